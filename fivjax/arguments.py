@@ -1,0 +1,92 @@
+"""Checks on what users pass in: each failure is a sentence that names the argument, the rule and the value.
+
+Values that are not known yet (inside `jit`, `grad` or `vmap`) cannot be checked and pass; lanes of a map that turn out
+to be bad end in a named status instead.
+"""
+
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+
+from .precision import is_known
+
+
+def real_number(
+    name: str, value, *, minimum: float | None = None, above: float | None = None, maximum: float | None = None
+) -> None:
+    """Refuse anything but one finite real number within the stated bound."""
+    if not is_known(value):
+        return
+    array = numeric_array(name, value)
+    if array.shape != ():
+        raise ValueError(
+            f"Argument `{name}` must be one number, but has shape {array.shape}. For several values, pass them as an "
+            f"axis of `bistability_map` or use `jax.vmap`."
+        )
+    number = array.item()
+    if not np.isfinite(number):
+        raise ValueError(f"Argument `{name}` must be finite, but is {number}.")
+    if minimum is not None and number < minimum:
+        rule = "non-negative" if minimum == 0 else f"at least {minimum:g}"
+        raise ValueError(f"Argument `{name}` must be {rule}, but is {number:g}.")
+    if above is not None and number <= above:
+        rule = "positive" if above == 0 else f"above {above:g}"
+        raise ValueError(f"Argument `{name}` must be {rule}, but is {number:g}.")
+    if maximum is not None and number > maximum:
+        raise ValueError(f"Argument `{name}` must be at most {maximum:g}, but is {number:g}.")
+
+
+def numeric_array(name: str, value) -> np.ndarray:
+    """`value` as a NumPy array of real numbers, or a sentence about what it is instead."""
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError):
+        raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}.") from None
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}.")
+    return array
+
+
+def axis(name: str, values) -> np.ndarray:
+    """The values of one axis of a batch: one-dimensional, not empty, finite, strictly increasing."""
+    array = numeric_array(name, values).astype(np.float64)
+    if array.ndim == 0:
+        array = array[None]
+    if array.ndim != 1:
+        raise ValueError(f"Axis `{name}` must be one-dimensional, but has shape {array.shape}.")
+    if array.size == 0:
+        raise ValueError(f"Axis `{name}` must hold at least one value, but is empty.")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"Axis `{name}` must be finite, but holds {array[~np.isfinite(array)][0]}.")
+    steps = np.diff(array)
+    if np.any(steps <= 0):
+        at = int(np.argmax(steps <= 0))
+        raise ValueError(
+            f"Axis `{name}` must be strictly increasing, but goes from {array[at]:g} to {array[at + 1]:g} "
+            f"(values {at} and {at + 1}). Sort it and drop repeats, for instance with `numpy.unique`."
+        )
+    return array
+
+
+def instance(name: str, value, kinds: type | tuple[type, ...], example: str) -> None:
+    """Refuse a value of the wrong type, with an example of the right one."""
+    if not isinstance(value, kinds):
+        raise TypeError(f"Argument `{name}` must be {example}, but is {describe(value)}.")
+
+
+def one_of(name: str, value, choices: Iterable[str]) -> None:
+    """Refuse a word that is not among the choices."""
+    choices = list(choices)
+    if value not in choices:
+        listed = ", ".join(f'"{choice}"' for choice in choices)
+        raise ValueError(f"Argument `{name}` must be one of {listed}, but is {value!r}.")
+
+
+def describe(value) -> str:
+    """A short description of a value for an error message."""
+    if isinstance(value, str | bool | int | float | complex | type(None)):
+        return f"{value!r} ({type(value).__name__})"
+    if isinstance(value, np.ndarray | jax.Array):
+        return f"an array of {value.dtype} with shape {value.shape}"
+    return f"of type {type(value).__name__}"

@@ -1,0 +1,340 @@
+r"""The one physics: accelerations, contact forces, what ends a status, and what follows.
+
+A contact sticks (0), slides (1) or is detached (2). With the free acceleration $a^f = M^{-1}(fF - C\dot q - Kq)$ and the
+contact's compliance $G = E^T M^{-1} E$, $E = [e_t, e_n]$, every status is the free structure plus contact forces
+$a = a^f + M^{-1}(e_t T + e_n N)$ that keep what the status demands:
+
+| status | demands | forces |
+|---|---|---|
+| stick | $a_t = a_n = 0$ | $(T, N) = -G^{-1} (a^f_t, a^f_n)$ |
+| slide | $a_n = 0$, $T = \sigma \mu N$ | $N = -a^f_n / (G_{nn} + \sigma \mu G_{nt})$ |
+| detach | | $T = N = 0$ |
+
+with $\sigma = -\mathrm{sign}(\dot q_t - v_{belt})$. These are Eqs. 3, 6 and 5 of the paper, for any structure: the
+projection of the symmetric free matrices replaces typing each set in.
+
+A status lasts while its *guards* are positive: the two edges of the friction cone while sticking, N and the slip speed
+while sliding, the gap while detached. When one is used up, `transition` puts the state on its constraint, applies the
+impact law where the gap closed, and chooses the next status from the forces, never from which guard it was.
+
+Everything here is about one contact at one instant; batches come from `jax.vmap`.
+"""
+
+import enum
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .friction import AbstractFriction
+from .scene import Scene
+
+
+class Status(enum.IntEnum):
+    """The paper's codes."""
+
+    STICK = 0
+    SLIDE = 1
+    DETACH = 2
+
+
+class Contact(eqx.Module):
+    """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides."""
+
+    status: Int[Array, ""]
+    direction: Float[Array, ""]
+
+
+class Mechanics(eqx.Module):
+    """A scene in the form that accelerations need: everything divided by the mass matrix, once."""
+
+    free_position: Float[Array, "n n"]  # -M⁻¹K, 1/s²
+    free_velocity: Float[Array, "n n"]  # -M⁻¹C, 1/s
+    free_load: Float[Array, " n"]  # M⁻¹f, 1/kg
+    from_tangential: Float[Array, " n"]  # M⁻¹e_t, 1/kg
+    from_normal: Float[Array, " n"]  # M⁻¹e_n, 1/kg
+    friction: AbstractFriction
+    belt_speed: Float[Array, ""]
+    restitution: Float[Array, ""]
+    impact_law: str = eqx.field(static=True)
+    tangential: int = eqx.field(static=True)
+    normal: int = eqx.field(static=True)
+
+    def __init__(self, scene: Scene):
+        structure = scene.structure
+        n = structure.size
+        forces = jnp.zeros((n, 2), structure.mass.dtype)
+        forces = forces.at[structure.tangential, 0].set(1.0).at[structure.normal, 1].set(1.0)
+        right = jnp.concatenate(
+            [-structure.stiffness, -structure.damping, structure.load_direction[:, None], forces], axis=1
+        )
+        solved = jnp.linalg.solve(structure.mass, right)
+        self.free_position = solved[:, :n]
+        self.free_velocity = solved[:, n : 2 * n]
+        self.free_load = solved[:, 2 * n]
+        self.from_tangential = solved[:, 2 * n + 1]
+        self.from_normal = solved[:, 2 * n + 2]
+        self.friction = scene.friction
+        self.belt_speed = scene.belt_speed
+        self.restitution = scene.restitution
+        self.impact_law = scene.impact_law
+        self.tangential = structure.tangential
+        self.normal = structure.normal
+
+    @property
+    def compliance(self) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """G_tt, G_tn and G_nn, in 1/kg."""
+        return (
+            self.from_tangential[self.tangential],
+            self.from_tangential[self.normal],
+            self.from_normal[self.normal],
+        )
+
+    def normal_compliance(self, direction: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, ""]:
+        """G_nn + σμ G_nt: how the gap accelerates under a normal force that drags friction along, in 1/kg.
+
+        Where it is not positive the contact problem has no unique solution (Painlevé's paradox).
+        """
+        _, g_tn, g_nn = self.compliance
+        return g_nn + direction * mu * g_tn
+
+
+State = Float[Array, " 2n"]  # displacements, then velocities
+
+
+def relative_velocity(mechanics: Mechanics, y: State) -> Float[Array, ""]:
+    """Tangential velocity of the structure relative to the belt, in m/s."""
+    return y[_n(y) + mechanics.tangential] - mechanics.belt_speed
+
+
+def gap(mechanics: Mechanics, y: State) -> Float[Array, ""]:
+    """Distance from the belt, in m."""
+    return y[mechanics.normal]
+
+
+def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
+    """Accelerations without contact forces, in m/s²."""
+    n = _n(y)
+    # Sums over columns rather than matrix products: in a batch these become one fused loop over lanes.
+    acceleration = mechanics.free_load * load
+    for j in range(n):
+        acceleration = acceleration + mechanics.free_position[:, j] * y[j] + mechanics.free_velocity[:, j] * y[n + j]
+    return acceleration
+
+
+def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N that hold the contact still."""
+    g_tt, g_tn, g_nn = mechanics.compliance
+    free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
+    determinant = g_tt * g_nn - g_tn**2
+    return (g_tn * free_n - g_nn * free_t) / determinant, (g_tn * free_t - g_tt * free_n) / determinant
+
+
+def sliding_forces(
+    mechanics: Mechanics, free: Float[Array, " n"], direction: Float[Array, ""], slip_speed: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N while sliding, the friction force pointing in `direction`."""
+    mu = mechanics.friction(slip_speed)
+    normal_force = -free[mechanics.normal] / mechanics.normal_compliance(direction, mu)
+    return direction * mu * normal_force, normal_force
+
+
+def contact_forces(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N in the given status; N is negative beyond the instant where contact is lost."""
+    free = free_acceleration(mechanics, load, y)
+    return _forces(mechanics, contact, free, y)
+
+
+def acceleration(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
+    """Accelerations in the given status, in m/s²; those that the status forbids are exactly zero."""
+    free = free_acceleration(mechanics, load, y)
+    tangential_force, normal_force = _forces(mechanics, contact, free, y)
+    total = free + mechanics.from_tangential * tangential_force + mechanics.from_normal * normal_force
+    index = jnp.arange(_n(y))
+    held = (index == mechanics.normal) & (contact.status != Status.DETACH)
+    held = held | ((index == mechanics.tangential) & (contact.status == Status.STICK))
+    return jnp.where(held, 0.0, total)
+
+
+def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "2"]:
+    """What must stay positive for the status to last; N, or m/s and m where that is what counts.
+
+    stick: distances of T from both edges of the friction cone; slide: N and the slip speed; detach: the gap, twice.
+    """
+    tangential_force, normal_force = contact_forces(mechanics, contact, load, y)
+    edge = mechanics.friction.static * normal_force
+    slip_speed = -contact.direction * relative_velocity(mechanics, y)
+    height = gap(mechanics, y)
+    return _by_status(
+        contact,
+        stick=jnp.stack([edge - tangential_force, edge + tangential_force]),
+        slide=jnp.stack([normal_force, slip_speed]),
+        detach=jnp.stack([height, height]),
+    )
+
+
+def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
+    """The state with what the status forbids set to exactly zero: gap and its rate, and creep while sticking."""
+    touching = contact.status != Status.DETACH
+    sticking = contact.status == Status.STICK
+    return _with_contact_coordinates(
+        mechanics,
+        y,
+        gap=jnp.where(touching, 0.0, gap(mechanics, y)),
+        gap_rate=jnp.where(touching, 0.0, y[_n(y) + mechanics.normal]),
+        tangential_velocity=jnp.where(sticking, mechanics.belt_speed, y[_n(y) + mechanics.tangential]),
+    )
+
+
+def transition(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    ended: Bool[Array, "2"],
+    resolution: Float[Array, ""],
+) -> tuple[Contact, State]:
+    """What follows where the guards in `ended` are used up: the next status, and the state on its constraint.
+
+    Where none is, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) is taken
+    to have come to rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
+    """
+    n = _n(y)
+    detached = contact.status == Status.DETACH
+    sliding = contact.status == Status.SLIDE
+    lifted = sliding & ended[0]
+    touched = detached & ended[0]
+    # Slip that has run out is put at exactly zero; sticking has none to begin with.
+    stopped = (sliding & ended[1]) | (contact.status == Status.STICK)
+    stopped_velocity = jnp.where(stopped, mechanics.belt_speed, y[n + mechanics.tangential])
+    y_stopped = _with_contact_coordinates(
+        mechanics,
+        y,
+        gap=jnp.where(touched, 0.0, gap(mechanics, y)),
+        gap_rate=y[n + mechanics.normal],
+        tangential_velocity=stopped_velocity,
+    )
+    y_next = jnp.where(touched, _resting(mechanics, load, impact(mechanics, y_stopped), resolution), y_stopped)
+    # At the edge of the friction cone, or where N has just reached zero, rounding alone would decide whether the status
+    # that has ended goes on. It does not.
+    following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
+    following = Contact(
+        status=jnp.where(lifted, Status.DETACH, following.status).astype(following.status.dtype),
+        direction=following.direction,
+    )
+    y_next = on_constraint(mechanics, following, y_next)
+    any_ended = jnp.any(ended)
+    return (
+        Contact(
+            status=jnp.where(any_ended, following.status, contact.status),
+            direction=jnp.where(any_ended, following.direction, contact.direction),
+        ),
+        jnp.where(any_ended, y_next, y),
+    )
+
+
+def status_from_forces(
+    mechanics: Mechanics, load: Float[Array, ""], y: State, may_stick: Bool[Array, ""] | bool = True
+) -> Contact:
+    """The status that a state on its constraints is in, found from the forces that each status would need.
+
+    Open or opening: detached. Slipping: sliding if pressed, else detached. At rest on the belt: sticking if the holding
+    force lies in the friction cone, else sliding the way it is pushed, else detached.
+    """
+    free = free_acceleration(mechanics, load, y)
+    slip = relative_velocity(mechanics, y)
+    open_ = (gap(mechanics, y) > 0) | (y[_n(y) + mechanics.normal] > 0)
+    holding, pressing = sticking_forces(mechanics, free)
+    sticks = may_stick & (slip == 0) & (pressing > 0) & (jnp.abs(holding) <= mechanics.friction.static * pressing)
+    pushed = jnp.where(slip == 0, jnp.sign(holding), -jnp.sign(slip))
+    direction = jnp.where(pushed == 0, 1.0, pushed).astype(y.dtype)
+    _, sliding_normal_force = sliding_forces(mechanics, free, direction, jnp.abs(slip))
+    status = jnp.where(
+        open_,
+        Status.DETACH,
+        jnp.where(sticks, Status.STICK, jnp.where(sliding_normal_force > 0, Status.SLIDE, Status.DETACH)),
+    )
+    return Contact(status=status.astype(jnp.int32), direction=direction)
+
+
+def impact(mechanics: Mechanics, y: State) -> State:
+    """Velocities after the gap has closed: Newton's restitution normally, and the scene's impact law tangentially.
+
+    - "coulomb" (default): the tangential impulse obeys Coulomb's law; the one that ends slip is taken if the friction
+      cone at the approaching slip speed holds it.
+    - "frictionless": no tangential impulse; the normal one moves whatever the mass matrix couples to it.
+    - "reset": the normal velocity alone is changed, as a code does that resets one number. Not consistent with momentum.
+
+    The paper does not state its law; its Table 2 comes out the same with all three.
+    """
+    n = _n(y)
+    g_tt, g_tn, g_nn = mechanics.compliance
+    approach = y[n + mechanics.normal]
+    slip = relative_velocity(mechanics, y)
+    jump = -(1.0 + mechanics.restitution) * approach
+    if mechanics.impact_law == "reset":
+        return y.at[n + mechanics.normal].add(jump)
+    if mechanics.impact_law == "frictionless":
+        tangential_impulse, normal_impulse = jnp.zeros_like(jump), jump / g_nn
+    else:
+        mu = mechanics.friction(jnp.abs(slip))
+        determinant = g_tt * g_nn - g_tn**2
+        ending = (-g_nn * slip - g_tn * jump) / determinant
+        ending_normal = (g_tn * slip + g_tt * jump) / determinant
+        direction = jnp.sign(ending)
+        dragging_normal = jump / mechanics.normal_compliance(direction, mu)
+        ends_slip = jnp.abs(ending) <= mu * ending_normal
+        tangential_impulse = jnp.where(ends_slip, ending, direction * mu * dragging_normal)
+        normal_impulse = jnp.where(ends_slip, ending_normal, dragging_normal)
+    kick = mechanics.from_tangential * tangential_impulse + mechanics.from_normal * normal_impulse
+    y = y.at[n:].add(kick)
+    # What the law demands exactly, free of rounding: a mass that comes to rest on the belt rests.
+    tangential_velocity = y[n + mechanics.tangential]
+    if mechanics.impact_law == "coulomb":
+        tangential_velocity = jnp.where(ends_slip, mechanics.belt_speed, tangential_velocity)
+    return _with_contact_coordinates(
+        mechanics,
+        y,
+        gap=gap(mechanics, y),
+        gap_rate=-mechanics.restitution * approach,
+        tangential_velocity=tangential_velocity,
+    )
+
+
+def _resting(mechanics: Mechanics, load: Float[Array, ""], y: State, resolution: Float[Array, ""]) -> State:
+    rate = y[_n(y) + mechanics.normal]
+    free_n = free_acceleration(mechanics, load, y)[mechanics.normal]
+    rests = rate + 0.5 * free_n * resolution <= 0
+    return jnp.where(jnp.arange(y.shape[0]) == _n(y) + mechanics.normal, jnp.where(rests, 0.0, rate), y)
+
+
+def _forces(
+    mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], y: State
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    sticking = sticking_forces(mechanics, free)
+    slip_speed = -contact.direction * relative_velocity(mechanics, y)
+    sliding = sliding_forces(mechanics, free, contact.direction, slip_speed)
+    none = jnp.zeros_like(slip_speed)
+    tangential_force, normal_force = (
+        _by_status(contact, stick=stick, slide=slide, detach=none)
+        for stick, slide in zip(sticking, sliding, strict=True)
+    )
+    return tangential_force, normal_force
+
+
+def _by_status(contact: Contact, *, stick, slide, detach):
+    return jnp.where(contact.status == Status.STICK, stick, jnp.where(contact.status == Status.SLIDE, slide, detach))
+
+
+def _with_contact_coordinates(mechanics: Mechanics, y: State, *, gap, gap_rate, tangential_velocity) -> State:
+    n = _n(y)
+    index = jnp.arange(2 * n)
+    y = jnp.where(index == mechanics.normal, gap, y)
+    y = jnp.where(index == n + mechanics.normal, gap_rate, y)
+    return jnp.where(index == n + mechanics.tangential, tangential_velocity, y)
+
+
+def _n(y: State) -> int:
+    return y.shape[0] // 2

@@ -1,0 +1,143 @@
+"""The proof of a limit cycle: the orbit is seen to return.
+
+The state at successive upward zero crossings of the tangential velocity comes back to within a tolerance, at the same
+lag again and again, with contact events in between and without drifting off. Two kinds of return count:
+
+- *tight*: the states are the same to within the method's error, as on a periodic orbit;
+- *loose*: the state went away and came back close. Above 1.7 m/s the paper's limit cycle is not periodic: it winds
+  around a torus, its amplitude beats over some 14 periods of 68 Hz for ever, and no two crossings are the same.
+
+Merely being close to an earlier state proves nothing. Right at the critical perturbation trajectories linger near an
+unstable cycle for seconds, almost periodic, before they decide. They stay close without going away, so they are no loose
+return, and they drift, so they are no tight one: a chain whose distances grow does not count.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .contact import State
+
+# A chain of returns counts when it is at least this long.
+LEAST_RETURNS = 3
+SHORTEST_SEARCH = 8
+LONGEST_SEARCH = 64
+# A loose return: this close relative to the orbit's size, and to how far it had gone meanwhile.
+LOOSE_DISTANCE = 0.02
+LOOSE_SHARE = 0.15
+LOOSE_SPAN = 16
+
+
+class Resolution(eqx.Module):
+    """What a method's crossing states are good for."""
+
+    tight: Float[Array, ""]  # crossings this close, relative to the orbit's size, are the same
+    span: Int[Array, ""]  # crossings over which they have to stay the same
+    floor: Float[Array, ""]  # excursions below this may be the method's own error
+
+
+class Orbit(eqx.Module):
+    """What has to be remembered of a trajectory to see that its orbit returns: one earlier state and a few counts."""
+
+    anchor: Float[Array, " 2n"]  # the crossing state that later ones are compared with
+    crossings: Int[Array, ""]  # since the anchor was set
+    patience: Int[Array, ""]  # crossings after which a search starts again from a newer anchor
+    changes: Int[Array, ""]  # status changes since the anchor was set
+    lag: Int[Array, ""]  # crossings per return; 0 while none is known
+    returns: Int[Array, ""]  # returns in a row at that lag
+    first_distance: Float[Array, ""]  # of the first of these returns, relative
+    excursion: Float[Array, ""]  # largest distance from the anchor since it was set, relative
+    peak: Float[Array, ""]  # largest tangential speed since the anchor was set, m/s
+    amplitude: Float[Array, ""]  # the same over the returns in a row
+    returned: Bool[Array, ""]  # seen to return: a limit cycle
+
+
+def new_orbit(y: State) -> Orbit:
+    zero, none = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
+    # No anchor yet: an infinite one is never returned to, and a patience of one replaces it at the first crossing.
+    return Orbit(
+        anchor=jnp.full_like(y, jnp.inf),
+        crossings=none,
+        patience=none + 1,
+        changes=none,
+        lag=none,
+        returns=none,
+        first_distance=zero,
+        excursion=zero,
+        peak=zero,
+        amplitude=zero,
+        returned=jnp.zeros((), bool),
+    )
+
+
+def observe(
+    orbit: Orbit,
+    weights: Float[Array, " 2n"],
+    equilibrium: State,
+    tangential: int,
+    before: State,
+    after: State,
+    changed: Bool[Array, ""],
+    resolution: Resolution,
+) -> Orbit:
+    """The orbit's memory after one more step, from the state `before` it to the state `after` it.
+
+    `weights` make displacements and velocities comparable; distances are relative to that from `equilibrium`. `changed`
+    says whether the status changed in the step.
+    """
+    tangential_velocity = before.shape[0] // 2 + tangential
+    speed = before[tangential_velocity], after[tangential_velocity]
+    crossed = (speed[0] < 0) & (speed[1] >= 0)
+    share = speed[0] / jnp.where(crossed, speed[0] - speed[1], 1.0)
+    at = before + jnp.where(crossed, share, 0.0) * (after - before)
+    distance = _length(weights * (at - orbit.anchor)) / _length(weights * (at - equilibrium))
+
+    crossings = orbit.crossings + 1
+    changes = orbit.changes + changed
+    peak = jnp.maximum(orbit.peak, jnp.abs(speed[1]))
+    # While the anchor is not set, the distance is infinite and says nothing.
+    excursion = jnp.where(jnp.isfinite(distance), jnp.maximum(orbit.excursion, distance), orbit.excursion)
+    loose = (distance <= LOOSE_DISTANCE) & (distance <= LOOSE_SHARE * excursion) & (excursion >= resolution.floor)
+    close = ((distance <= resolution.tight) | loose) & (changes > 0)
+    searching = orbit.lag == 0
+    due = crossings == orbit.lag
+    again = ~searching & due & close
+    found = searching & close
+    lost = ~searching & due & ~close
+    tired = searching & ~close & (crossings >= orbit.patience)
+
+    returns = jnp.where(found, 1, jnp.where(lost, 0, orbit.returns + again))
+    lag = jnp.where(found, crossings, jnp.where(lost, 0, orbit.lag))
+    span = jnp.where(loose, LOOSE_SPAN, resolution.span)
+    needed = jnp.maximum(LEAST_RETURNS, -(-span // jnp.maximum(lag, 1)))
+    complete = again & (returns >= needed)
+    # Below a hundredth of the method's error there is nothing left to drift.
+    drifting = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
+    restart = found | (complete & drifting)
+    amplitude = jnp.where(found, peak, jnp.where(again, jnp.maximum(orbit.amplitude, peak), orbit.amplitude))
+    new_anchor = found | again | lost | tired
+    patience = jnp.where(
+        lost,
+        SHORTEST_SEARCH,
+        jnp.where(tired, jnp.clip(2 * orbit.patience, SHORTEST_SEARCH, LONGEST_SEARCH), orbit.patience),
+    )
+    seen = Orbit(
+        anchor=jnp.where(new_anchor, at, orbit.anchor),
+        crossings=jnp.where(new_anchor, 0, crossings),
+        patience=patience,
+        changes=jnp.where(new_anchor, 0, changes),
+        lag=lag,
+        returns=jnp.where(restart, 1, returns),
+        first_distance=jnp.where(restart, distance, orbit.first_distance),
+        excursion=jnp.where(new_anchor, 0.0, excursion),
+        peak=jnp.where(new_anchor, 0.0, peak),
+        amplitude=amplitude,
+        returned=orbit.returned | (complete & ~drifting),
+    )
+    between = eqx.tree_at(lambda o: (o.changes, o.peak), orbit, (changes, peak))
+    return jax.tree.map(lambda new, old: jnp.where(crossed, new, old), seen, between)
+
+
+def _length(x: Float[Array, " k"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(x * x))

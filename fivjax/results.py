@@ -1,0 +1,148 @@
+"""Results as labelled datasets: units, coordinates, provenance, and a file that is whole or absent."""
+
+import json
+import os
+import tempfile
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+
+from .scene import Scene
+
+# Long name and unit of each parameter and result that fivjax itself names.
+QUANTITIES = {
+    "mu": ("friction coefficient", "1"),
+    "mu_static": ("static friction coefficient", "1"),
+    "mu_dynamic": ("dynamic friction coefficient", "1"),
+    "decay": ("decay of friction with slip speed", "s/m"),
+    "belt_speed": ("belt speed", "m/s"),
+    "restitution": ("coefficient of restitution", "1"),
+    "force": ("load", "N"),
+    "p": ("perturbation coefficient", "1"),
+    "duration": ("duration of the pulse", "s"),
+    "start": ("start of the pulse", "s"),
+    "m1": ("mass 1", "kg"),
+    "m2": ("mass 2", "kg"),
+    "c1": ("damper 1", "N s/m"),
+    "c2": ("damper 2", "N s/m"),
+    "k1": ("spring 1", "N/m"),
+    "k2": ("spring 2", "N/m"),
+    "theta": ("belt inclination", "rad"),
+    "t": ("time", "s"),
+    "displacement": ("displacement", "m"),
+    "velocity": ("velocity", "m/s"),
+    "acceleration": ("acceleration", "m/s2"),
+    "status": ("contact status (0 stick, 1 slide, 2 detach)", "1"),
+    "normal_force": ("normal force", "N"),
+    "friction_force": ("friction force", "N"),
+    "verdict": ("verdict", "1"),
+    "amplitude": ("peak tangential speed on the final orbit", "m/s"),
+    "decided_at": ("time at which the verdict was proved", "s"),
+    "contact_events": ("number of status changes up to the verdict", "1"),
+    "last_event": ("time of the last status change up to the verdict", "s"),
+    "p_crit": ("critical perturbation", "1"),
+    "p_crit_low": ("largest perturbation proved to return to sliding below the crossing", "1"),
+    "p_crit_high": ("smallest perturbation proved to end on a limit cycle above the crossing", "1"),
+    "p_crit_error": ("error estimate of the critical perturbation", "1"),
+    "only_crossing": ("whether no other crossing was seen above the first", "1"),
+    "crossings": ("number of verdict changes seen over the range of p", "1"),
+}
+
+
+def label(variable: xr.DataArray) -> xr.DataArray:
+    """The variable with its long name and unit."""
+    if variable.name in QUANTITIES:
+        long_name, unit = QUANTITIES[str(variable.name)]
+        variable.attrs.update(long_name=long_name, units=unit)
+    return variable
+
+
+def labelled(dataset: xr.Dataset, scene: Scene, **settings) -> xr.Dataset:
+    """The dataset with units on everything it holds, and where it came from."""
+    for name in list(dataset.variables):
+        label(dataset[name])
+    dataset.attrs.update(
+        scene=json.dumps(describe(scene)),
+        settings=json.dumps(settings),
+        fivjax=metadata.version("fivjax"),
+        jax=jax.__version__,
+        diffrax=metadata.version("diffrax"),
+        device=jax.devices()[0].device_kind,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    return dataset
+
+
+def describe(scene: Scene) -> dict:
+    """Everything that defines a scene, as plain Python values."""
+    structure = scene.structure
+    return {
+        "structure": getattr(structure.builder, "__name__", "Structure"),
+        "friction": type(scene.friction).__name__,
+        "load": type(scene.load).__name__,
+        "impact_law": scene.impact_law,
+        "parameters": {name: float(value) for name, value in scene.parameters.items()},
+        "mass": np.asarray(structure.mass).tolist(),
+        "damping": np.asarray(structure.damping).tolist(),
+        "stiffness": np.asarray(structure.stiffness).tolist(),
+        "load_direction": np.asarray(structure.load_direction).tolist(),
+        "tangential": structure.tangential,
+        "normal": structure.normal,
+    }
+
+
+def check_writable(path: str | Path) -> Path:
+    """Refuse, before any work is done, a path that could not be written afterwards.
+
+    **Raises:** `ValueError` naming what stands in the way.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"Output path `{path}` is a folder; give the name of a file in it.")
+    if not path.parent.is_dir():
+        raise ValueError(f"Output folder `{path.parent}` does not exist; create it first.")
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+            pass
+    except OSError as error:
+        raise ValueError(f"Output folder `{path.parent}` cannot be written: {error.strerror}.") from error
+    return path
+
+
+def save(dataset: xr.Dataset, path: str | Path) -> Path:
+    """Write a dataset as NetCDF; the file appears under its name only when it is whole.
+
+    **Raises:** `ValueError` for a path that cannot be written.
+    """
+    return _replace_whole(check_writable(path), lambda part: dataset.to_netcdf(part, engine="h5netcdf"))
+
+
+def save_figure(figure, path: str | Path, **options) -> Path:
+    """Write a matplotlib figure; the file appears under its name only when it is whole.
+
+    **Raises:** `ValueError` for a path that cannot be written.
+    """
+    path = check_writable(path)
+    options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}
+    return _replace_whole(path, lambda part: figure.savefig(part, **options))
+
+
+def _replace_whole(path: Path, write) -> Path:
+    # Beside the target, so that the final rename stays within one file system and cannot be half done.
+    handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    try:
+        write(part)
+        # `mkstemp` makes private files; a result has the permissions of any other new file.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(part, 0o666 & ~mask)
+        os.replace(part, path)
+    except BaseException:
+        Path(part).unlink(missing_ok=True)
+        raise
+    return path

@@ -1,0 +1,178 @@
+"""One trajectory, with everything that can be read off it."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float, Int
+
+from . import arguments
+from . import contact as physics
+from .contact import Contact, Mechanics, State
+from .event_exact import EventExact
+from .precision import is_known, real, returning_numpy
+from .results import labelled
+from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_by
+
+
+class Trajectory(eqx.Module):
+    """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size."""
+
+    t: Float[Array, " T"]  # s
+    displacement: Float[Array, "T n"]  # m
+    velocity: Float[Array, "T n"]  # m/s
+    acceleration: Float[Array, "T n"]  # m/s²
+    status: Int[Array, " T"]  # 0 stick, 1 slide, 2 detach
+    normal_force: Float[Array, " T"]  # N
+    friction_force: Float[Array, " T"]  # N
+    scene: Scene
+
+    @property
+    def slip_velocity(self) -> Float[Array, " T"]:
+        """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
+        return self.velocity[:, self.scene.structure.tangential] - np.asarray(self.scene.belt_speed)
+
+    @property
+    def gap(self) -> Float[Array, " T"]:
+        """Distance from the belt, in m."""
+        return self.displacement[:, self.scene.structure.normal]
+
+    def to_dataset(self) -> xr.Dataset:
+        """The trajectory with names, units and the scene it came from."""
+        along = ("t", "coordinate")
+        dataset = xr.Dataset(
+            {
+                "displacement": (along, np.asarray(self.displacement)),
+                "velocity": (along, np.asarray(self.velocity)),
+                "acceleration": (along, np.asarray(self.acceleration)),
+                "status": ("t", np.asarray(self.status)),
+                "normal_force": ("t", np.asarray(self.normal_force)),
+                "friction_force": ("t", np.asarray(self.friction_force)),
+            },
+            coords={"t": np.asarray(self.t), "coordinate": np.arange(self.displacement.shape[1])},
+        )
+        return labelled(dataset, self.scene)
+
+
+@returning_numpy
+def simulate(
+    scene: Scene,
+    t1: float = 2.0,
+    dt_save: float = 1e-4,
+    method: AbstractStepper | None = None,
+    *,
+    y0=None,
+) -> Trajectory:
+    """The response of a scene from t = 0 to `t1`.
+
+    **Arguments:**
+
+    - `scene`: what is simulated.
+    - `t1`: the end, in s.
+    - `dt_save`: distance of the saved instants, in s; the steps in between are the method's.
+    - `method`: how to step, `EventExact()` unless given.
+    - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
+      equilibrium at rest unless given.
+
+    **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
+    being finite, or contact events come without end, the rows from there on are NaN.
+
+    **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
+    equilibrium to start from, or friction beyond Painlevé's limit.
+    """
+    method = EventExact() if method is None else method
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    arguments.real_number("t1", t1, above=0)
+    arguments.real_number("dt_save", dt_save, above=0)
+    _refuse_painleve(scene)
+    y0 = _initial_state(scene, y0)
+    rows = math.ceil(t1 / dt_save - 1e-9)
+    # Events cut advances short, so there may be more of them than it takes to span the interval.
+    most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
+    saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
+    return _simulate(scene, method, y0, saved, most)
+
+
+@eqx.filter_jit
+def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int) -> Trajectory:
+    mechanics = Mechanics(scene)
+    # Steps end on the load's jumps as well as on the saved instants.
+    jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
+    ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
+
+    def to_next(carry, end):
+        t, y, contact = carry
+        y, contact, reached = advance_by(method, mechanics, contact, scene.load(0.5 * (t + end)), y, end - t, most)
+        y = jnp.where(reached, y, jnp.nan)
+        return (end, y, contact), (y, contact)
+
+    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
+    _, (ys, contacts) = jax.lax.scan(to_next, (saved[0], y0, contact0), ends)
+    rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    y = with_start(y0, ys)
+    contacts = jax.tree.map(with_start, contact0, contacts)
+    load = jax.vmap(scene.load)(saved)
+    n = scene.structure.size
+    friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
+        contacts, load, y
+    )
+    return Trajectory(
+        t=saved,
+        displacement=y[:, :n],
+        velocity=y[:, n:],
+        acceleration=jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y),
+        status=contacts.status.astype(jnp.int8),
+        normal_force=normal_force,
+        friction_force=friction_force,
+        scene=scene,
+    )
+
+
+def _initial_state(scene: Scene, y0) -> State:
+    n, normal = scene.structure.size, scene.structure.normal
+    if y0 is None:
+        if is_known(scene.belt_speed):
+            sliding_equilibrium(scene)  # for what it refuses
+        q, _ = steady_sliding(scene, scene.load.force)
+        return jnp.concatenate([q, jnp.zeros_like(q)])
+    parts = y0 if isinstance(y0, tuple | list) and len(y0) == 2 else (y0,)
+    y = jnp.concatenate([real(part) for part in parts])
+    if y.shape != (2 * n,):
+        raise ValueError(
+            f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
+            f"({2 * n},), but has shape {y.shape}."
+        )
+    if is_known(y):
+        if not np.all(np.isfinite(y)):
+            raise ValueError("Argument `y0` must be finite.")
+        if y[normal] < 0:
+            raise ValueError(
+                f"Argument `y0` must not start below the belt, but its displacement {normal} (the gap) is "
+                f"{float(y[normal]):g} m."
+            )
+        if y[normal] == 0 and y[n + normal] < 0:
+            raise ValueError(
+                f"Argument `y0` must not start on the belt and moving into it, but its velocity {normal} (of the gap) "
+                f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
+            )
+    return y
+
+
+def _refuse_painleve(scene: Scene) -> None:
+    largest = scene.friction.static
+    if is_known(largest) and is_known(scene.structure.mass):
+        limit = painleve_friction(scene.structure)
+        if is_known(limit) and float(largest) >= limit:
+            raise ValueError(
+                f"The contact problem has no unique solution at friction {float(largest):g}: Painlevé's limit of this "
+                f"structure is {float(limit):.4g}. Lower the friction or the coupling in the mass matrix."
+            )

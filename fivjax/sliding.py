@@ -1,0 +1,198 @@
+r"""The proof that sliding is reached: no contact event can happen again.
+
+While the contact slides and the load no longer changes, the deviation $z$ from the sliding equilibrium obeys
+$\dot z = A z$ (plus a remainder, for friction that depends on speed). Sliding ends when the pressing force or the slip
+speed runs out. Both are affine in $z$, so the proof is a bound on two signals $\sum_k a_k e^{λ_k t}$ over all the
+future. A quiet interval proves nothing: close to the stability limit two modes are almost parallel, and the answer to a
+kick grows for a second before it decays.
+
+- Constant friction: the exact envelope of the sum, the slow beat of the modes included (`envelope_peak`).
+- Speed-dependent friction: the linear motion with a bound on the remainder (`decays_nonlinearly`).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from . import contact as physics
+from .contact import Contact, Mechanics, State, Status
+from .scene import Scene, steady_sliding
+
+# The proof for speed-dependent friction speaks of slip speeds above this share of the belt's.
+LOWEST_SLIP = 0.5
+ENVELOPE_DECADES = 12.0
+ENVELOPE_INSTANTS = 161
+
+
+class LinearSliding(eqx.Module):
+    """The sliding motion linearised about its equilibrium, with the two signals that end it.
+
+    `m` is twice the number of coordinates that sliding leaves free: the structure's without the normal one.
+    """
+
+    equilibrium: Float[Array, " 2n"]  # the state about which the deviation z is measured
+    matrix: Float[Array, "m m"]
+    pressing: Float[Array, " m"]  # row: how z changes the pressing acceleration, the free one towards the belt
+    pressing_margin: Float[Array, ""]  # its size at equilibrium, m/s²
+    slip: Float[Array, " m"]  # row: how z changes the slip speed
+    slip_margin: Float[Array, ""]  # its size at equilibrium, m/s
+    remainder: Float[Array, " m"]  # direction in which the remainder of the friction law acts
+    remainder_slope: Float[Array, ""]  # bounds on that remainder, see `decays_nonlinearly`
+    remainder_curvature: Float[Array, ""]
+    direction: Float[Array, ""]  # of the friction force
+    exists: Bool[Array, ""]  # steady sliding exists and presses
+    solvable: Bool[Array, ""]  # the contact problem has one solution in either direction of slip
+
+
+def linear_sliding(scene: Scene) -> LinearSliding:
+    """The sliding motion's Jacobian and the two signals that end it, from `contact` by automatic differentiation."""
+    mechanics = Mechanics(scene)
+    n, load = scene.structure.size, scene.load.final
+    q, normal_force = steady_sliding(scene, load)
+    equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
+    direction = jnp.sign(scene.belt_speed)
+    contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), direction)
+    keep = _sliding_coordinates(n, mechanics.normal)
+
+    def rates(z):
+        y = equilibrium.at[keep].add(z)
+        return jnp.concatenate([y[n:], physics.acceleration(mechanics, contact, load, y)])[keep]
+
+    def pressing(z):
+        return -physics.free_acceleration(mechanics, load, equilibrium.at[keep].add(z))[mechanics.normal]
+
+    def slip(z):
+        return -direction * physics.relative_velocity(mechanics, equilibrium.at[keep].add(z))
+
+    rest = jnp.zeros(len(keep), q.dtype)
+    # Friction enters the accelerations as  a = (…) + a_press χ(μ) d,  χ = σ(μ - μ₀) / (c(μ) c(μ₀)),  with c the normal
+    # compliance and d = G_nn M⁻¹e_t - G_nt M⁻¹e_n. Bounds on χ' and χ'' over slip speed follow from those on μ.
+    _, g_tn, g_nn = mechanics.compliance
+    along = g_nn * mechanics.from_tangential - g_tn * mechanics.from_normal
+    slope, curvature = mechanics.friction.variation(LOWEST_SLIP * jnp.abs(scene.belt_speed))
+    static = mechanics.friction.static
+    compliance = jnp.minimum(
+        mechanics.normal_compliance(direction, jnp.zeros_like(static)), mechanics.normal_compliance(direction, static)
+    )
+    return LinearSliding(
+        equilibrium=equilibrium,
+        matrix=jax.jacfwd(rates)(rest),
+        pressing=jax.grad(pressing)(rest),
+        pressing_margin=pressing(rest),
+        slip=jax.grad(slip)(rest),
+        slip_margin=slip(rest),
+        remainder=jnp.concatenate([jnp.zeros(n, q.dtype), along])[keep],
+        remainder_slope=slope / compliance**2,
+        remainder_curvature=curvature / compliance**2 + 2 * jnp.abs(g_tn) * slope**2 / compliance**3,
+        direction=direction,
+        exists=(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
+        solvable=(compliance > 0) & (mechanics.normal_compliance(-direction, static) > 0),
+    )
+
+
+class SlidingModes(eqx.Module):
+    """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper one is kept, counted twice."""
+
+    linear: LinearSliding
+    eigenvalues: Complex[Array, " k"]  # 1/s
+    to_modal: Complex[Array, "k m"]  # rows of V⁻¹
+    pressing: Complex[Array, " k"]  # shares of the modes in the two signals
+    slip: Complex[Array, " k"]
+    remainder: Complex[Array, " k"]
+    stable: Bool[Array, ""]
+
+
+def sliding_modes(linear: LinearSliding) -> SlidingModes:
+    """Modal coordinates of a batch of sliding motions (leading axis), by NumPy.
+
+    They are wanted once per structure and friction, not once per step, and general eigenvectors are not to be had on
+    every accelerator.
+    """
+    linear = jax.tree.map(np.asarray, linear)
+    finite = np.all(np.isfinite(linear.matrix), axis=(-2, -1))
+    matrix = np.where(finite[:, None, None], linear.matrix, -np.eye(linear.matrix.shape[-1]))
+    eigenvalues, vectors = np.linalg.eig(matrix)
+    # A defective matrix has no modal coordinates. Infinite ones make every bound infinite, so nothing is proved.
+    inverse = np.full(vectors.shape, np.inf, complex)
+    regular = finite & (np.linalg.cond(vectors) < 1e12)
+    inverse[regular] = np.linalg.inv(vectors[regular])
+    # Conjugate pairs: the upper half plane first, then cut off what only repeats it.
+    order = np.argsort(-eigenvalues.imag, axis=-1, kind="stable")
+    kept = int(np.max(np.sum(eigenvalues.imag >= 0, axis=-1)))
+    eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)[:, :kept]
+    inverse = np.take_along_axis(inverse, order[:, :, None], axis=1)[:, :kept]
+    vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
+    count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
+    return SlidingModes(
+        linear=linear,
+        eigenvalues=eigenvalues.astype(complex),
+        to_modal=inverse,
+        pressing=count * np.einsum("li,lik->lk", linear.pressing, vectors),
+        slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
+        remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        stable=regular & np.all(eigenvalues.real < 0, axis=-1),
+    )
+
+
+def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, y: State) -> Bool[Array, ""]:
+    """Whether a bound shows that a contact which slides now, under its final load, never stops sliding."""
+    linear = modes.linear
+    z = (y - linear.equilibrium)[_sliding_coordinates(y.shape[0] // 2, mechanics.normal)]
+    modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
+    if mechanics.friction.constant:
+        proved = (envelope_peak(modes.pressing * modal, modes.eigenvalues) < linear.pressing_margin) & (
+            envelope_peak(modes.slip * modal, modes.eigenvalues) < linear.slip_margin
+        )
+    else:
+        proved = decays_nonlinearly(modes, modal)
+    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
+    return sliding & proved & modes.stable & linear.exists
+
+
+def envelope_peak(shares: Complex[Array, " k"], eigenvalues: Complex[Array, " k"]) -> Float[Array, ""]:
+    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes, tight also for near-parallel ones.
+
+    Near a coalescence the shares $a_k$ are huge and cancel, so the sum of their sizes is a useless bound. With the mean
+    exponent $\bar λ$ taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two instants a distance $h$
+    apart it lies within $h^2 \max|u''| / 8$ of the chord, and $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past
+    the last instant the sum of sizes has decayed and is bound enough.
+    """
+    sizes = jnp.abs(shares)
+    total = jnp.sum(sizes)
+    weights = sizes / jnp.where(total > 0, total, 1.0)
+    mean = jnp.sum(weights * eigenvalues)
+    offsets = eigenvalues - mean
+    # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
+    horizon = ENVELOPE_DECADES / jnp.maximum(-mean.real, 1e-6 * jnp.max(jnp.abs(eigenvalues)) + 1e-300)
+    t = horizon * jnp.linspace(0.0, 1.0, ENVELOPE_INSTANTS, dtype=total.dtype) ** 2
+    growth = jnp.exp(offsets * t[:, None])
+    slow = jnp.abs(growth @ shares)
+    bend = jnp.abs(growth) @ (sizes * jnp.abs(offsets) ** 2)
+    chord = jnp.maximum(slow[1:], slow[:-1]) + jnp.diff(t) ** 2 / 8 * jnp.maximum(bend[1:], bend[:-1])
+    inside = jnp.max(jnp.exp(mean.real * t[:-1]) * chord)
+    beyond = jnp.sum(sizes * jnp.exp(eigenvalues.real * horizon))
+    bound = jnp.minimum(jnp.maximum(inside, beyond), total)
+    return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+
+
+def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
+    r"""Whether the motion decays although friction depends on speed.
+
+    The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
+    pressing acceleration by $E/κ$. The remainder that linearisation leaves out is then at most $C E^2$, so
+    $\dot E ≤ -r E + F C E^2$ with $r$ the slowest decay rate and $F = \sum e_k |f_k|$: once $F C E < r$, $E$ falls for ever.
+    """
+    linear = modes.linear
+    balance = linear.slip_margin / linear.pressing_margin
+    weights = jnp.abs(modes.slip) + balance * jnp.abs(modes.pressing)
+    size = jnp.sum(weights * jnp.abs(modal))
+    drive = jnp.sum(weights * jnp.abs(modes.remainder))
+    bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
+    rate = -jnp.max(modes.eigenvalues.real)
+    return (drive * bend * size < rate) & (size < LOWEST_SLIP * linear.slip_margin)
+
+
+def _sliding_coordinates(n: int, normal: int) -> np.ndarray:
+    return np.array([i for i in range(2 * n) if i not in (normal, n + normal)])
