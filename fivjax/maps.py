@@ -46,7 +46,9 @@ def bistability_map(
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
-    tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
+    tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s). With an axis p,
+    `p_crit` over the others is the middle of the two neighbours on it between which the limit cycle first appears;
+    `critical_perturbation` narrows that down.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, and values that the scene refuses.
@@ -80,6 +82,11 @@ def bistability_map(
         },
         coords=axes,
     )
+    if "p" in axes:
+        others = tuple(name for name in axes if name != "p")
+        rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(axes["p"]))
+        brackets, _ = _first_crossing(axes["p"], rows)
+        dataset["p_crit"] = (others, brackets.mean(axis=-1).reshape([len(axes[name]) for name in others]))
     labelled(dataset, scene, method=describe_method(method), t_max=t_max)
     dataset["verdict"].attrs.update(
         flag_values=np.array([verdict.value for verdict in MEANING], np.int8),

@@ -1,0 +1,203 @@
+"""The command line, `fivjax …`: the public API with sensible defaults, data and a picture of each result."""
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from . import plot
+from .event_exact import EventExact
+from .friction import Coulomb, ExponentialDecay
+from .load import Pulse
+from .maps import bistability_map
+from .results import check_writable, save, save_figure
+from .scene import Scene
+from .simulate import simulate
+from .steppers import AbstractStepper
+from .structure import belt_oscillator
+from .verdict import Verdict
+from .where_switched import WhereSwitched
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOptions:
+    """The scene; the defaults are the paper's Table 1 and Section 4."""
+
+    mu: float = 0.227
+    """constant friction coefficient"""
+    mu_static: float | None = None
+    """static coefficient; with --mu-dynamic, friction falls with slip speed (Eq. 1)"""
+    mu_dynamic: float | None = None
+    """dynamic coefficient of Eq. 1"""
+    decay: float = 0.5
+    """decay factor of Eq. 1 (s/m)"""
+    belt_speed: float = 3.0
+    """belt speed (m/s)"""
+    force: float = 100.0
+    """load (N)"""
+    p: float = 1.2
+    """perturbation coefficient: the kick raises the load to p times itself (Eq. 14)"""
+    duration: float = 0.1
+    """how long the kick lasts (s)"""
+    start: float = 0.0
+    """when it starts (s)"""
+    restitution: float = 0.0
+    """coefficient of restitution of the closing gap"""
+    m1: float = 0.53
+    """mass 1 (kg)"""
+    m2: float = 0.045
+    """mass 2 (kg)"""
+    c1: float = 1.0
+    """damper 1 (N s/m)"""
+    c2: float = 1.0
+    """damper 2 (N s/m)"""
+    k1: float = 100e3
+    """spring 1 (N/m)"""
+    k2: float = 101e3
+    """spring 2 (N/m)"""
+    theta: float = 0.01
+    """inclination of the belt (rad)"""
+
+    def scene(self) -> Scene:
+        names = ("m1", "m2", "c1", "c2", "k1", "k2", "theta")
+        if (self.mu_static is None) != (self.mu_dynamic is None):
+            missing = "--mu-dynamic" if self.mu_dynamic is None else "--mu-static"
+            raise ValueError(f"Friction that falls with speed needs both coefficients; {missing} is missing.")
+        falls = self.mu_static is not None
+        return Scene(
+            belt_oscillator(**{name: getattr(self, name) for name in names}),
+            ExponentialDecay(self.mu_static, self.mu_dynamic, self.decay) if falls else Coulomb(self.mu),
+            self.belt_speed,
+            Pulse(self.force, self.p, self.duration, self.start),
+            restitution=self.restitution,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class MethodOptions:
+    """How to step."""
+
+    method: Literal["event-exact", "where-switched"] = "event-exact"
+    """exact through contact events, or status switching at the ends of fixed steps"""
+    dt: float = 5e-5
+    """step of the where-switched method (s)"""
+
+    def stepper(self) -> AbstractStepper:
+        return EventExact() if self.method == "event-exact" else WhereSwitched(dt=self.dt)
+
+
+@dataclasses.dataclass(frozen=True)
+class Map:
+    """Bi-stability map: one trajectory for each pair of values, all in one batch. Writes OUT.nc and OUT.png."""
+
+    x: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "mu=0.05:0.228:64"
+    """parameter to the right: any of the scene's"""
+    y: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "p=1:4:64"
+    """parameter upwards"""
+    out: Path = Path("bistability")
+    """files to write, without suffix"""
+    t_max: float = 20.0
+    """time after which a lane without a verdict is called undecided (s)"""
+    memory: float = 2e9
+    """memory for lanes under way (bytes)"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
+
+    def run(self) -> None:
+        data, picture = _outputs(self.out)
+        scene, method = self.scene.scene(), self.method.stepper()
+        axes = dict(map(_axis, (self.x, self.y)))
+        if len(axes) != 2:
+            raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
+        dataset = bistability_map(scene, method=method, t_max=self.t_max, memory=self.memory, **axes)
+        save(dataset, data)
+        save_figure(plot.bistability(dataset), picture)
+        _say(data, picture)
+        for verdict in Verdict:
+            count = int((dataset["verdict"] == verdict).sum())
+            if count:
+                print(f"  {count:7d} lanes: {verdict.name.lower().replace('_', ' ')}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """One trajectory from sliding equilibrium through the kick. Writes OUT.nc and OUT.png."""
+
+    t1: float = 2.0
+    """end (s)"""
+    dt_save: float = 1e-4
+    """distance of saved instants (s)"""
+    quantity: Literal["displacement", "velocity", "acceleration"] = "acceleration"
+    """what to draw, along the belt"""
+    out: Path = Path("response")
+    """files to write, without suffix"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
+
+    def run(self) -> None:
+        data, picture = _outputs(self.out)
+        run = simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper())
+        save(run.to_dataset(), data)
+        save_figure(plot.response(run, self.quantity), picture)
+        _say(data, picture)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; sentences on standard error and exit code 2 for what is refused."""
+    keep_compiled_code()
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"map": Map, "simulate": Simulate},
+        prog="fivjax",
+        description="Friction-induced vibration: what a scene does after a kick.",
+        args=arguments,
+    )
+    try:
+        command.run()
+    except (ValueError, TypeError) as error:
+        print(f"fivjax: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def keep_compiled_code() -> None:
+    """Keep compiled code in the user's cache folder, unless JAX was told where to keep it."""
+    if jax.config.jax_compilation_cache_dir is None:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "fivjax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _axis(text: str) -> tuple[str, np.ndarray]:
+    try:
+        name, values = text.split("=")
+        start, stop, count = values.split(":")
+        low, high, points = float(start), float(stop), int(count)
+        if points < 1:
+            raise ValueError
+    except ValueError:
+        raise ValueError(
+            f"An axis must read NAME=FROM:TO:COUNT, such as mu=0.05:0.228:64, but reads {text!r}."
+        ) from None
+    if points > 1 and not high > low:
+        raise ValueError(f"Axis `{name}` must go up, but goes from {low:g} to {high:g}.")
+    return name, np.linspace(low, high, points)
+
+
+def _outputs(stem: Path) -> tuple[Path, Path]:
+    """The two files of a result, found writable before any work is done."""
+    stem = stem.with_suffix("") if stem.suffix in (".nc", ".png") else stem
+    data, picture = (stem.with_name(stem.name + suffix) for suffix in (".nc", ".png"))
+    return check_writable(data), check_writable(picture)
+
+
+def _say(*paths: Path) -> None:
+    print("\n".join(f"wrote {path}" for path in paths))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
