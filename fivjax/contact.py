@@ -107,6 +107,11 @@ def relative_velocity(mechanics: Mechanics, y: State) -> Float[Array, ""]:
     return y[_n(y) + mechanics.tangential] - mechanics.belt_speed
 
 
+def slip_speed(mechanics: Mechanics, contact: Contact, y: State) -> Float[Array, ""]:
+    """Slip against the friction force, in m/s; positive while the contact slides in the direction of its status."""
+    return -contact.direction * relative_velocity(mechanics, y)
+
+
 def gap(mechanics: Mechanics, y: State) -> Float[Array, ""]:
     """Distance from the belt, in m."""
     return y[mechanics.normal]
@@ -131,10 +136,10 @@ def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Flo
 
 
 def sliding_forces(
-    mechanics: Mechanics, free: Float[Array, " n"], direction: Float[Array, ""], slip_speed: Float[Array, ""]
+    mechanics: Mechanics, free: Float[Array, " n"], direction: Float[Array, ""], slip: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(T, N) in N while sliding, the friction force pointing in `direction`."""
-    mu = mechanics.friction(slip_speed)
+    mu = mechanics.friction(slip)
     normal_force = -free[mechanics.normal] / mechanics.normal_compliance(direction, mu)
     return direction * mu * normal_force, normal_force
 
@@ -144,15 +149,42 @@ def contact_forces(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(T, N) in N in the given status; N is negative beyond the instant where contact is lost."""
     free = free_acceleration(mechanics, load, y)
-    return _forces(mechanics, contact, free, y)
+    sliding = sliding_forces(mechanics, free, contact.direction, slip_speed(mechanics, contact, y))
+    return forces_by_status(mechanics, contact, free, sliding)
+
+
+def forces_by_status(
+    mechanics: Mechanics,
+    contact: Contact,
+    free: Float[Array, " n"],
+    sliding: tuple[Float[Array, ""], Float[Array, ""]],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in the given status, from the free accelerations and the forces that sliding would have."""
+    stick_t, stick_n = sticking_forces(mechanics, free)
+    slide_t, slide_n = sliding
+    none = jnp.zeros_like(slide_n)
+    return (
+        _by_status(contact, stick=stick_t, slide=slide_t, detach=none),
+        _by_status(contact, stick=stick_n, slide=slide_n, detach=none),
+    )
 
 
 def acceleration(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
     """Accelerations in the given status, in m/s²; those that the status forbids are exactly zero."""
     free = free_acceleration(mechanics, load, y)
-    tangential_force, normal_force = _forces(mechanics, contact, free, y)
+    return acceleration_under(mechanics, contact, free, *contact_forces(mechanics, contact, load, y))
+
+
+def acceleration_under(
+    mechanics: Mechanics,
+    contact: Contact,
+    free: Float[Array, " n"],
+    tangential_force: Float[Array, ""],
+    normal_force: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """Accelerations from the free ones and the contact forces, in m/s²."""
     total = free + mechanics.from_tangential * tangential_force + mechanics.from_normal * normal_force
-    index = jnp.arange(_n(y))
+    index = jnp.arange(free.shape[0])
     held = (index == mechanics.normal) & (contact.status != Status.DETACH)
     held = held | ((index == mechanics.tangential) & (contact.status == Status.STICK))
     return jnp.where(held, 0.0, total)
@@ -163,14 +195,24 @@ def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: St
 
     stick: distances of T from both edges of the friction cone; slide: N and the slip speed; detach: the gap, twice.
     """
-    tangential_force, normal_force = contact_forces(mechanics, contact, load, y)
+    forces = contact_forces(mechanics, contact, load, y)
+    return guards_under(mechanics, contact, *forces, slip_speed(mechanics, contact, y), gap(mechanics, y))
+
+
+def guards_under(
+    mechanics: Mechanics,
+    contact: Contact,
+    tangential_force: Float[Array, ""],
+    normal_force: Float[Array, ""],
+    slip: Float[Array, ""],
+    height: Float[Array, ""],
+) -> Float[Array, "2"]:
+    """`guards` from the contact forces, the slip speed and the gap; linear in all of them."""
     edge = mechanics.friction.static * normal_force
-    slip_speed = -contact.direction * relative_velocity(mechanics, y)
-    height = gap(mechanics, y)
     return _by_status(
         contact,
         stick=jnp.stack([edge - tangential_force, edge + tangential_force]),
-        slide=jnp.stack([normal_force, slip_speed]),
+        slide=jnp.stack([normal_force, slip]),
         detach=jnp.stack([height, height]),
     )
 
@@ -308,20 +350,6 @@ def _resting(mechanics: Mechanics, load: Float[Array, ""], y: State, resolution:
     free_n = free_acceleration(mechanics, load, y)[mechanics.normal]
     rests = rate + 0.5 * free_n * resolution <= 0
     return jnp.where(jnp.arange(y.shape[0]) == _n(y) + mechanics.normal, jnp.where(rests, 0.0, rate), y)
-
-
-def _forces(
-    mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], y: State
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    sticking = sticking_forces(mechanics, free)
-    slip_speed = -contact.direction * relative_velocity(mechanics, y)
-    sliding = sliding_forces(mechanics, free, contact.direction, slip_speed)
-    none = jnp.zeros_like(slip_speed)
-    tangential_force, normal_force = (
-        _by_status(contact, stick=stick, slide=slide, detach=none)
-        for stick, slide in zip(sticking, sliding, strict=True)
-    )
-    return tangential_force, normal_force
 
 
 def _by_status(contact: Contact, *, stick, slide, detach):

@@ -6,9 +6,11 @@ instant where sliding ends.
 """
 
 import abc
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.experimental.jet import jet
 from jaxtyping import Array, Float
 
 from . import arguments
@@ -29,6 +31,13 @@ class AbstractFriction(eqx.Module):
     @abc.abstractmethod
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         """The coefficient of friction while sliding at this slip speed."""
+
+    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
+        """The last Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one)."""
+        order = len(slip) - 1
+        derivatives = [math.factorial(k) * slip[k] for k in range(1, order + 1)]
+        _, series = jet(self.__call__, (slip[0],), (derivatives,))
+        return series[-1] / math.factorial(order)
 
     @abc.abstractmethod
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -95,6 +104,14 @@ class ExponentialDecay(AbstractFriction):
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)
+
+    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
+        # The exponential's own recurrence, Ė = -d u̇ E, does not start anew at every order as the general way does.
+        order = len(slip) - 1
+        falling = [self(slip[0]) - self.mu_dynamic]
+        for k in range(1, order + 1):
+            falling.append(-self.decay / k * sum(j * slip[j] * falling[k - j] for j in range(1, k + 1)))
+        return falling[order]
 
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         # Both derivatives shrink in size with slip speed, so the bound is the value at the lower end.

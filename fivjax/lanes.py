@@ -23,9 +23,9 @@ from . import contact as physics
 from . import orbit as orbits
 from .contact import Contact, Mechanics, State
 from .load import AbstractLoad
-from .orbit import Orbit, Resolution
+from .orbit import Orbit
 from .scene import Scene, steady_sliding
-from .sliding import SlidingModes, linear_sliding, sliding_modes, slides_forever
+from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
 from .steppers import AbstractStepper
 from .verdict import Verdict
 

@@ -4,20 +4,19 @@ import functools
 import itertools
 import json
 
-import jax
 import numpy as np
 import xarray as xr
 
 from . import arguments
-from .lanes import Outcome, run_to_verdict
 from .event_exact import EventExact
+from .lanes import Outcome, run_to_verdict
 from .load import Pulse
 from .precision import in_double_precision
 from .results import labelled
 from .scene import Scene
 from .steppers import AbstractStepper
-from .where_switched import WhereSwitched
 from .verdict import MEANING, Verdict
+from .where_switched import WhereSwitched
 
 
 @in_double_precision
@@ -46,9 +45,9 @@ def bistability_map(
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
-    tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s). With an axis p,
-    `p_crit` over the others is the middle of the two neighbours on it between which the limit cycle first appears;
-    `critical_perturbation` narrows that down.
+    tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
+    With an axis p, `p_crit` over the others is the middle of the two neighbours on it between which the limit cycle
+    first appears; `critical_perturbation` narrows that down.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, and values that the scene refuses.

@@ -5,7 +5,7 @@ Okabe and Ito's and matplotlib's perceptually uniform maps, and what matters is 
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
@@ -40,8 +40,8 @@ def bistability(
     """A bi-stability map: where sliding returns, and how large the limit cycle is elsewhere.
 
     **Arguments:** `dataset` from `bistability_map` with two axes (the first is drawn to the right); `critical`, from
-    `critical_perturbation`, drawn over it instead of the map's own, coarser boundary; `value`, what colours the limit cycles: "amplitude", "decided_at",
-    "contact_events" or "last_event".
+    `critical_perturbation`, drawn over it instead of the map's own, coarser boundary; `value`, what colours the limit
+    cycles: "amplitude", "decided_at", "contact_events" or "last_event".
 
     **Raises:** `ValueError` for a map that does not have two axes.
     """
@@ -149,14 +149,11 @@ def perturbation(run: Trajectory, *, figure: Figure | None = None) -> Figure:
     """The load's pulse and the tangential acceleration that answers it (Fig. 8)."""
     figure = figure or Figure(figsize=(8.0, 4.8), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
-    force, jumps = run.scene.load, [float(jump) for jump in run.scene.load.jumps]
-    edges = [float(run.t[0]), *jumps, float(run.t[-1])]
-    levels = [float(force(0.5 * (a + b))) for a, b in zip(edges, edges[1:], strict=False)]
-    upper.stairs(levels, edges, baseline=None, color=VERMILION, lw=1.6)
-    upper.set(ylabel="load (N)", ylim=(0, 1.15 * max(levels)))
+    upper.step(run.t, run.load, where="post", color=VERMILION, lw=1.6)
+    upper.set(ylabel="load (N)", ylim=(0, 1.15 * np.max(run.load)))
     tangential = run.scene.structure.tangential
     lower.plot(run.t, np.asarray(run.acceleration)[:, tangential], color=BLUE, lw=0.7)
-    lower.set(xlabel="time (s)", ylabel="tangential acceleration (m/s²)", xlim=(edges[0], edges[-1]))
+    lower.set(xlabel="time (s)", ylabel="tangential acceleration (m/s²)", xlim=(run.t[0], run.t[-1]))
     return figure
 
 
@@ -165,7 +162,7 @@ def comparison(
 ) -> Figure:
     """The tangential response of several runs by label, each in a row of its own, on one scale (Fig. 9)."""
     figure = figure or Figure(figsize=(8.0, 1.2 + 1.9 * len(runs)), layout="constrained")
-    rows: Sequence[Axes] = figure.subplots(len(runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    rows = list(figure.subplots(len(runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0])
     for axes, (name, run), colour in zip(rows, runs.items(), [BLUE, ORANGE, GREEN, PURPLE] * len(runs), strict=False):
         tangential = run.scene.structure.tangential
         axes.plot(run.t, _of(run, quantity)[:, tangential], color=colour, lw=0.7)

@@ -38,6 +38,7 @@ QUANTITIES = {
     "acceleration": ("acceleration", "m/s2"),
     "status": ("contact status (0 stick, 1 slide, 2 detach)", "1"),
     "normal_force": ("normal force", "N"),
+    "load": ("load", "N"),
     "friction_force": ("friction force", "N"),
     "verdict": ("verdict", "1"),
     "amplitude": ("peak tangential speed on the final orbit", "m/s"),

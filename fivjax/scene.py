@@ -1,7 +1,6 @@
 """A scene: a structure pressed onto a moving belt, with a friction law and a load."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float

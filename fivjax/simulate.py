@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from . import arguments
 from . import contact as physics
-from .contact import Contact, Mechanics, State
+from .contact import Mechanics, State
 from .event_exact import EventExact
-from .precision import is_known, real, returning_numpy
+from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
 from .steppers import MOST_ADVANCES, AbstractStepper, advance_by
@@ -29,6 +29,7 @@ class Trajectory(eqx.Module):
     status: Int[Array, " T"]  # 0 stick, 1 slide, 2 detach
     normal_force: Float[Array, " T"]  # N
     friction_force: Float[Array, " T"]  # N
+    load: Float[Array, " T"]  # N
     scene: Scene
 
     @property
@@ -52,13 +53,14 @@ class Trajectory(eqx.Module):
                 "status": ("t", np.asarray(self.status)),
                 "normal_force": ("t", np.asarray(self.normal_force)),
                 "friction_force": ("t", np.asarray(self.friction_force)),
+                "load": ("t", np.asarray(self.load)),
             },
             coords={"t": np.asarray(self.t), "coordinate": np.arange(self.displacement.shape[1])},
         )
         return labelled(dataset, self.scene)
 
 
-@returning_numpy
+@in_double_precision
 def simulate(
     scene: Scene,
     t1: float = 2.0,
@@ -95,11 +97,11 @@ def simulate(
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    return _simulate(scene, method, y0, saved, most)
+    return Trajectory(**jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most)), scene=scene)
 
 
 @eqx.filter_jit
-def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int) -> Trajectory:
+def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int) -> dict:
     mechanics = Mechanics(scene)
     # Steps end on the load's jumps as well as on the saved instants.
     jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
@@ -125,16 +127,16 @@ def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Arr
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
         contacts, load, y
     )
-    return Trajectory(
-        t=saved,
-        displacement=y[:, :n],
-        velocity=y[:, n:],
-        acceleration=jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y),
-        status=contacts.status.astype(jnp.int8),
-        normal_force=normal_force,
-        friction_force=friction_force,
-        scene=scene,
-    )
+    return {
+        "t": saved,
+        "displacement": y[:, :n],
+        "velocity": y[:, n:],
+        "acceleration": jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y),
+        "status": contacts.status.astype(jnp.int8),
+        "normal_force": normal_force,
+        "friction_force": friction_force,
+        "load": load,
+    }
 
 
 def _initial_state(scene: Scene, y0) -> State:

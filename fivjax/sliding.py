@@ -152,7 +152,8 @@ def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, 
 
 
 def envelope_peak(shares: Complex[Array, " k"], eigenvalues: Complex[Array, " k"]) -> Float[Array, ""]:
-    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes, tight also for near-parallel ones.
+    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes,
+    tight also for near-parallel ones.
 
     Near a coalescence the shares $a_k$ are huge and cancel, so the sum of their sizes is a useless bound. With the mean
     exponent $\bar λ$ taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two instants a distance $h$

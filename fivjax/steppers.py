@@ -24,7 +24,6 @@ from .contact import Contact, Mechanics, State
 from .orbit import Resolution
 from .scene import Scene
 
-
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
 

@@ -114,7 +114,8 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
         arguments.real_number(name, value, minimum=0)
     arguments.real_number("theta", theta)
     parameters = {
-        name: real(value) for name, value in dict(m1=m1, m2=m2, c1=c1, c2=c2, k1=k1, k2=k2, theta=theta).items()
+        name: real(value)
+        for name, value in {"m1": m1, "m2": m2, "c1": c1, "c2": c2, "k1": k1, "k2": k2, "theta": theta}.items()
     }
     m1, m2, c1, c2, k1, k2, theta = parameters.values()
     sin, cos = jnp.sin(theta), jnp.cos(theta)

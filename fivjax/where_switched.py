@@ -62,12 +62,12 @@ class WhereSwitched(AbstractStepper):
         load, h = args.load(0.5 * (t0 + t1)), t1 - t0
         smooth, error = self._smooth_step(mechanics, contact, load, y0, h)
         y1, next_contact, _ = self._switched(mechanics, contact, load, smooth, h)
-        dense_info = dict(
-            y0=y0,
-            y1=y1,
-            k0=h * rates(mechanics, contact, load, y0),
-            k1=h * rates(mechanics, next_contact, load, y1),
-        )
+        dense_info = {
+            "y0": y0,
+            "y1": y1,
+            "k0": h * rates(mechanics, contact, load, y0),
+            "k1": h * rates(mechanics, next_contact, load, y1),
+        }
         return y1, error, dense_info, StepperState(mechanics, next_contact), diffrax.RESULTS.successful
 
     def advance(
@@ -88,7 +88,10 @@ class WhereSwitched(AbstractStepper):
 
     def _switched(self, mechanics, contact, load, smooth, h) -> Advance:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
-        next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, h)
+        # An impact noticed up to a step late is that much too fast, which keeps rebounds of up to e/(1 - e) steps alive.
+        e = mechanics.restitution
+        resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
+        next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
         return Advance(y, next_contact, h)
 
 

@@ -1,0 +1,93 @@
+"""Figures of trajectories, maps and critical perturbations, as the README states them.
+
+    python tests/measure_maps.py [errors] [table2] [map] [speed]
+
+Each word picks one study; without any, all run (some minutes on two cores). The reference is `tests/oracle.py`.
+"""
+
+import json
+import sys
+import time
+
+import fivjax as fj
+import numpy as np
+import oracle
+from tqdm import tqdm
+
+MAP = {"mu": (0.05, 0.228), "p": (1.0, 4.0)}
+
+
+def scene(**changes) -> fj.Scene:
+    paper = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, fj.Pulse(100.0, 1.2))
+    return paper.replace(**changes)
+
+
+def errors() -> None:
+    """State error, relative to each coordinate's size, at 0.5 s (9 events) and 2 s (345 events): μ = 0.227, p = 1.3, 3 m/s."""
+    for t1, kind in ((0.1, "one status"), (0.5, "9 events"), (2.0, "345 events")):
+        reference = oracle.simulate(
+            oracle.paper_model(mu=0.227, belt_speed=3.0, p=1.3), t1, np.array([0.0, t1]), rtol=1e-13
+        )
+        exact = np.concatenate([reference.q[-1], reference.v[-1]])
+        methods = {"EventExact()": fj.EventExact()}
+        methods |= {f"WhereSwitched(Tsit5, dt={dt:g})": fj.WhereSwitched(dt=dt) for dt in (2e-4, 5e-5, 1e-5)}
+        for name, method in methods.items():
+            run = fj.simulate(scene(p=1.3), t1, t1, method)
+            state = np.concatenate([run.displacement[-1], run.velocity[-1]])
+            scale = np.where(exact == 0, 1.0, np.abs(exact))
+            print(f"{name:32s} t = {t1} s ({kind}): {np.max(np.abs(state - exact) / scale):.1e}")
+
+
+def table2() -> None:
+    """Table 2 and p_crit behind it."""
+    speeds = [0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0]
+    begin = time.perf_counter()
+    found = fj.critical_perturbation(scene(), belt_speed=speeds, p_range=(1.0, 1.3), tolerance=1e-7, progress=False)
+    print(f"{time.perf_counter() - begin:.0f} s, compilation included")
+    for speed in speeds:
+        row = found.sel(belt_speed=speed)
+        p = float(row["p_crit"])
+        print(
+            f"v = {speed:5g} m/s: p_crit = {p:.8f} ± {float(row['p_crit_error']):.0e}, first of 0.01: {np.ceil(100 * p) / 100}"
+        )
+
+
+def map_() -> None:
+    """The paper's map, 64 × 64, and 200 of its lanes by the oracle."""
+    m = paper_map(64)
+    print("64 × 64:", {name: count for name, count in json.loads(m.attrs["counts"]).items() if count})
+    kinds = {0: "sliding", 1: "limit cycle"}
+    cells = np.random.default_rng(64).choice(m["verdict"].size, 200, replace=False)
+    agree = differ = open_ = 0
+    for cell in tqdm(cells, desc="oracle", disable=None):
+        i, j = np.unravel_index(cell, m["verdict"].shape)
+        verdict = int(m["verdict"][i, j])
+        model = oracle.paper_model(mu=float(m["mu"][i]), belt_speed=3.0, p=float(m["p"][j]))
+        kind = oracle.verdict(model, t_max=40.0).kind
+        open_ += verdict < 0
+        agree += verdict >= 0 and kind == kinds[verdict]
+        differ += verdict >= 0 and kind != kinds[verdict]
+    print(f"oracle: {agree} lanes agree, {differ} differ, {open_} undecided")
+
+
+def speed() -> None:
+    """Wall time and lane-cycles (one trajectory over 1/68 s) per second, first call and warm."""
+    for points in (32, 64):
+        for call in ("first call", "warm"):
+            begin = time.perf_counter()
+            m = paper_map(points)
+            wall = time.perf_counter() - begin
+            lasted = np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"])
+            print(f"{points} × {points}, {call}: {wall:.1f} s, {68 * lasted.sum() / wall:.3g} lane-cycles/s")
+
+
+def paper_map(points: int):
+    axes = {name: np.linspace(low, high, points) for name, (low, high) in MAP.items()}
+    return fj.bistability_map(scene(), progress=False, **axes)
+
+
+if __name__ == "__main__":
+    studies = {"errors": errors, "table2": table2, "map": map_, "speed": speed}
+    for name in sys.argv[1:] or studies:
+        print(f"--- {name}: {studies[name].__doc__}")
+        studies[name]()

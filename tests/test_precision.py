@@ -1,0 +1,46 @@
+"""Double precision for a newcomer, and nobody's settings changed: looked at in a fresh process."""
+
+import subprocess
+import sys
+import textwrap
+
+
+def in_a_fresh_process(code: str) -> str:
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def test_a_newcomer_gets_double_precision_and_keeps_single_elsewhere():
+    """Importing and using fivjax must neither round its results nor turn x64 on for the rest of the program."""
+    in_a_fresh_process(
+        """
+        import jax, jax.numpy as jnp, numpy as np
+        import fivjax as fj
+        assert not jax.config.jax_enable_x64
+        scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), 3.0, fj.Pulse(force=100.0, p=1.3))
+        assert scene.structure.mass.dtype == np.float64
+        run = fj.simulate(scene, 0.02, 1e-3)
+        assert isinstance(run.displacement, np.ndarray) and run.displacement.dtype == np.float64
+        assert (run.displacement + 1).dtype == np.float64
+        assert fj.sliding_equilibrium(scene).dtype == np.float64
+        m = fj.bistability_map(scene, p=[1.05], progress=False)
+        assert m["decided_at"].dtype == np.float64
+        assert not jax.config.jax_enable_x64
+        assert jnp.ones(2).dtype == jnp.float32
+        """
+    )
+
+
+def test_single_precision_input_does_not_become_single_precision_physics():
+    """A parameter that arrives as float32 is one float32 number, computed with in double precision."""
+    in_a_fresh_process(
+        """
+        import jax.numpy as jnp, numpy as np
+        import fivjax as fj
+        friction = fj.Coulomb(mu=jnp.float32(0.25))
+        assert friction.mu.dtype == np.float64 and float(friction.mu) == 0.25
+        """
+    )

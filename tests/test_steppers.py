@@ -1,0 +1,232 @@
+"""Both steppers against closed forms, against each other, and in a plain `diffrax.diffeqsolve`."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+
+import fivjax as fj
+from fivjax.contact import Mechanics, Status, status_from_forces
+
+RUNGE_KUTTA = [
+    diffrax.Heun,
+    diffrax.Midpoint,
+    diffrax.Ralston,
+    diffrax.Bosh3,
+    diffrax.Tsit5,
+    diffrax.Dopri5,
+    diffrax.Dopri8,
+]
+
+
+def point_mass(mu=0.0, mu_static=None, stiffness=1.0, belt_speed=0.0, force=1.0, restitution=0.0) -> fj.Scene:
+    """One unit mass with a spring along the belt, pressed on by a load."""
+    structure = fj.Structure(
+        mass=np.eye(2),
+        damping=np.zeros((2, 2)),
+        stiffness=np.diag([stiffness, 0.0]),
+        load_direction=[0.0, -1.0],
+        tangential=0,
+        normal=1,
+    )
+    return fj.Scene(structure, fj.Coulomb(mu, mu_static), belt_speed, fj.ConstantLoad(force), restitution=restitution)
+
+
+def events(scene: fj.Scene, y0, t1: float, method=None) -> list[tuple[float, int]]:
+    """(time, new status) of every status change, from the stepper's own advances."""
+    method = method or fj.EventExact()
+    with jax.enable_x64(True):
+        mechanics = Mechanics(scene)
+        load = scene.load(0.0)
+        y = jnp.asarray(y0, float)
+        contact = status_from_forces(mechanics, load, y)
+        advance = jax.jit(lambda contact, y, h: method.advance(mechanics, contact, load, y, h))
+        t, seen = 0.0, []
+        while t < t1:
+            after = advance(contact, y, jnp.asarray(t1 - t))
+            t += float(after.h)
+            if int(after.contact.status) != int(contact.status):
+                seen.append((t, int(after.contact.status)))
+            y, contact = after.y, after.contact
+    return seen
+
+
+def test_stick_slip_period_of_a_block_with_two_friction_forces():
+    """t_stick = 2Δ/(kv) and t_slip = (2/ω)(π - arctan(Δω/(kv))): wrong if an event is late or the status after it is."""
+    v, delta = 0.2, 0.5
+    scene = point_mass(mu=0.5, mu_static=1.0, belt_speed=v)
+    seen = events(scene, [1.0, 0.0, v, 0.0], 40.0)
+    ends = [t for t, status in seen if status == Status.SLIDE]
+    begins = [t for t, status in seen if status == Status.STICK]
+    stick, slip = 2 * delta / v, 2 * (np.pi - np.arctan(delta / v))
+    # Rounding of times near 40 s, through four periods.
+    np.testing.assert_allclose(np.diff(ends), stick + slip, atol=1e-12)
+    np.testing.assert_allclose(np.array(begins) - np.array(ends[: len(begins)]), slip, atol=1e-12)
+    assert stick + slip == pytest.approx(8.902605408, abs=1e-9)
+
+
+def test_oscillator_with_coulomb_friction_comes_to_rest_where_it_should():
+    """Each half period takes 2μN/k off the amplitude; the mass stays where the spring can no longer move it."""
+    scene = point_mass(mu=1.0)
+    run = fj.simulate(scene, 30.0, 0.01, y0=([12.0, 0.0], [6.0, 0.0]))
+    peak = np.hypot(13.0, 6.0) - 1.0
+    assert run.displacement[:, 0].max() == pytest.approx(peak, abs=1e-4)  # the peak lies between saved instants
+    assert run.displacement[-1, 0] == pytest.approx(14.0 - peak, abs=1e-12)
+    assert run.status[-1] == Status.STICK
+    at_rest = [t for t, status in events(scene, [12.0, 0.0, 6.0, 0.0], 30.0) if status == Status.STICK]
+    assert at_rest[-1] == pytest.approx(np.arctan2(6.0, 13.0) + 7 * np.pi, abs=1e-12)
+
+
+def test_bouncing_mass_comes_to_rest_after_endless_bounces():
+    """At rest after √(2h/g)(1+e)/(1-e), never below the floor: the sum of a geometric series of bounces."""
+    scene = point_mass(force=9.81, restitution=0.5, stiffness=0.0)
+    run = fj.simulate(scene, 2.0, 0.001, y0=([0.0, 1.0], [0.0, 0.0]))
+    assert run.gap.min() >= 0
+    rest = np.sqrt(2 / 9.81) * 1.5 / 0.5
+    touching = [t for t, status in events(scene, [0.0, 1.0, 0.0, 0.0], 2.0) if status != Status.DETACH]
+    # Bounces below a millionth of the first are not followed, which ends the series that much early.
+    assert touching[0] == pytest.approx(rest, abs=1e-6)
+    assert np.all(run.gap[run.t > rest] == 0)
+    assert np.all(run.normal_force[run.t > rest] == pytest.approx(9.81))
+
+
+def test_where_switched_meets_the_closed_forms_to_first_order():
+    """Halving the step halves the error in the resting place and the stick–slip state, and nothing stays below the floor."""
+    errors = []
+    for dt in (2e-3, 1e-3, 5e-4):
+        run = fj.simulate(point_mass(mu=1.0), 30.0, 0.5, fj.WhereSwitched(dt=dt), y0=([12.0, 0.0], [6.0, 0.0]))
+        errors.append(abs(run.displacement[-1, 0] - (15.0 - np.hypot(13.0, 6.0))))
+        bounce = fj.simulate(
+            point_mass(force=9.81, restitution=0.5, stiffness=0.0),
+            2.0,
+            0.01,
+            fj.WhereSwitched(dt=dt),
+            y0=([0.0, 1.0], [0.0, 0.0]),
+        )
+        assert bounce.gap.min() >= 0
+        assert np.all(bounce.gap[bounce.t > 1.4] == 0)
+    assert errors[-1] < 2 * 5e-4
+    assert errors[-1] < errors[0]
+
+
+@pytest.mark.parametrize("solver", RUNGE_KUTTA, ids=lambda solver: solver.__name__)
+def test_where_switched_has_the_order_of_its_solver_while_the_status_lasts(solver, paper_scene):
+    """Within one status the wrapped Runge–Kutta method must keep its order: the field it integrates is smooth."""
+    scene = paper_scene.replace(p=1.05)
+    exact = oracle.propagate(oracle.paper_model(mu=0.227, belt_speed=3.0, p=1.05), 0.05, np.array([0.0, 0.05]))
+    order = solver().order(None)
+    # Coarse enough that the error of the best of them stands clear of rounding.
+    steps = {2: [200, 400], 3: [200, 400], 5: [40, 80], 8: [8, 16]}[order]
+    errors = []
+    for count in steps:
+        run = fj.simulate(scene, 0.05, 0.05, fj.WhereSwitched(solver(), dt=0.05 / count))
+        assert set(run.status) == {Status.SLIDE}
+        errors.append(np.abs(run.velocity[-1] - exact.v[-1]).max())
+    observed = np.log2(errors[0] / errors[1])
+    assert observed > order - 0.4
+
+
+def test_where_switched_error_falls_in_proportion_to_the_step_after_events(paper_scene):
+    """First order after events, as its documentation says: not worse, and not silently something else."""
+    scene = paper_scene.replace(p=1.3)
+    exact = fj.simulate(scene, 0.5, 0.5)
+    steps = [2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5]
+    errors = [
+        np.abs(fj.simulate(scene, 0.5, 0.5, fj.WhereSwitched(dt=dt)).velocity[-1] - exact.velocity[-1]).max()
+        for dt in steps
+    ]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    # The phase of events within steps scatters the errors about the trend.
+    assert 0.6 < slope < 1.6
+    assert errors[-1] < 2e-4
+
+
+@pytest.mark.parametrize("method", [fj.EventExact(), fj.WhereSwitched(dt=1e-4)], ids=["exact", "where"])
+def test_plain_diffeqsolve_gives_what_simulate_gives(method, paper_scene):
+    """Both steppers are diffrax solvers: the scene in `args`, the status in the solver state, dense output inside steps."""
+    scene = paper_scene.replace(p=1.3)
+    run = fj.simulate(scene, 0.5, 1e-4, method)
+    with jax.enable_x64(True):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(fj.vector_field),
+            method,
+            0.0,
+            0.5,
+            None,
+            jnp.concatenate([run.displacement[0], run.velocity[0]]),
+            args=scene,
+            stepsize_controller=diffrax.StepTo(jnp.asarray(run.t)),
+            saveat=diffrax.SaveAt(ts=jnp.asarray(run.t[::100])),
+            max_steps=10_000,
+        )
+    ys = np.asarray(solution.ys)
+    assert solution.result == diffrax.RESULTS.successful
+    # The same steps in the same order; interpolation at their ends rounds.
+    np.testing.assert_allclose(ys[:, :3], run.displacement[::100], atol=1e-13)
+    np.testing.assert_allclose(ys[:, 3:], run.velocity[::100], atol=1e-10)
+
+
+def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
+    """Dense output must be as exact as the step, also where several events lie inside one diffrax step."""
+    scene = paper_scene.replace(p=2.0)
+    run = fj.simulate(scene, 0.3, 1e-3)
+    with jax.enable_x64(True):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(fj.vector_field),
+            fj.EventExact(),
+            0.0,
+            0.3,
+            None,
+            jnp.concatenate([run.displacement[0], run.velocity[0]]),
+            args=scene,
+            stepsize_controller=diffrax.StepTo(jnp.array([0.0, 0.1, 0.2, 0.3])),
+            saveat=diffrax.SaveAt(ts=jnp.asarray(run.t)),
+        )
+    assert np.count_nonzero(np.diff(run.status)) > 15
+    # Rounding, multiplied by the growth of differences through some thirty events.
+    np.testing.assert_allclose(np.asarray(solution.ys)[:, :3], run.displacement, atol=1e-13)
+
+
+def test_a_grazing_dip_inside_one_advance_is_found():
+    """A gap that closes and opens again within one step must be seen, though it is open at both of the step's ends."""
+    from fivjax.event_exact import _march_to_roots
+
+    with jax.enable_x64(True):
+        for depth in (1e-1, 1e-4, 1e-8, 1e-12):
+            # (x - 0.6)² - depth: positive at both ends, two roots in between.
+            c = [jnp.array([0.36 - depth]), jnp.array([-1.2]), jnp.array([1.0])]
+            x, fires = _march_to_roots(c)
+            assert bool(fires[0])
+            assert float(x[0]) == pytest.approx(0.6 - np.sqrt(depth), abs=1e-7)
+            # And raised by as much, it stays clear: no event.
+            c = [jnp.array([0.36 + depth]), jnp.array([-1.2]), jnp.array([1.0])]
+            assert not bool(_march_to_roots(c)[1][0])
+
+
+def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
+    """The march must stop at the first real root in [0, 1] and nowhere else; NumPy finds all roots."""
+    from fivjax.event_exact import _march_to_roots
+
+    rng = np.random.default_rng(1)
+    coefficients = rng.normal(size=(400, 8)) / np.arange(1, 9)
+    coefficients[:, 0] = np.abs(coefficients[:, 0]) + 1e-3
+    with jax.enable_x64(True):
+        x, fires = map(np.asarray, _march_to_roots([jnp.asarray(column) for column in coefficients.T]))
+    for row, position, fired in zip(coefficients, x, fires, strict=True):
+        roots = np.roots(row[::-1])
+        real = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0) & (roots.real < 1)].real)
+        assert fired == bool(len(real))
+        if fired:
+            assert position == pytest.approx(real[0], abs=1e-7)  # NumPy's own accuracy at near-double roots
+    assert fires.sum() > 50
+
+
+def test_a_step_clipped_to_any_length_is_exact(paper_scene):
+    """Event times must not depend on where advances happen to end: saved at different distances, the states agree."""
+    scene = paper_scene.replace(p=1.3)
+    runs = [fj.simulate(scene, 1.2, dt) for dt in (0.4, 0.01, 1e-4)]
+    for run, every in zip(runs, (1, 40, 4000), strict=True):
+        # A contact event every few milliseconds, rounding multiplied on the way.
+        np.testing.assert_allclose(run.displacement[::every], runs[0].displacement, atol=1e-12)

@@ -1,0 +1,145 @@
+"""The two proofs: neither may hold where it should not, and both must hold soon where they can."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.contact import Contact, Mechanics, Status
+from fivjax.orbit import Resolution, new_orbit, observe
+from fivjax.sliding import envelope_peak, linear_sliding, slides_forever, sliding_modes
+
+
+def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):
+    t = np.linspace(0.0, t_end, points)
+    return np.abs(sum(a * np.exp(ev * t) for a, ev in zip(shares, eigenvalues, strict=True))).max()
+
+
+@pytest.mark.parametrize("apart", [20.0, 3.0, 0.3, 1e-2, 1e-4])
+def test_the_envelope_is_a_bound_and_a_tight_one(apart):
+    """Too low a bound would prove what is false; too high a one costs hundreds of cycles near the stability limit."""
+    rng = np.random.default_rng(int(1e4 * apart))
+    for _ in range(20):
+        mean = -rng.uniform(0.5, 2.0) + 427j
+        split = apart * np.exp(1j * rng.uniform(0.2, np.pi - 0.2)) / 2
+        # The slower of the two still decays.
+        split = split if abs(split.real) < 0.45 else split * 0.45 / abs(split.real)
+        eigenvalues = np.array([mean + split, mean - split])
+        # Near-parallel modes: huge shares that cancel to a sum of size one.
+        shares = rng.normal() / apart * np.array([1, -1]) + rng.normal(size=2) + 1j * rng.normal(size=2)
+        with jax.enable_x64(True):
+            bound = float(envelope_peak(jnp.asarray(shares), jnp.asarray(eigenvalues)))
+        true = brute_force_peak(shares, eigenvalues)
+        assert bound >= true * (1 - 1e-9)
+        # What is lost: chords between instants, and the sum of sizes at the end of the horizon.
+        assert bound <= 1.08 * true
+
+
+def modes_of(scene: fj.Scene):
+    with jax.enable_x64(True):
+        linear = jax.tree.map(lambda leaf: leaf[None], linear_sliding(scene))
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), sliding_modes(linear))
+
+
+def proved(scene: fj.Scene, q, v) -> bool:
+    with jax.enable_x64(True):
+        contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.asarray(1.0))
+        y = jnp.concatenate([jnp.asarray(q), jnp.asarray(v)])
+        return bool(slides_forever(Mechanics(scene), modes_of(scene), contact, y))
+
+
+@pytest.mark.parametrize(
+    "friction",
+    [fj.Coulomb(0.1), fj.Coulomb(0.227), fj.Coulomb(0.2282), fj.ExponentialDecay(0.2, 0.19, 0.5)],
+    ids=["low", "close", "closer", "falling"],
+)
+def test_proved_sliding_never_meets_an_event_and_the_proof_is_not_idle(friction):
+    """Random states: where the proof holds, a long run must show no event; and it must hold for the smaller ones."""
+    scene = fj.Scene(fj.belt_oscillator(), friction, 2.0, fj.ConstantLoad(100.0))
+    q0 = fj.sliding_equilibrium(scene)
+    rng = np.random.default_rng(3)
+    held, events = 0, 0
+    for size in np.geomspace(2e-6, 3e-3, 16):
+        dq, dv = size * rng.normal(size=3), 427 * size * rng.normal(size=3)
+        dq[2] = dv[2] = 0.0
+        run = fj.simulate(scene, 6.0, 5e-3, y0=(q0 + dq, dv))
+        quiet = set(run.status) == {Status.SLIDE}
+        holds = proved(scene, q0 + dq, dv)
+        assert quiet or not holds
+        held += holds
+        events += not quiet
+    assert held >= 3, "a proof that never holds decides nothing"
+    assert events >= 2, "without events the check would prove nothing"
+
+
+def test_no_proof_while_it_may_still_grow(paper_scene):
+    """p = 1.193: quiet for a second after the kick, then squeal. A quiet interval must not count as proof."""
+    run = fj.simulate(paper_scene.replace(p=1.193), 1.05, 0.01)
+    assert set(run.status) == {Status.SLIDE}
+    for t in (0.2, 0.5, 0.8, 1.0):
+        row = round(t / 0.01)
+        assert not proved(paper_scene, run.displacement[row], run.velocity[row])
+
+
+def test_no_proof_above_the_stability_limit():
+    """At μ = 0.25 sliding is unstable: however small the motion, it grows."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.25), 3.0, fj.ConstantLoad(100.0))
+    q0 = fj.sliding_equilibrium(scene)
+    assert not proved(scene, q0 + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
+
+
+def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True):
+    """An orbit that has seen these crossing states, each entered by a step whose velocity rises through zero."""
+    with jax.enable_x64(True):
+        resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
+        step = jax.jit(
+            lambda orbit, before, after, changed: observe(
+                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, resolution
+            )
+        )
+        orbit, when = new_orbit(jnp.zeros(4)), None
+        for count, state in enumerate(states):
+            after = jnp.asarray(state, float).at[2].set(0.0)
+            orbit = step(orbit, after.at[2].set(-1.0), after, jnp.asarray(events))
+            orbit = step(orbit, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False))
+            if when is None and bool(orbit.returned):
+                when = count
+        return when
+
+
+def test_a_periodic_orbit_is_seen_to_return():
+    """Periods one and five: the same states again and again."""
+    assert fed([[1.0, 2.0, 0, 3.0]] * 40) is not None
+    cycle = [[np.cos(k), 1 + np.sin(k), 0, 0.3 * k] for k in range(5)]
+    assert fed(cycle * 12) is not None
+
+
+def test_a_torus_is_seen_to_return():
+    """Quasi-periodic: never the same twice, but it comes back again and again."""
+    angle = 2 * np.pi * np.arange(400) * (np.sqrt(5) - 1) / 28
+    assert fed(np.stack([3 + 0.3 * np.cos(angle), 0.3 * np.sin(angle), 0 * angle, 0 * angle], axis=1)) is not None
+
+
+@pytest.mark.parametrize("rate", [1.05, 1.01, 1.001, 0.999, 0.99])
+def test_leaving_an_unstable_cycle_slowly_is_no_return(rate):
+    """Close to an earlier state for dozens of periods, drifting off all the while: not a limit cycle, not yet."""
+    distance = 1e-3 * rate ** np.arange(200)
+    distance = distance if rate > 1 else 0.2 * rate ** np.arange(200)
+    states = np.stack([3 + distance, 1 - distance, 0 * distance, 0 * distance], axis=1)
+    assert fed(states) is None
+
+
+def test_a_spiral_out_of_an_unstable_cycle_is_no_return():
+    """It goes away and comes back close, turn after turn, but a little further out each time."""
+    k = np.arange(300)
+    radius = 1e-3 * 1.02**k
+    radius = radius[radius < 1.0]
+    angle = 2 * np.pi * np.arange(len(radius)) / 7.0
+    states = np.stack([3 + radius * np.cos(angle), radius * np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    assert fed(states) is None
+
+
+def test_without_contact_events_nothing_is_a_limit_cycle():
+    """An undamped sliding oscillation returns too; it is no squeal."""
+    assert fed([[1.0, 2.0, 0, 3.0]] * 60, events=False) is None
