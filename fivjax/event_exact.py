@@ -188,8 +188,11 @@ def _march_to_roots(c: list[Float[Array, " g"]]) -> tuple[Float[Array, " g"], Bo
     bound_3 = sum(k * (k - 1) * (k - 2) * fk for k, fk in enumerate(falling) if k > 2)
     huge = 1.0 / eps
 
+    # Already used up: as after a jump of the load, or where the last advance ended a rounding short of the root.
+    spent = c[0] < 0
+
     def open_(x, step):
-        return (x < 1) & (step > 2 * eps * x)
+        return ~spent & (x < 1) & (step > 2 * eps * x)
 
     def going(carry):
         x, step, count = carry
@@ -209,7 +212,8 @@ def _march_to_roots(c: list[Float[Array, " g"]]) -> tuple[Float[Array, " g"], Bo
         return jnp.where(open_(x, step), x + onward, x), onward, count + 1
 
     x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
-    return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), (x < 1) & (step <= 2 * eps * x) & (size > 0)
+    found = spent | ((x < 1) & (step <= 2 * eps * x))
+    return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
 
 
 def _ratio(above, below, otherwise):

@@ -230,3 +230,20 @@ def test_a_step_clipped_to_any_length_is_exact(paper_scene):
     for run, every in zip(runs, (1, 40, 4000), strict=True):
         # A contact event every few milliseconds, rounding multiplied on the way.
         np.testing.assert_allclose(run.displacement[::every], runs[0].displacement, atol=1e-12)
+
+
+def test_a_guard_about_to_run_out_is_not_taken_for_one_that_has_just_begun():
+    """An advance may end a rounding short of a root. The next one must find it at once, not divide it out as its own start."""
+    from fivjax.event_exact import _march_to_roots
+
+    with jax.enable_x64(True):
+
+        def march(*c):
+            x, fires = _march_to_roots([jnp.array([ck]) for ck in c])
+            return float(x[0]), bool(fires[0])
+
+        assert march(1e-14, -1.0, 0.5) == (0.0, True)
+        assert march(-1e-3, 1.0, 0.5) == (0.0, True)  # used up already, though it would recover
+        assert march(0.0, 0.0, 1e-14, 1.0, -1.1)[0] == pytest.approx(1 / 1.1)  # just lifted off; comes down later
+        assert march(1e-15, 1.0, -2.0)[0] == pytest.approx(0.5)  # just begun to slip; stops later
+        assert march(0.0, 1.0, 1.0) == (1.0, False)
