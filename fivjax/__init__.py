@@ -1,5 +1,6 @@
 """fivjax: friction-induced vibration in JAX: slide, stick, detach, squeal; differentiable and in batches."""
 
+from . import cea as cea
 from . import plot as plot
 from .contact import Status as Status
 from .event_exact import EventExact as EventExact

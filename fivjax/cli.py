@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import tyro
 
-from . import plot
+from . import cea, plot, plot_linear
 from .event_exact import EventExact
 from .friction import Coulomb, ExponentialDecay
 from .load import Pulse
@@ -147,11 +147,37 @@ class Simulate:
         _say(data, picture)
 
 
+@dataclasses.dataclass(frozen=True)
+class Cea:
+    """Complex eigenvalue analysis: frequencies and growth rates over one parameter (Fig. 3). Writes OUT.nc and OUT.png."""
+
+    x: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "mu=0:0.5:501"
+    """parameter to follow the modes along: any of the scene's"""
+    out: Path = Path("cea")
+    """files to write, without suffix"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+
+    def run(self) -> None:
+        data, picture = _outputs(self.out)
+        scene = self.scene.scene()
+        dataset = cea.modes(scene, **dict([_axis(self.x)]))
+        save(dataset, data)
+        save_figure(plot_linear.eigenvalues(dataset), picture)
+        _say(data, picture)
+        direction = 1 if self.scene.belt_speed >= 0 else -1
+        limit = cea.stability_limit(scene.structure, direction=direction)
+        if limit.outcome is cea.Outcome.FOUND:
+            print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
+            print(cea.sensitivity(scene.structure, direction=direction))
+        else:
+            print(f"  constant friction: {limit.outcome.value}")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; sentences on standard error and exit code 2 for what is refused."""
     keep_compiled_code()
     command = tyro.extras.subcommand_cli_from_dict(
-        {"map": Map, "simulate": Simulate},
+        {"map": Map, "simulate": Simulate, "cea": Cea},
         prog="fivjax",
         description="Friction-induced vibration: what a scene does after a kick.",
         args=arguments,

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from . import arguments
+from .critical import critical_friction
 from .event_exact import EventExact
 from .lanes import Outcome, run_to_verdict
 from .load import Pulse
@@ -47,7 +48,8 @@ def bistability_map(
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
     tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
     With an axis p, `p_crit` over the others is the middle of the two neighbours on it between which the limit cycle
-    first appears; `critical_perturbation` narrows that down.
+    first appears; `critical_perturbation` narrows that down. With an axis mu, the attribute `mu_crit` is the critical
+    friction of linear theory.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, and values that the scene refuses.
@@ -92,6 +94,7 @@ def bistability_map(
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
         meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
     )
+    _add_linear_limit(dataset, scene)
     dataset.attrs["counts"] = json.dumps(
         {verdict.name.lower(): int(np.sum(outcome.verdict == verdict)) for verdict in MEANING}
     )
@@ -179,6 +182,7 @@ def critical_perturbation(
         },
         coords=axes,
     )
+    _add_linear_limit(dataset, scene)
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
     return labelled(dataset, scene, method=describe_method(method), t_max=t_max, tolerance=tolerance, p_step=p_step)
 
@@ -242,6 +246,16 @@ def _narrowed(run, method, columns, brackets: np.ndarray, tolerance: float) -> n
 def _widened(brackets: np.ndarray, by: float) -> np.ndarray:
     width = np.where(np.diff(brackets) > 0, by, 0.0)
     return brackets + width * np.array([-1.0, 1.0])
+
+
+def _add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
+    """Note the critical friction of linear theory where friction is an axis and nothing else changes it."""
+    changes_it = {*scene.structure.parameters, "belt_speed"} & set(dataset.dims)
+    if "mu" not in dataset.dims or changes_it or float(scene.belt_speed) == 0:
+        return
+    limit = float(critical_friction(scene.structure, direction=1 if scene.belt_speed > 0 else -1))
+    if np.isfinite(limit):
+        dataset.attrs["mu_crit"] = limit
 
 
 def _checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:

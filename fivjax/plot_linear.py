@@ -1,0 +1,138 @@
+"""Pictures of the linear analysis: they draw what `cea` has computed, and compute nothing.
+
+Each function takes a dataset and returns a matplotlib figure, a new one unless given. Colours are told apart by readers
+who do not see all of them and in grey; lines differ in style as well.
+"""
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito, in an order of falling darkness; lines also change their dashes.
+COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+DASHES = ("-", "--", "-.", ":")
+FALLS, RISES = "#0072B2", "#E69F00"
+
+
+def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """Frequencies and growth rates of the modes over one parameter (Fig. 3), with the critical friction marked.
+
+    `dataset` is from `cea.modes`.
+    """
+    figure = _figure(figure, (6.4, 5.6))
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    name = str(dataset["frequency"].dims[0])
+    for k, mode in enumerate(dataset["mode"].values):
+        style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[k % len(DASHES)], "label": f"mode {mode + 1}"}
+        upper.plot(dataset[name], dataset["frequency"].sel(mode=mode), **style)
+        lower.plot(dataset[name], dataset["growth_rate"].sel(mode=mode), **style)
+    lower.axhline(0, color="0.4", linewidth=0.8)
+    if "mu_crit" in dataset and np.isfinite(dataset["mu_crit"]):
+        mu_crit = float(dataset["mu_crit"])
+        for axes in (upper, lower):
+            axes.axvline(mu_crit, color="0.4", linestyle=(0, (1, 2)), linewidth=1.2)
+        lower.annotate(
+            f"$\\mu_{{crit}}$ = {mu_crit:.5g}, {float(dataset['frequency_crit']):.3f} Hz",
+            (mu_crit, 0),
+            xytext=(-6, 6),
+            textcoords="offset points",
+            ha="right",
+            fontsize="small",
+        )
+    upper.set_ylabel(_label(dataset["frequency"]))
+    lower.set_ylabel(_label(dataset["growth_rate"]))
+    lower.set_xlabel(_label(dataset[name]))
+    upper.legend(frameon=False)
+    return figure
+
+
+def sensitivity(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """Which parameter moves the critical friction: percent per percent, the largest on top (a tornado).
+
+    `dataset` is from `cea.sensitivity(structure).dataset`. The plain derivative is written beside each bar. Bars to the
+    left (μ_crit falls) are hatched.
+    """
+    shown = dataset.isel(parameter=np.argsort(np.nan_to_num(np.abs(dataset["normalised"].values)), kind="stable"))
+    figure = _figure(figure, (6.4, 1.4 + 0.36 * shown.sizes["parameter"]))
+    axes = figure.subplots()
+    names = [str(name) for name in shown["parameter"].values]
+    for row, value in enumerate(shown["normalised"].values):
+        falls = value < 0
+        axes.barh(
+            row,
+            np.nan_to_num(value),
+            color=FALLS if falls else RISES,
+            edgecolor="black",
+            linewidth=0.6,
+            hatch="///" if falls else None,
+        )
+        plain, unit = float(shown["sensitivity"][row]), str(shown["unit"].values[row])
+        text = f"{plain:+.3g} per {unit}" if np.isfinite(plain) else "no derivative (undamped)"
+        axes.annotate(
+            text,
+            (np.nan_to_num(value), row),
+            xytext=(-4 if falls else 4, 0),
+            textcoords="offset points",
+            ha="right" if falls else "left",
+            va="center",
+            fontsize="small",
+        )
+    axes.set_yticks(range(len(names)), names)
+    axes.axvline(0, color="black", linewidth=0.8)
+    # Room for the numbers beside the longest bars.
+    axes.margins(x=0.6)
+    axes.set_xlabel(f"percent of $\\mu_{{crit}}$ = {float(dataset['mu_crit']):.5g} per percent of the parameter")
+    return figure
+
+
+def chart(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """Growth rate over two parameters, with the limit of stability drawn in.
+
+    `dataset` is from `cea.chart`. Points without steady sliding are left white.
+    """
+    figure = _figure(figure, (6.4, 4.8))
+    axes = figure.subplots()
+    across, up = (str(name) for name in dataset["growth_rate"].dims)
+    growth = dataset["growth_rate"].transpose(up, across)
+    picture = axes.pcolormesh(dataset[across], dataset[up], growth, cmap="cividis", shading="nearest", rasterized=True)
+    figure.colorbar(picture, ax=axes, label=_label(dataset["growth_rate"]))
+    _limit(axes, dataset[across], dataset[up], growth)
+    axes.set_xlabel(_label(dataset[across]))
+    axes.set_ylabel(_label(dataset[up]))
+    return figure
+
+
+def design(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """How a design went: the quantity it improves, and the parameters, over the steps (`Design.history`)."""
+    names = [str(name) for name in dataset.data_vars]
+    figure = _figure(figure, (6.4, 1.2 + 1.5 * len(names)))
+    for axes, name in zip(np.atleast_1d(figure.subplots(len(names), 1, sharex=True)), names, strict=True):
+        axes.plot(dataset["step"], dataset[name], color=COLOURS[0])
+        axes.set_ylabel(_label(dataset[name]))
+    axes.set_xlabel("step")
+    return figure
+
+
+def _limit(axes: Axes, x, y, growth) -> None:
+    values = growth.values[np.isfinite(growth.values)]
+    if values.size == 0 or values.min() >= 0 or values.max() <= 0:
+        side = "unstable" if values.size and values.min() >= 0 else "stable"
+        axes.set_title(
+            f"{side} everywhere shown" if values.size else "no steady sliding anywhere shown", fontsize="medium"
+        )
+        return
+    # White under black: seen on any colour.
+    axes.contour(x, y, growth, levels=[0.0], colors="white", linewidths=3.0)
+    axes.contour(x, y, growth, levels=[0.0], colors="black", linewidths=1.4)
+    axes.set_title("line: limit of stability", fontsize="medium")
+
+
+def _figure(figure: Figure | None, size: tuple[float, float]) -> Figure:
+    return Figure(figsize=size, layout="constrained") if figure is None else figure
+
+
+def _label(variable: xr.DataArray) -> str:
+    long_name = variable.attrs.get("long_name", str(variable.name).replace("_", " "))
+    unit = variable.attrs.get("units", "1")
+    return str(long_name) if unit == "1" else f"{long_name} ({unit})"

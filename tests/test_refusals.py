@@ -1,0 +1,588 @@
+"""Bad input at the public functions, the files and the command line: a sentence, at once, and nothing written.
+
+No test here may reach an engine: the fixture below makes that an error of its own kind.
+"""
+
+import contextlib
+import math
+import re
+import sys
+import time
+
+import diffrax
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+import fivjax as fj
+from fivjax import cli, results
+
+
+class EngineReached(BaseException):
+    """Bad input got as far as compiled code. Not an `Exception`, so that no handler takes it for a refusal."""
+
+
+@pytest.fixture(autouse=True)
+def no_engine(monkeypatch):
+    """Were a check made after compiling, a typing error would cost a minute. Compiling begins where these are called."""
+
+    def reached(*_, **__):
+        raise EngineReached
+
+    monkeypatch.setattr(sys.modules["fivjax.maps"], "run_to_verdict", reached)
+    monkeypatch.setattr(sys.modules["fivjax.simulate"], "_simulate", reached)
+    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)  # it configures JAX for the whole process
+
+
+@pytest.fixture
+def constant_scene():
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad())
+
+
+def sentence(message):
+    return message[0].isupper() and message[-1] in ".?" and "\n" not in message
+
+
+@contextlib.contextmanager
+def refused(error, *fragments):
+    """A refusal in whole sentences that hold all of these fragments: the argument's name and the value among them."""
+    with pytest.raises(error) as refusal:
+        yield
+    message = str(refusal.value)
+    assert sentence(message), message
+    for fragment in fragments:
+        assert fragment in message, message
+
+
+@contextlib.contextmanager
+def untouched(folder):
+    """The folder holds the same files with the same contents afterwards: no result, no temporary."""
+
+    def contents():
+        return {path.name: path.is_file() and path.read_bytes() for path in folder.iterdir()}
+
+    before = contents()
+    yield
+    assert contents() == before
+
+
+def test_the_engine_is_reached_by_good_input(paper_scene):
+    """Were the stand-ins in the wrong place, every other test here would pass whatever is checked and when."""
+    for call in (
+        lambda: fj.simulate(paper_scene, 0.1, 1e-3),
+        lambda: fj.bistability_map(paper_scene, mu=[0.1, 0.2]),
+        lambda: fj.critical_perturbation(paper_scene),
+        lambda: cli.main(["map", "--out", "/tmp/never-written"]),
+        lambda: cli.main(["simulate", "--out", "/tmp/never-written"]),
+    ):
+        with pytest.raises(EngineReached):
+            call()
+
+
+def test_refusals_take_no_time(paper_scene):
+    """Were something compiled first, this would take seconds. The first call pays for NumPy's and JAX's own warm-up."""
+
+    def refuse():
+        with pytest.raises(ValueError, match="increasing"):
+            fj.bistability_map(paper_scene, mu=[0.2, 0.1])
+        with pytest.raises(ValueError, match="t1"):
+            fj.simulate(paper_scene, -1.0)
+
+    refuse()
+    start = time.perf_counter()
+    refuse()
+    # Compiling a stepper takes several seconds on this machine, a check microseconds.
+    assert time.perf_counter() - start < 0.5
+
+
+# --------------------------------------------------------------------------------------------- axes
+
+AXES = [
+    ([], ValueError, ["empty"]),
+    ([0.2, 0.1], ValueError, ["strictly increasing", "from 0.2 to 0.1"]),
+    ([0.1, 0.2, 0.2], ValueError, ["strictly increasing", "from 0.2 to 0.2", "values 1 and 2"]),
+    ([0.1, math.nan], ValueError, ["finite", "nan"]),
+    ([0.1, math.inf], ValueError, ["finite", "inf"]),
+    ([[0.1, 0.2]], ValueError, ["one-dimensional", "(1, 2)"]),
+    ("0.1", TypeError, ["numeric", "'0.1' (str)"]),
+    (["a", "b"], TypeError, ["numeric"]),
+    ([0.1, 0.2j], TypeError, ["numeric"]),
+    ([[0.1], [0.1, 0.2]], TypeError, ["numeric"]),
+    ([False, True], TypeError, ["numeric"]),
+    (None, TypeError, ["numeric", "None"]),
+    ({0.1, 0.2}, TypeError, ["numeric", "set"]),
+]
+BOTH = [fj.bistability_map, fj.critical_perturbation]
+
+
+@pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
+@pytest.mark.parametrize(("values", "error", "fragments"), AXES, ids=[str(axis[0]) for axis in AXES])
+def test_bad_axes(paper_scene, function, values, error, fragments):
+    """Were one accepted, a map would be empty, have rows twice, or hold lanes that mean nothing."""
+    with refused(error, "`mu`", *fragments):
+        function(paper_scene, mu=values)
+
+
+@pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("name", ["mu_crit", "t_maxx", "impact_law", "mu_static"])
+def test_unknown_axes(paper_scene, function, name):
+    """Were an unknown name swallowed, a misspelt option would change nothing and nobody would know."""
+    with refused(ValueError, f"`{name}`", "belt_speed", "theta"):
+        function(paper_scene, **{name: [0.1, 0.2]})
+
+
+@pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    ("axis", "fragments"),
+    [
+        (dict(mu=[-0.1, 0.2]), ("`mu`", "non-negative", "-0.1")),
+        (dict(m1=[0.0, 1.0]), ("`m1`", "positive", "0")),
+        (dict(restitution=[0.5, 1.5]), ("`restitution`", "at most 1", "1.5")),
+        (dict(mu=[0.1, 0.2], k2=[-1.0, 1e5]), ("`k2`", "non-negative", "-1")),
+    ],
+)
+def test_axis_values_that_the_scene_refuses(paper_scene, function, axis, fragments):
+    """Were only the form of an axis checked, lanes outside the model would come back with a verdict."""
+    with refused(ValueError, *fragments):
+        function(paper_scene, **axis)
+
+
+def test_axes_that_cross_each_other():
+    """Were only one end checked, part of a map would stick less firmly than it slides."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.3, 0.1), 3.0, fj.Pulse())
+    with refused(ValueError, "`mu_static`", "`mu_dynamic`", "0.1", "0.2"):
+        fj.bistability_map(scene, mu_static=[0.1, 0.3], mu_dynamic=[0.05, 0.2])
+
+
+def test_a_p_axis_needs_a_pulse(constant_scene):
+    """Were p ignored for a constant load, all rows of the map would be the same."""
+    with refused(ValueError, "`p`", "Pulse"):
+        fj.bistability_map(constant_scene, p=[1.0, 1.5])
+    with refused(TypeError, "`scene.load`", "Pulse", "ConstantLoad"):
+        fj.critical_perturbation(constant_scene, mu=[0.1, 0.2])
+
+
+def test_a_map_needs_an_axis(paper_scene):
+    """Were none needed, the result would have no dimension and the user no hint what to give."""
+    with refused(ValueError, "at least one axis", "mu", "belt_speed"):
+        fj.bistability_map(paper_scene)
+
+
+def test_p_is_not_an_axis_where_it_is_sought(paper_scene):
+    """Were p accepted, it would be overwritten."""
+    with refused(ValueError, "`p`", "`p_range`"):
+        fj.critical_perturbation(paper_scene, p=[1.0, 2.0])
+
+
+# ------------------------------------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    ("options", "error", "fragments"),
+    [
+        (dict(t_max=0.0), ValueError, ["`t_max`", "positive", "0"]),
+        (dict(t_max=-3.0), ValueError, ["`t_max`", "positive", "-3"]),
+        (dict(t_max=math.inf), ValueError, ["`t_max`", "finite", "inf"]),
+        (dict(t_max="20"), TypeError, ["`t_max`", "numeric", "'20'"]),
+        (dict(t_max=[1.0, 2.0]), ValueError, ["`t_max`", "one number", "(2,)"]),
+        (dict(memory=0), ValueError, ["`memory`", "positive", "0"]),
+        (dict(memory=math.nan), ValueError, ["`memory`", "finite", "nan"]),
+        (dict(method="event-exact"), TypeError, ["`method`", "EventExact()", "'event-exact'"]),
+        (dict(method=diffrax.Tsit5()), TypeError, ["`method`", "EventExact()", "Tsit5"]),
+        (dict(method=fj.EventExact), TypeError, ["`method`", "EventExact()"]),
+    ],
+)
+def test_bad_options(paper_scene, function, options, error, fragments):
+    """Were one accepted, the run would stop at once, never, or in the middle of the first step."""
+    with refused(error, *fragments):
+        function(paper_scene, mu=[0.1, 0.2], **options)
+
+
+@pytest.mark.parametrize("function", [*BOTH, fj.simulate], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("scene", [None, "scene", fj.belt_oscillator()], ids=["None", "str", "Structure"])
+def test_what_is_no_scene(function, scene):
+    """Were anything taken for a scene, the first missing attribute would be the message."""
+    with refused(TypeError, "`scene`", "a Scene"):
+        function(scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "fragments"),
+    [
+        (dict(p_range=(2.0, 1.0)), ValueError, ["p_range[1]", "above 2", "1"]),
+        (dict(p_range=(1.0, 1.0)), ValueError, ["p_range[1]", "above 1", "1"]),
+        (dict(p_range=(-1.0, 1.0)), ValueError, ["p_range[0]", "non-negative", "-1"]),
+        (dict(p_range=(math.nan, 1.0)), ValueError, ["p_range[0]", "finite", "nan"]),
+        (dict(p_range=(1.0, math.inf)), ValueError, ["p_range[1]", "finite", "inf"]),
+        (dict(p_range=("a", "b")), TypeError, ["p_range[0]", "numeric", "'a'"]),
+        (dict(p_step=0.0), ValueError, ["`p_step`", "positive", "0"]),
+        (dict(p_step=-0.1), ValueError, ["`p_step`", "positive", "-0.1"]),
+        (dict(tolerance=0.0), ValueError, ["`tolerance`", "positive", "0"]),
+        (dict(tolerance=None), TypeError, ["`tolerance`", "numeric", "None"]),
+        pytest.param(
+            dict(p_range=3.0), TypeError, ["p_range", "3"],
+            marks=pytest.mark.xfail(strict=True, reason="unpacked before it is checked"),
+        ),
+        pytest.param(
+            dict(p_range=(1.0, 2.0, 3.0)), ValueError, ["p_range", "3"],
+            marks=pytest.mark.xfail(strict=True, reason="unpacked before it is checked"),
+        ),
+        pytest.param(
+            dict(p_range=(1.0, 1.2), p_step=1.0), ValueError, ["`p_step`", "1"],
+            marks=pytest.mark.xfail(strict=True, raises=EngineReached, reason="one point is scanned, and NaN returned"),
+        ),
+    ],
+)  # fmt: skip
+def test_bad_search_ranges(paper_scene, options, error, fragments):
+    """Were one accepted, the search would scan nothing, or for ever."""
+    with refused(error, *fragments):
+        fj.critical_perturbation(paper_scene, **options)
+
+
+# ------------------------------------------------------------------------------------------- methods
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "fragments"),
+    [
+        (lambda: fj.EventExact(order=3), ValueError, ["`order`", "at least 4", "3"]),
+        (lambda: fj.EventExact(order=8.5), ValueError, ["`order`", "8.5"]),
+        (lambda: fj.EventExact(order="16"), ValueError, ["`order`", "'16'"]),
+        (lambda: fj.EventExact(order=True), ValueError, ["`order`", "True"]),
+        (lambda: fj.EventExact(tolerance=0.0), ValueError, ["`tolerance`", "positive", "0"]),
+        (lambda: fj.EventExact(tolerance=-1e-9), ValueError, ["`tolerance`", "positive", "-1e-09"]),
+        (lambda: fj.EventExact(tolerance="small"), TypeError, ["`tolerance`", "'small'"]),
+        (lambda: fj.EventExact(dt=0.0), ValueError, ["`dt`", "positive", "0"]),
+        (lambda: fj.EventExact(dt=math.nan), ValueError, ["`dt`", "finite", "nan"]),
+        (lambda: fj.EventExact(dt=None), TypeError, ["`dt`", "None"]),
+        (lambda: fj.WhereSwitched(dt=0.0), ValueError, ["`dt`", "positive", "0"]),
+        (lambda: fj.WhereSwitched(dt=-1e-5), ValueError, ["`dt`", "positive", "-1e-05"]),
+        (lambda: fj.WhereSwitched(dt=math.inf), ValueError, ["`dt`", "finite", "inf"]),
+        (lambda: fj.WhereSwitched(dt="fast"), TypeError, ["`dt`", "'fast'"]),
+        (lambda: fj.WhereSwitched("Tsit5"), TypeError, ["`solver`", "diffrax.Tsit5()", "'Tsit5'"]),
+        (lambda: fj.WhereSwitched(diffrax.Tsit5), TypeError, ["`solver`", "diffrax.Tsit5()"]),
+        (lambda: fj.WhereSwitched(diffrax.Kvaerno5()), TypeError, ["`solver`", "explicit", "Kvaerno5"]),
+        (lambda: fj.WhereSwitched(fj.EventExact()), TypeError, ["`solver`", "explicit", "EventExact"]),
+        pytest.param(
+            lambda: fj.EventExact(dt=np.array([1.0, 2.0])), ValueError, ["`dt`", "(2,)"],
+            marks=pytest.mark.xfail(strict=True, reason="`dt != inf` is asked of an array"),
+        ),
+    ],
+)  # fmt: skip
+def test_bad_methods(make, error, fragments):
+    """Were one accepted, a run would not step, step for ever, or step with a method that this one cannot be built on."""
+    with refused(error, *fragments):
+        make()
+
+
+@pytest.mark.xfail(strict=True, reason="`isinstance(order, int)` does not know NumPy's whole numbers")
+def test_an_order_counted_by_numpy_is_a_whole_number():
+    """Were it refused, the sentence would say that 12 is no whole number."""
+    assert fj.EventExact(order=np.int64(12)).order(None) == 12
+
+
+# ------------------------------------------------------------------------------------------ simulate
+
+
+@pytest.mark.parametrize("name", ["t1", "dt_save"])
+@pytest.mark.parametrize(
+    ("value", "error", "fragments"),
+    [
+        (0.0, ValueError, ["positive", "0"]),
+        (-2.0, ValueError, ["positive", "-2"]),
+        (math.nan, ValueError, ["finite", "nan"]),
+        (math.inf, ValueError, ["finite", "inf"]),
+        ("2", TypeError, ["numeric", "'2' (str)"]),
+        (None, TypeError, ["numeric", "None"]),
+        (2j, TypeError, ["2j (complex)"]),
+        (True, TypeError, ["True (bool)"]),
+        ([1.0, 2.0], ValueError, ["one number", "(2,)"]),
+    ],
+)
+def test_bad_times(paper_scene, name, value, error, fragments):
+    """Were one accepted, there would be no rows, or rows without end."""
+    with refused(error, f"`{name}`", *fragments):
+        fj.simulate(paper_scene, **{name: value})
+
+
+ON_BELT = np.zeros(6)
+
+
+@pytest.mark.parametrize(
+    ("y0", "error", "fragments"),
+    [
+        (np.zeros(5), ValueError, ["3 displacements", "(5,)"]),
+        (np.zeros((2, 3)), ValueError, ["3 displacements", "(2, 3)"]),
+        ((np.zeros(3), np.zeros(2)), ValueError, ["3 displacements", "(5,)"]),
+        ([0.0] * 7, ValueError, ["3 displacements", "(7,)"]),
+        ([0.0, 0.0, -1e-6, 0.0, 0.0, 0.0], ValueError, ["below the belt", "-1e-06 m"]),
+        ((np.array([0.0, 0.0, -0.25]), np.zeros(3)), ValueError, ["below the belt", "-0.25 m"]),
+        ([0.0, 0.0, 0.0, 0.0, 0.0, -0.5], ValueError, ["moving into it", "-0.5 m/s"]),
+        ([math.nan, 0.0, 0.0, 0.0, 0.0, 0.0], ValueError, ["finite"]),
+        ([0.0, 0.0, 0.0, 0.0, math.inf, 0.0], ValueError, ["finite"]),
+        *(
+            pytest.param(y0, error, fragments, marks=pytest.mark.xfail(strict=True, reason=reason), id=reason)
+            for y0, error, fragments, reason in (
+                ((np.zeros(2), np.zeros(4)), ValueError, ["(2,)", "(4,)"], "a pair is only checked when joined"),
+                (0.0, ValueError, ["3 displacements"], "a number is joined before it is checked"),
+                ((np.zeros(3), 0.0), ValueError, ["3 displacements"], "a pair with a number is joined before it is checked"),
+                ("rest", (TypeError, ValueError), ["'rest'"], "a text reaches JAX"),
+                ((None, np.zeros(3)), (TypeError, ValueError), ["None"], "None reaches JAX"),
+                (ON_BELT + 0j, TypeError, ["complex"], "complex values lose their imaginary part with a warning"),
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_bad_starts(paper_scene, y0, error, fragments):
+    """Were one accepted, the run would start from a state that nobody asked for, or inside the belt."""
+    with refused(error, "`y0`", *fragments):
+        fj.simulate(paper_scene, 0.01, y0=y0)
+
+
+@pytest.mark.parametrize("y0", [np.zeros(6), [0.0] * 6, (np.zeros(3), np.zeros(3)), ([0.0] * 3, [0.0] * 3)])
+def test_good_starts(paper_scene, y0):
+    """Were one of the promised forms refused, a run could not be continued from where another ended."""
+    with pytest.raises(EngineReached):
+        fj.simulate(paper_scene, 0.01, y0=y0)
+
+
+def test_scenes_that_cannot_be_simulated(paper_scene):
+    """Were one run, its first row would be NaN or one of several solutions."""
+    with refused(ValueError, "Painlevé", "150", "108.5"):
+        fj.simulate(paper_scene.replace(mu=150.0))
+    with refused(ValueError, "`belt_speed`", "zero", "`y0`"):
+        fj.simulate(paper_scene.replace(belt_speed=0.0))
+    pulled = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    with refused(ValueError, "sliding equilibrium", "pull with 100 N"):
+        fj.simulate(fj.Scene(pulled, fj.Coulomb(0.2), 1.0))
+
+
+def test_method_of_simulate(paper_scene):
+    """Were a plain diffrax solver taken, contact would be ignored."""
+    with refused(TypeError, "`method`", "EventExact()", "Dopri5"):
+        fj.simulate(paper_scene, method=diffrax.Dopri5())
+
+
+# --------------------------------------------------------------------------------------------- files
+
+DATASET = xr.Dataset({"a": ("x", np.arange(3.0))})
+
+
+class BreaksMidway:
+    """Stands for a dataset or a figure whose writing fails after some bytes: a full disk, an interrupt."""
+
+    def __init__(self, error):
+        self.error = error
+
+    def _write(self, path, **_):
+        with open(path, "wb") as file:
+            file.write(b"half of it")
+        raise self.error
+
+    to_netcdf = savefig = _write
+
+
+WRITERS = [(fj.save, "result.nc"), (fj.save_figure, "result.png")]
+ERRORS = [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeError("HDF error")]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
+def test_writing_that_fails_leaves_nothing(tmp_path, writer, name, error):
+    """Were half a file left, the next reader would take it for a result; were a temporary left, folders would fill up."""
+    with untouched(tmp_path), pytest.raises(type(error)):
+        writer(BreaksMidway(error), tmp_path / name)
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
+def test_writing_that_fails_keeps_the_earlier_result(tmp_path, writer, name, error):
+    """Were the old file opened for writing, a night's work would be lost to a full disk."""
+    (tmp_path / name).write_bytes(b"the result of last night")
+    with untouched(tmp_path), pytest.raises(type(error)):
+        writer(BreaksMidway(error), tmp_path / name)
+
+
+def test_a_dataset_that_cannot_be_stored_leaves_nothing(tmp_path):
+    """Were the failure of a real dataset handled otherwise than that of a stand-in, the tests above would prove little."""
+    strange = DATASET.assign(b=("x", np.array([object(), object(), object()], dtype=object)))
+    with untouched(tmp_path), pytest.raises((TypeError, ValueError)):
+        fj.save(strange, tmp_path / "result.nc")
+
+
+def test_a_picture_of_unknown_kind_leaves_nothing(tmp_path):
+    """Were the suffix found out after opening the file, an empty picture would stay."""
+    with untouched(tmp_path), pytest.raises(ValueError, match="'xyz' is not supported"):
+        fj.save_figure(Figure(), tmp_path / "result.xyz")
+
+
+def test_results_are_whole_and_alone(tmp_path):
+    """Were a temporary left beside a good result, or the result not what was saved, nothing could be trusted."""
+    (tmp_path / "result.nc").write_bytes(b"an earlier one")
+    assert fj.save(DATASET, tmp_path / "result.nc") == tmp_path / "result.nc"
+    assert fj.save_figure(Figure(), tmp_path / "result.png") == tmp_path / "result.png"
+    assert {path.name for path in tmp_path.iterdir()} == {"result.nc", "result.png"}
+    with xr.open_dataset(tmp_path / "result.nc", engine="h5netcdf") as back:
+        xr.testing.assert_identical(back.load(), DATASET)
+    assert (tmp_path / "result.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_results_can_be_read_by_others_like_any_new_file(tmp_path):
+    """Were the temporary's permissions kept, colleagues could not open a result on a shared disk."""
+    plain = tmp_path / "plain"
+    plain.write_bytes(b"")
+    assert fj.save(DATASET, tmp_path / "result.nc").stat().st_mode == plain.stat().st_mode
+
+
+@pytest.mark.parametrize("check", [results.check_writable, lambda p: fj.save(DATASET, p), lambda p: fj.save_figure(Figure(), p)],
+                         ids=["check_writable", "save", "save_figure"])  # fmt: skip
+def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
+    """Were a path found bad only after the work, the work would be lost."""
+    (tmp_path / "folder").mkdir()
+    with untouched(tmp_path):
+        with refused(ValueError, str(tmp_path / "folder"), "is a folder"):
+            check(tmp_path / "folder")
+        with refused(ValueError, str(tmp_path / "missing"), "does not exist"):
+            check(str(tmp_path / "missing" / "result.nc"))
+
+        def denied(*_, **__):
+            raise PermissionError(13, "Permission denied")
+
+        # A folder that even an administrator cannot write cannot be made on every machine.
+        monkeypatch.setattr(results.tempfile, "NamedTemporaryFile", denied)
+        with refused(ValueError, str(tmp_path), "cannot be written", "Permission denied"):
+            check(tmp_path / "result.nc")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
+def test_a_real_folder_that_nobody_can_write():
+    """Were the probe not a real write, this folder, whose permission bits look fine to an administrator, would pass."""
+    with refused(ValueError, "`/proc`", "cannot be written"):
+        results.check_writable("/proc/result.nc")
+
+
+@pytest.mark.xfail(strict=True, reason="the advice is to create a folder where a file stands")
+def test_a_file_in_place_of_the_folder_is_called_a_file(tmp_path):
+    """Were it said not to exist, the user would look for a spelling mistake."""
+    (tmp_path / "taken").write_bytes(b"")
+    with refused(ValueError, "`", "not a folder"):
+        results.check_writable(tmp_path / "taken" / "result.nc")
+
+
+@pytest.mark.xfail(strict=True, reason="the probe's and the temporary's names are longer than the result's")
+def test_long_names_that_the_file_system_allows(tmp_path):
+    """Were they refused, the sentence would blame the folder."""
+    assert results.check_writable(tmp_path / ("x" * 252 + ".nc")).parent == tmp_path
+
+
+@pytest.mark.xfail(strict=True, raises=(AttributeError, AssertionError), reason="the dataset's type is not checked")
+@pytest.mark.parametrize("thing", [{"a": 1}, np.zeros(3), None], ids=["dict", "array", "None"])
+def test_what_is_no_dataset(tmp_path, thing):
+    """Were the mistake not named, the message would be about an attribute."""
+    with refused(TypeError, "`dataset`"):
+        fj.save(thing, tmp_path / "result.nc")
+
+
+# -------------------------------------------------------------------------------------- command line
+
+
+def refused_on_the_command_line(capsys, arguments):
+    """The sentence that a command answers with; it must come on standard error, with exit code 2 and nothing else."""
+    code = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    assert code == 2
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("fivjax: ")
+    message = lines[0].removeprefix("fivjax: ")
+    assert sentence(message), message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["map", "--x", "mu=0.1:0.2"], ["NAME=FROM:TO:COUNT", "'mu=0.1:0.2'"]),
+        (["map", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
+        (["map", "--y", "p=a:b:3"], ["NAME=FROM:TO:COUNT", "'p=a:b:3'"]),
+        (["map", "--y", "p=1:2:0"], ["COUNT", "'p=1:2:0'"]),
+        (["map", "--y", "p=1:2:2.5"], ["COUNT", "'p=1:2:2.5'"]),
+        (["map", "--x", "mu=0.2:0.1:3"], ["`mu`", "0.2", "0.1"]),
+        (["map", "--x", "mu=0.1:0.1:3"], ["`mu`", "0.1"]),
+        (["map", "--x", "mu=nan:1:3"], ["`mu`", "nan"]),
+        (["map", "--x", "speed=1:2:3"], ["`speed`", "belt_speed"]),
+        (["map", "--x", "p=1:2:3"], ["different", "p"]),
+        (["map", "--x", "mu=-1:0.2:3"], ["`mu`", "non-negative", "-1"]),
+        (["map", "--m1", "-1"], ["`m1`", "positive", "-1"]),
+        (["map", "--restitution", "2"], ["`restitution`", "at most 1", "2"]),
+        (["map", "--t-max", "0"], ["`t_max`", "positive", "0"]),
+        (["map", "--memory", "-5"], ["`memory`", "positive", "-5"]),
+        (["map", "--mu-static", "0.3"], ["--mu-dynamic"]),
+        (["map", "--mu-dynamic", "0.3"], ["--mu-static"]),
+        (["map", "--mu-static", "0.1", "--mu-dynamic", "0.3", "--x", "belt_speed=1:2:2"], ["`mu_static`", "0.1", "0.3"]),
+        (["map", "--method", "where-switched", "--dt", "0"], ["`dt`", "positive", "0"]),
+        (["simulate", "--t1", "-1"], ["`t1`", "positive", "-1"]),
+        (["simulate", "--dt-save", "0"], ["`dt_save`", "positive", "0"]),
+        (["simulate", "--mu", "nan"], ["`mu`", "finite", "nan"]),
+        (["simulate", "--mu", "200"], ["Painlevé", "200"]),
+        (["simulate", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
+        (["simulate", "--p", "-1"], ["`p`", "non-negative", "-1"]),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else None,
+)  # fmt: skip
+def test_command_line_refusals(tmp_path, capsys, arguments, fragments):
+    """Were the answer a traceback, an exit code of 0 or a file, a script would go on with nothing."""
+    with untouched(tmp_path):
+        message = refused_on_the_command_line(capsys, [*arguments, "--out", tmp_path / "out"])
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("command", ["map", "simulate"])
+def test_command_line_refuses_paths_before_anything_else(tmp_path, capsys, command):
+    """Were a path checked at the end, an hour's map would have nowhere to go."""
+    (tmp_path / "taken.nc").mkdir()
+    with untouched(tmp_path):
+        message = refused_on_the_command_line(capsys, [command, "--out", tmp_path / "missing" / "out", "--m1", "-1"])
+        assert str(tmp_path / "missing") in message
+        message = refused_on_the_command_line(capsys, [command, "--out", tmp_path / "taken"])
+        assert str(tmp_path / "taken.nc") in message
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".png"])
+def test_a_picture_that_cannot_be_written_is_found_before_the_run(tmp_path, capsys, suffix):
+    """Were only the data's path checked, the command would fail after the run."""
+    (tmp_path / f"out{suffix}").mkdir()
+    message = refused_on_the_command_line(capsys, ["simulate", "--out", tmp_path / "out"])
+    assert f"out{suffix}" in message
+
+
+@pytest.mark.parametrize("arguments", [[], ["squeal"], ["map", "--mu", "abc"], ["simulate", "--quantity", "jerk"], ["map", "--muu", "1"]],
+                         ids=" ".join)  # fmt: skip
+def test_command_lines_that_do_not_parse(tmp_path, monkeypatch, capsys, arguments):
+    """Were one run with defaults, the user would get an answer to another question."""
+    monkeypatch.chdir(tmp_path)
+    with untouched(tmp_path), pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+    captured = capsys.readouterr()
+    complaint = captured.err + captured.out
+    assert re.search("|".join(map(re.escape, arguments[-2:] or ["subcommand"])), complaint)
+
+
+@pytest.mark.xfail(strict=True, reason="pathlib's own sentence, which names neither the option nor a remedy")
+@pytest.mark.parametrize("out", [".", "/", ""])
+def test_an_output_without_a_name(tmp_path, monkeypatch, capsys, out):
+    """Were the answer pathlib's, the user would not learn what to give instead."""
+    monkeypatch.chdir(tmp_path)
+    assert "PosixPath" not in refused_on_the_command_line(capsys, ["simulate", "--out", out])
+
+
+@pytest.mark.xfail(strict=True, reason="`numpy.linspace` warns about inf before the axis is checked")
+def test_an_axis_without_end(tmp_path, capsys):
+    """Were NumPy's warning all there is, the user would read about an invalid value in a multiplication."""
+    message = refused_on_the_command_line(capsys, ["map", "--x", "mu=0:inf:3", "--out", tmp_path / "out"])
+    assert "finite" in message

@@ -1,0 +1,349 @@
+"""The structure: Eq. 5 as the paper prints it, any number of coordinates, and what is refused."""
+
+import math
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import fivjax as fj
+
+# A few products and sums of double-precision numbers; anything wrong in a formula is off by many orders more.
+ROUNDING = 1e-14
+
+
+def eq5(m1, m2, c1, c2, k1, k2, theta):
+    """Mass, damping and stiffness of Eq. 5, typed in from the paper."""
+    s, c = math.sin(theta), math.cos(theta)
+    mass = [
+        [m1 * c**2 + m2, 0.0, -m1 * s * c],
+        [0.0, m1, 0.0],
+        [-m1 * c * s, 0.0, m1 * s**2 + m2],
+    ]
+    damping = [
+        [c1 * c**2 + c2 * s**2, -c2 * s, (c2 - c1) * s * c],
+        [-c2 * s, c2, -c2 * c],
+        [(c2 - c1) * s * c, -c2 * c, c2 * c**2 + c1 * s**2],
+    ]
+    stiffness = [
+        [k1 * c**2 + k2 * s**2, -k2 * s, (k2 - k1) * s * c],
+        [-k2 * s, k2, -k2 * c],
+        [(k2 - k1) * s * c, -k2 * c, k2 * c**2 + k1 * s**2],
+    ]
+    return np.array(mass), np.array(damping), np.array(stiffness)
+
+
+def random_parameters(seed):
+    rng = np.random.default_rng(seed)
+    low_high = {
+        "m1": (0.01, 5),
+        "m2": (0.01, 5),
+        "c1": (0, 50),
+        "c2": (0, 50),
+        "k1": (1e3, 1e6),
+        "k2": (1e3, 1e6),
+        "theta": (-1.5, 1.5),
+    }
+    return {name: float(rng.uniform(*bounds)) for name, bounds in low_high.items()}
+
+
+def random_matrices(n, seed):
+    """A positive definite mass, and damping and stiffness that are only semi-definite (one rigid motion)."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n))
+    springs = rng.normal(size=(n - 1, n))
+    dampers = rng.normal(size=(n - 1, n))
+    return root @ root.T + np.eye(n), dampers.T @ dampers, 1e4 * springs.T @ springs
+
+
+def sentence(message):
+    """Whether a message reads as one or a few sentences on one line."""
+    return message[0].isupper() and message[-1] in ".?" and "\n" not in message
+
+
+# ------------------------------------------------------------------------------- the belt oscillator
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_belt_oscillator_is_eq_5(seed):
+    """Were an entry or a sign of Eq. 5 different, every result of the paper would be."""
+    parameters = random_parameters(seed)
+    structure = fj.belt_oscillator(**parameters)
+    for made, printed in zip((structure.mass, structure.damping, structure.stiffness), eq5(**parameters), strict=True):
+        np.testing.assert_allclose(np.asarray(made), printed, rtol=0, atol=ROUNDING * np.abs(printed).max())
+    np.testing.assert_array_equal(np.asarray(structure.load_direction), [0.0, -1.0, 0.0])
+    assert (structure.tangential, structure.normal, structure.size) == (0, 2, 3)
+
+
+def test_defaults_are_table_1():
+    """Were a default not Table 1's, "the paper's oscillator" would be another one."""
+    table_1 = {"m1": 0.53, "m2": 0.045, "c1": 1.0, "c2": 1.0, "k1": 100e3, "k2": 101e3, "theta": 0.01}
+    structure = fj.belt_oscillator()
+    assert {name: float(value) for name, value in structure.parameters.items()} == table_1
+
+
+@pytest.mark.parametrize("k2", [101e3, 101_000, np.float64(101e3), np.asarray(101e3)])
+def test_double_precision_without_x64(k2):
+    """Were a matrix rounded to single precision, modes 0.03 Hz apart could not be told from each other."""
+    assert not jax.config.jax_enable_x64
+    structure = fj.belt_oscillator(theta=0.3, k2=k2)
+    for matrix in (structure.mass, structure.damping, structure.stiffness, structure.load_direction):
+        assert matrix.dtype == np.float64
+    off_diagonal = (101e3 - 100e3) * math.sin(0.3) * math.cos(0.3)  # float32 would be 1e-8 off
+    # The entry is a difference of terms a hundred times larger.
+    assert abs(float(structure.stiffness[0, 2]) - off_diagonal) < 100 * ROUNDING * off_diagonal
+
+
+# --------------------------------------------------------------------------------- general structures
+
+
+@pytest.mark.parametrize(("n", "tangential", "normal"), [(2, 1, 0), (2, 0, 1), (12, 5, 11)])
+def test_any_number_of_coordinates(n, tangential, normal):
+    """Were matrices changed, reordered or refused, only the paper's oscillator could be studied."""
+    mass, damping, stiffness = random_matrices(n, seed=n)
+    direction = np.random.default_rng(n).normal(size=n)
+    structure = fj.Structure(mass, damping, stiffness, direction, tangential=tangential, normal=normal)
+    np.testing.assert_array_equal(np.asarray(structure.mass), mass)
+    np.testing.assert_array_equal(np.asarray(structure.damping), damping)
+    np.testing.assert_array_equal(np.asarray(structure.stiffness), stiffness)
+    np.testing.assert_array_equal(np.asarray(structure.load_direction), direction)
+    assert (structure.size, structure.tangential, structure.normal) == (n, tangential, normal)
+    assert structure.parameters == {}
+
+
+def test_lists_and_integers_are_matrices_too():
+    """Were lists refused or integers kept, small structures could not be typed in, or would divide as integers."""
+    structure = fj.Structure([[2, 0], [0, 1]], [[0, 0], [0, 0]], [[3, -1], [-1, 3]], [0, -1], tangential=0, normal=1)
+    assert structure.stiffness.dtype == np.float64
+    np.testing.assert_array_equal(np.asarray(structure.stiffness), [[3.0, -1.0], [-1.0, 3.0]])
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 1e9])
+def test_masses_of_very_different_size_are_accepted(ratio):
+    """Were definiteness judged without scaling, a light wheel on a heavy frame would be called indefinite."""
+    structure = fj.Structure(np.diag([1.0, ratio]), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
+    assert float(structure.mass[1, 1]) == ratio
+
+
+def test_rounding_in_symmetry_is_forgiven():
+    """Were exact symmetry demanded, matrices out of a finite-element code would be refused for their last digit."""
+    stiffness = np.array([[3.0, -1.0], [-1.0 - 1e-13, 3.0]])
+    assert fj.Structure(np.eye(2), np.eye(2), stiffness, [0, -1], tangential=0, normal=1).size == 2
+
+
+def test_matrices_may_be_traced():
+    """Were traced matrices refused, no derivative with respect to an entry could be taken."""
+
+    def stiffness_of(k):
+        return fj.Structure(np.eye(2), np.eye(2), k * np.eye(2), [0, -1], tangential=0, normal=1).stiffness.sum()
+
+    with jax.enable_x64(True):  # the sum is taken in here
+        assert float(jax.grad(stiffness_of)(3.0)) == 2.0
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=TypeError,
+    reason="a list of traced entries is refused as not numeric: `arguments.numeric_array`",
+)
+def test_entries_of_a_list_may_be_traced():
+    """Were a traced entry refused, the natural way to write a small matrix would not be differentiable."""
+
+    def mass_of(m):
+        return fj.Structure([[m, 0.0], [0.0, m]], np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1).mass.sum()
+
+    with jax.enable_x64(True):
+        assert float(jax.grad(mass_of)(3.0)) == 2.0
+
+
+# ------------------------------------------------------------------------------------------ replace()
+
+
+def test_replace_rebuilds_with_the_new_value_and_keeps_the_rest():
+    """Were a value lost or the matrices not rebuilt, a parameter study would show another structure's results."""
+    parameters = random_parameters(11)
+    changed = fj.belt_oscillator(**parameters).replace(k1=90e3, theta=0.2)
+    fresh = fj.belt_oscillator(**{**parameters, "k1": 90e3, "theta": 0.2})
+    for one, other in zip(jax.tree.leaves(changed), jax.tree.leaves(fresh), strict=True):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
+    assert {name: float(value) for name, value in changed.parameters.items()} == {
+        **parameters, "k1": 90e3, "theta": 0.2
+    }  # fmt: skip
+
+
+def test_replace_leaves_the_original_alone():
+    """Were the original changed, comparing before and after would compare a structure with itself."""
+    structure = fj.belt_oscillator()
+    structure.replace(m1=2.0)
+    assert float(structure.parameters["m1"]) == 0.53
+    assert float(structure.mass[1, 1]) == 0.53
+
+
+def test_replace_refuses_unknown_names():
+    """Were an unknown name ignored, a typing error would pass for a parameter without influence."""
+    with pytest.raises(ValueError, match=r"`k3`.*m1, m2, c1, c2, k1, k2, theta") as refusal:
+        fj.belt_oscillator().replace(k3=1.0)
+    assert sentence(str(refusal.value))
+
+
+def test_replace_refuses_what_the_builder_refuses():
+    """Were the check left out here, a negative mass could come in by the back door."""
+    with pytest.raises(ValueError, match=r"`m1` must be positive, but is -1"):
+        fj.belt_oscillator().replace(m1=-1.0)
+
+
+def test_replace_of_a_structure_given_as_matrices_says_why_not():
+    """Were it silent, a parameter study of plain matrices would return the same structure again and again."""
+    structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
+    with pytest.raises(ValueError, match=r"`k1`.*given as matrices"):
+        structure.replace(k1=1.0)
+
+
+@pytest.mark.xfail(strict=True, raises=IndexError, reason="`Structure.replace()` indexes an empty list of changes")
+def test_replacing_nothing_changes_nothing():
+    """Were it an error, code that loops over parameters would stumble over a structure that has none."""
+    structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
+    assert structure.replace().size == 2
+
+
+# --------------------------------------------------------------------------- refusals: belt_oscillator
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "rule", "shown"),
+    [
+        *((name, 0.0, "positive", "0") for name in ("m1", "m2")),
+        *((name, -0.5, "positive", "-0.5") for name in ("m1", "m2")),
+        *((name, -2.0, "non-negative", "-2") for name in ("c1", "c2", "k1", "k2")),
+        *((name, math.nan, "finite", "nan") for name in ("m1", "m2", "c1", "c2", "k1", "k2", "theta")),
+        *((name, -math.inf, "finite", "-inf") for name in ("m1", "c2", "k1", "theta")),
+    ],
+)
+def test_belt_oscillator_refuses_values_out_of_range(name, value, rule, shown):
+    """Were one accepted, matrices would be indefinite or NaN and every answer nonsense."""
+    with pytest.raises(ValueError, match=rf"^Argument `{name}` must be {rule}, but is {re.escape(shown)}\.$"):
+        fj.belt_oscillator(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [("0.5", "'0.5' (str)"), (None, "None (NoneType)"), (1j, "1j (complex)"), (True, "True (bool)")]
+)
+def test_belt_oscillator_refuses_what_is_no_real_number(value, shown):
+    """Were a text or a complex number taken, the failure would come later, in words about arrays."""
+    with pytest.raises(TypeError, match=rf"^Argument `m2` must be .*, but is {re.escape(shown)}\.$"):
+        fj.belt_oscillator(m2=value)
+
+
+def test_belt_oscillator_refuses_several_values_at_once():
+    """Were an array taken, the matrices would silently get a third dimension."""
+    with pytest.raises(ValueError, match=r"`k1` must be one number, but has shape \(2,\).*axis") as refusal:
+        fj.belt_oscillator(k1=[1e5, 2e5])
+    assert sentence(str(refusal.value))
+
+
+def test_undamped_and_unsprung_oscillators_are_allowed():
+    """Were zero refused for springs and dampers, the undamped coalescence could not be computed."""
+    structure = fj.belt_oscillator(c1=0, c2=0.0, k1=0)
+    assert float(np.abs(structure.damping).max()) == 0.0
+
+
+# --------------------------------------------------------------------------------- refusals: Structure
+
+GOOD = {"mass": np.eye(3), "damping": np.eye(3), "stiffness": np.eye(3), "load_direction": np.array([0.0, -1.0, 0.0])}
+LAST_NEGATIVE = np.diag([1.0, 1.0, -2.0])
+UNSYMMETRIC = np.array([[1.0, 0.25, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+WITH_NAN = np.array([[1.0, math.nan, 0.0], [math.nan, 1.0, 0.0], [0.0, 0.0, 1.0]])
+MATRICES = ("mass", "damping", "stiffness")
+
+
+@pytest.mark.parametrize("name", MATRICES)
+@pytest.mark.parametrize(
+    ("value", "error", "fragments"),
+    [
+        (UNSYMMETRIC, ValueError, ["symmetric", "(0, 1) is 0.25", "(1, 0) is 0"]),
+        (LAST_NEGATIVE, ValueError, ["definite", "-2"]),
+        (np.array([[1.0, 3.0, 0], [3.0, 1.0, 0], [0, 0, 1.0]]), ValueError, ["definite", "-2"]),
+        (np.ones((3, 2)), ValueError, ["square", "(3, 2)"]),
+        (np.ones(3), ValueError, ["square", "(3,)"]),
+        (2.0, ValueError, ["square", "()"]),
+        (np.ones((1, 1)), ValueError, ["two rows", "1"]),
+        (WITH_NAN, ValueError, ["finite", "nan"]),
+        (np.diag([1.0, np.inf, 1.0]), ValueError, ["finite", "inf"]),
+        ("eye", TypeError, ["numeric", "'eye' (str)"]),
+        (None, TypeError, ["numeric", "None"]),
+        ([[1.0, 0.0], [0.0]], TypeError, ["numeric", "list"]),
+        (np.eye(3, dtype=bool), TypeError, ["numeric", "bool"]),
+        (np.eye(3) + 0j, TypeError, ["complex128"]),
+    ],
+)
+def test_structure_refuses_bad_matrices(name, value, error, fragments):
+    """Were one accepted, energy would not be conserved, or the failure would come later and name nothing."""
+    with pytest.raises(error) as refusal:
+        fj.Structure(**{**GOOD, name: value})
+    message = str(refusal.value)
+    assert f"`{name}`" in message
+    assert sentence(message)
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("name", ["damping", "stiffness"])
+def test_structure_refuses_matrices_of_different_sizes(name):
+    """Were they combined, one of them would be broadcast or cut."""
+    with pytest.raises(ValueError, match=rf"`{name}` must have shape \(3, 3\).*but has shape \(2, 2\)"):
+        fj.Structure(**{**GOOD, name: np.eye(2)})
+
+
+@pytest.mark.parametrize("value", [np.diag([1.0, 1.0, 0.0]), np.ones((3, 3))])
+def test_a_coordinate_without_mass_is_refused(value):
+    """Were the mass matrix singular, accelerations would be infinite."""
+    with pytest.raises(ValueError, match=r"`mass` must be positive definite.*Every coordinate needs a positive mass"):
+        fj.Structure(**{**GOOD, "mass": value})
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "fragments"),
+    [
+        ([0.0, -1.0], ValueError, ["(3,)", "(2,)"]),
+        (-1.0, ValueError, ["(3,)", "()"]),
+        (np.zeros((3, 1)), ValueError, ["(3,)", "(3, 1)"]),
+        ([0.0, math.nan, 0.0], ValueError, ["finite"]),
+        ("down", TypeError, ["numeric", "'down'"]),
+        ([0.0, 1j, 0.0], TypeError, ["numeric"]),
+    ],
+)
+def test_structure_refuses_bad_load_directions(value, error, fragments):
+    """Were one accepted, the load would act nowhere, everywhere or with half of its value lost."""
+    with pytest.raises(error) as refusal:
+        fj.Structure(**{**GOOD, "load_direction": value})
+    message = str(refusal.value)
+    assert "`load_direction`" in message
+    assert sentence(message)
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("name", ["tangential", "normal"])
+@pytest.mark.parametrize(
+    ("value", "error", "shown"),
+    [(3, ValueError, "is 3"), (-1, ValueError, "is -1"), (1.0, TypeError, "1.0 (float)"), (True, TypeError, "True (bool)"),
+     ("y2", TypeError, "'y2' (str)"), (None, TypeError, "None")],
+)  # fmt: skip
+def test_structure_refuses_bad_indices(name, value, error, shown):
+    """Were −1 or True taken as an index, another coordinate than meant would touch the belt."""
+    with pytest.raises(error, match=rf"`{name}` must be .*{re.escape(shown)}") as refusal:
+        fj.Structure(**GOOD, **{name: value})
+    assert sentence(str(refusal.value))
+
+
+def test_structure_refuses_one_coordinate_in_both_roles():
+    """Were it accepted, normal and tangential force would be the same force."""
+    with pytest.raises(ValueError, match=r"`tangential` and `normal`.*both are 1"):
+        fj.Structure(**GOOD, tangential=1, normal=1)
+
+
+def test_default_indices_do_not_fit_two_coordinates():
+    """Were the default gap index 2 wrapped round for two coordinates, the contact would be on the wrong one."""
+    with pytest.raises(ValueError, match=r"`normal` must be between 0 and 1, but is 2"):
+        fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1])
