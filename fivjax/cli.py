@@ -209,6 +209,8 @@ def _axis(text: str) -> tuple[str, np.ndarray]:
         raise ValueError(
             f"An axis must read NAME=FROM:TO:COUNT, such as mu=0.05:0.228:64, but reads {text!r}."
         ) from None
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise ValueError(f"Axis `{name}` must be finite, but goes from {low:g} to {high:g}.")
     if points > 1 and not high > low:
         raise ValueError(f"Axis `{name}` must go up, but goes from {low:g} to {high:g}.")
     return name, np.linspace(low, high, points)
@@ -216,6 +218,8 @@ def _axis(text: str) -> tuple[str, np.ndarray]:
 
 def _outputs(stem: Path) -> tuple[Path, Path]:
     """The two files of a result, found writable before any work is done."""
+    if not stem.name:
+        raise ValueError(f"Option `--out` must name the files to write, such as `--out result`, but is `{stem}`.")
     stem = stem.with_suffix("") if stem.suffix in (".nc", ".png") else stem
     data, picture = (stem.with_name(stem.name + suffix) for suffix in (".nc", ".png"))
     return check_writable(data), check_writable(picture)

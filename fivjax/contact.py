@@ -309,6 +309,9 @@ def impact(mechanics: Mechanics, y: State) -> State:
     - "frictionless": no tangential impulse; the normal one moves whatever the mass matrix couples to it.
     - "reset": the normal velocity alone is changed, as a code does that resets one number. Not consistent with momentum.
 
+    Newton's restitution above zero together with friction can create energy where the normal impulse turns the slip round
+    (Kane's paradox); that takes a strong coupling of the two coordinates in the mass matrix. Restitution 0 never does.
+
     The paper does not state its law; its Table 2 comes out the same with all three.
     """
     n = _n(y)

@@ -13,6 +13,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from diffrax import AbstractLocalInterpolation
 from jaxtyping import Array, Bool, Float
 
@@ -57,12 +58,12 @@ class EventExact(AbstractStepper):
     interpolation_cls: ClassVar = staticmethod(lambda **info: _Restepped(**info))
 
     def __init__(self, order: int = 16, tolerance: float = 1e-15, dt: float = math.inf):
-        if isinstance(order, bool) or not isinstance(order, int) or order < 4:
+        if isinstance(order, bool) or not isinstance(order, int | np.integer) or order < 4:
             raise ValueError(f"Argument `order` must be a whole number of at least 4, but is {order!r}.")
         arguments.real_number("tolerance", tolerance, above=0)
-        if dt != math.inf:
+        if not (isinstance(dt, float) and dt == math.inf):
             arguments.real_number("dt", dt, above=0)
-        self.order_ = order
+        self.order_ = int(order)
         self.tolerance = float(tolerance)
         self.dt = float(dt)
 

@@ -144,10 +144,13 @@ def critical_perturbation(
         raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
     if not axis:
         axis = {"belt_speed": np.asarray(scene.belt_speed)[None]}
+    if not isinstance(p_range, tuple | list) or len(p_range) != 2:
+        kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
+        raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
     low, high = p_range
     arguments.real_number("p_range[0]", low, minimum=0)
     arguments.real_number("p_range[1]", high, above=low)
-    arguments.real_number("p_step", p_step, above=0)
+    arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
     arguments.real_number("tolerance", tolerance, above=0)
     axes = _checked_axes(scene, axis)
     shape = tuple(len(values) for values in axes.values())

@@ -57,7 +57,9 @@ def known_to_numpy(leaf):
 
 
 def is_known(value) -> bool:
-    """Whether a value can be looked at now (under `jit`, `grad` and `vmap` it cannot)."""
+    """Whether a value, or all of a nested list, can be looked at now (under `jit`, `grad` and `vmap` it cannot)."""
+    if isinstance(value, list | tuple):
+        return all(map(is_known, value))
     return not isinstance(value, jax.core.Tracer)
 
 

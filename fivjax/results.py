@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import xarray as xr
 
+from . import arguments
 from .scene import Scene
 
 # Long name and unit of each parameter and result that fivjax itself names.
@@ -104,10 +105,12 @@ def check_writable(path: str | Path) -> Path:
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"Output path `{path}` is a folder; give the name of a file in it.")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise ValueError(f"Output folder `{path.parent}` is not a folder but a file; give another.")
     if not path.parent.is_dir():
         raise ValueError(f"Output folder `{path.parent}` does not exist; create it first.")
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".fivjax."):
             pass
     except OSError as error:
         raise ValueError(f"Output folder `{path.parent}` cannot be written: {error.strerror}.") from error
@@ -119,6 +122,7 @@ def save(dataset: xr.Dataset, path: str | Path) -> Path:
 
     **Raises:** `ValueError` for a path that cannot be written.
     """
+    arguments.instance("dataset", dataset, xr.Dataset, "an xarray Dataset, such as a map or `run.to_dataset()`")
     return _replace_whole(check_writable(path), lambda part: dataset.to_netcdf(part, engine="h5netcdf"))
 
 
@@ -134,7 +138,7 @@ def save_figure(figure, path: str | Path, **options) -> Path:
 
 def _replace_whole(path: Path, write) -> Path:
     # Beside the target, so that the final rename stays within one file system and cannot be half done.
-    handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
     os.close(handle)
     try:
         write(part)

@@ -140,6 +140,9 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     mu = scene.friction(jnp.abs(scene.belt_speed))
     stiffness, load = sliding_stiffness(scene, mu)
     reduced = jnp.linalg.solve(stiffness, load * force)
+    # A motion that is free but for rounding answers with displacements whose rounding alone outweighs the load.
+    rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
+    reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
     q = jnp.insert(reduced, structure.normal, 0.0)
     normal_force = structure.stiffness[structure.normal] @ q
     normal_force = normal_force - structure.load_direction[structure.normal] * force

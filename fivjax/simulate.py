@@ -146,13 +146,19 @@ def _initial_state(scene: Scene, y0) -> State:
             sliding_equilibrium(scene)  # for what it refuses
         q, _ = steady_sliding(scene, scene.load.force)
         return jnp.concatenate([q, jnp.zeros_like(q)])
-    parts = y0 if isinstance(y0, tuple | list) and len(y0) == 2 else (y0,)
-    y = jnp.concatenate([real(part) for part in parts])
-    if y.shape != (2 * n,):
+    is_pair = isinstance(y0, tuple | list) and len(y0) == 2
+    parts = tuple(y0) if is_pair else (y0,)
+    for part in parts:
+        if is_known(part):
+            arguments.numeric_array("y0", part)
+    parts = tuple(map(real, parts))
+    shapes = tuple(part.shape for part in parts)
+    if shapes != (((n,), (n,)) if is_pair else ((2 * n,),)):
         raise ValueError(
             f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
-            f"({2 * n},), but has shape {y.shape}."
+            f"({2 * n},), but has shape {' and '.join(map(str, shapes))}."
         )
+    y = jnp.concatenate(parts)
     if is_known(y):
         if not np.all(np.isfinite(y)):
             raise ValueError("Argument `y0` must be finite.")

@@ -88,6 +88,8 @@ class Structure(eqx.Module):
 
         **Raises:** `ValueError` for a name that is not among `structure.parameters`.
         """
+        if not changes:
+            return self
         unknown = sorted(set(changes) - set(self.parameters))
         if unknown or self.builder is None:
             known = ", ".join(self.parameters) or "none (it was given as matrices)"

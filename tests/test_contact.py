@@ -158,9 +158,7 @@ def test_sliding_is_eq_3(seed, slip):
     mu = -np.sign(slip) * (0.2 - (0.2 - 0.35) * math.exp(-0.5 * abs(slip)))  # Eq. 1
     m1, m2, c1, c2, k1, k2, s, c = *list(p.values())[:6], math.sin(p["theta"]), math.cos(p["theta"])
     mass = np.array([[m2 + m1 * c**2 + mu * m1 * c * s, 0.0], [0.0, m1]])
-    damping = np.array(
-        [[c2 * s**2 + c1 * c**2 + mu * (c1 - c2) * c * s, -c2 * s + mu * c2 * c], [-c2 * s, c2]]
-    )
+    damping = np.array([[c2 * s**2 + c1 * c**2 + mu * (c1 - c2) * c * s, -c2 * s + mu * c2 * c], [-c2 * s, c2]])
     stiffness = np.array(
         [
             [k2 * s**2 + k1 * c**2 + mu / 2 * (k1 - k2) * math.sin(2 * p["theta"]), -k2 * s + mu * k2 * c],
