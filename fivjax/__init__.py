@@ -1,7 +1,9 @@
 """fivjax: friction-induced vibration in JAX: slide, stick, detach, squeal; differentiable and in batches."""
 
 from . import cea as cea
+from . import design as design
 from . import plot as plot
+from . import plot_linear as plot_linear
 from .contact import Status as Status
 from .event_exact import EventExact as EventExact
 from .friction import Coulomb as Coulomb

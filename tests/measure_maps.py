@@ -9,10 +9,11 @@ import json
 import sys
 import time
 
-import fivjax as fj
 import numpy as np
 import oracle
 from tqdm import tqdm
+
+import fivjax as fj
 
 MAP = {"mu": (0.05, 0.228), "p": (1.0, 4.0)}
 

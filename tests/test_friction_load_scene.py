@@ -142,7 +142,7 @@ def test_laws_and_loads_refuse_values_out_of_range(kind, name, value, rule, show
 @pytest.mark.parametrize("value", ["0.2", None, [0.2, 0.3], 0.2j])
 def test_friction_refuses_what_is_no_number(value):
     """Were it accepted, the failure would come out of JAX and name no argument."""
-    with pytest.raises((TypeError, ValueError), match="^Argument `mu` must be "):
+    with pytest.raises((TypeError, ValueError), match=r"^Argument `mu` must be "):
         fj.Coulomb(value)
 
 

@@ -1,8 +1,9 @@
 """Linear theory against the simulator: growth rate and frequency read off small transients of Sections 3.1 and 3.2."""
 
-import fivjax as fj
 import numpy as np
 import pytest
+
+import fivjax as fj
 
 SCENES = {
     "mode coupling": fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.5), 3.0, fj.ConstantLoad(100.0)),
