@@ -403,7 +403,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     `jax.jit`, `jax.grad` and `jax.vmap`, also in a process that never turned on double precision. The derivative is
     implicit and exact through the limit, where that of the eigenvalues would grow without bound. An undamped structure
     is differentiated among undamped ones (the slightest damping moves the limit by a jump, so there is no derivative in
-    it; its entries are 0).
+    it; its entries are 0). Damping ratios below some 1e-11 drown in rounding and count as none.
 
     **Returns:** `inf` where the structure is never unstable, 0 where it is unstable at the slightest friction; the
     derivative is NaN then. `stability_limit` says the outcome and the mechanism by name.

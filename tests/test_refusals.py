@@ -357,18 +357,21 @@ def test_method_of_simulate(paper_scene):
 DATASET = xr.Dataset({"a": ("x", np.arange(3.0))})
 
 
-class BreaksMidway:
-    """Stands for a dataset or a figure whose writing fails after some bytes: a full disk, an interrupt."""
+@pytest.fixture
+def breaks_midway(monkeypatch):
+    """Datasets and figures whose writing fails after some bytes: a full disk, an interrupt."""
 
-    def __init__(self, error):
-        self.error = error
+    def make(error):
+        def write(self, path, **_):
+            with open(path, "wb") as file:
+                file.write(b"half of it")
+            raise error
 
-    def _write(self, path, **_):
-        with open(path, "wb") as file:
-            file.write(b"half of it")
-        raise self.error
+        monkeypatch.setattr(xr.Dataset, "to_netcdf", write)
+        monkeypatch.setattr(Figure, "savefig", write)
+        return {fj.save: DATASET, fj.save_figure: Figure()}
 
-    to_netcdf = savefig = _write
+    return make
 
 
 WRITERS = [(fj.save, "result.nc"), (fj.save_figure, "result.png")]
@@ -377,19 +380,19 @@ ERRORS = [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeEr
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
-def test_writing_that_fails_leaves_nothing(tmp_path, writer, name, error):
+def test_writing_that_fails_leaves_nothing(tmp_path, breaks_midway, writer, name, error):
     """Were half a file left, the next reader would take it for a result; were a temporary left, folders would fill up."""
     with untouched(tmp_path), pytest.raises(type(error)):
-        writer(BreaksMidway(error), tmp_path / name)
+        writer(breaks_midway(error)[writer], tmp_path / name)
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
-def test_writing_that_fails_keeps_the_earlier_result(tmp_path, writer, name, error):
+def test_writing_that_fails_keeps_the_earlier_result(tmp_path, breaks_midway, writer, name, error):
     """Were the old file opened for writing, a night's work would be lost to a full disk."""
     (tmp_path / name).write_bytes(b"the result of last night")
     with untouched(tmp_path), pytest.raises(type(error)):
-        writer(BreaksMidway(error), tmp_path / name)
+        writer(breaks_midway(error)[writer], tmp_path / name)
 
 
 def test_a_dataset_that_cannot_be_stored_leaves_nothing(tmp_path):
