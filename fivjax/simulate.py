@@ -68,6 +68,7 @@ def simulate(
     method: AbstractStepper | None = None,
     *,
     y0=None,
+    energy: bool = False,
 ) -> Trajectory:
     """The response of a scene from t = 0 to `t1`.
 
@@ -80,12 +81,16 @@ def simulate(
     - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
       equilibrium at rest unless given.
 
+    - `energy`: the energy ledger, which is not built yet; anything but False is refused.
+
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
     being finite, or contact events come without end, the rows from there on are NaN.
 
     **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
     equilibrium to start from, or friction beyond Painlevé's limit.
     """
+    if energy is not False:
+        raise NotImplementedError("Argument `energy` must be False: the energy ledger is not built yet.")
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
