@@ -76,6 +76,9 @@ class EventExact(AbstractStepper):
         # of 1e-8 mean that it was met to 1e-9, or that the orbit is another.
         return Resolution(jnp.asarray(1e-8), jnp.asarray(64), jnp.asarray(1e-5))
 
+    def prepare(self, mechanics: Mechanics) -> Mechanics:
+        return mechanics
+
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
         # No step straddles a jump, so the load in its middle is the load of the whole step.
@@ -111,7 +114,7 @@ class EventExact(AbstractStepper):
         reached = jnp.where(rising & fires[2], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, RESTING * reach)
-        return Advance(y_next, next_contact, h_used)
+        return Advance(y_next, next_contact, h_used, jnp.abs(y_next[n + mechanics.tangential]))
 
 
 def _series(

@@ -1,16 +1,15 @@
 """Many trajectories, each followed until its verdict is known.
 
 A *lane* is one trajectory of a batch. `follow` is written for one lane and a fixed number of steps; `jax.vmap` makes it
-a tile of lanes. After each round of steps the decided lanes leave, the others close ranks, and the tiles are filled
-anew: work is spent only where the verdict is open.
+a group of lanes that differ in the history of their load only and share everything else, and a second `jax.vmap` makes
+that a tile of groups. After each round of steps the decided lanes leave, the others close ranks, and the tiles are
+filled anew: work is spent only where the verdict is open.
 """
 
-import itertools
 import os
 import warnings
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,17 +21,28 @@ from tqdm.auto import tqdm
 from . import contact as physics
 from . import orbit as orbits
 from .contact import Contact, Mechanics, State
+from .event_exact import EventExact
 from .load import AbstractLoad
 from .orbit import Orbit
+from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
 from .steppers import AbstractStepper
 from .verdict import Verdict
 
-# Small enough that a tile's working set stays in a core's cache, large enough to fill its vector units.
-TILE_ON_CPU = 1024
+# Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
+TILE_ON_CPU = 128
 TILE_ELSEWHERE = 65536
-SMALL_TILE = 64
+# Lanes of a group that stand side by side in a tile: enough to fill a vector unit and to make matrix products pay.
+SIDE_BY_SIDE = 16
+# What a lane that shares nothing costs, in lanes that stand side by side.
+COST_OF_STANDING_ALONE = 4
+# Looks at a lane's verdict while its time grows e-fold.
+LOOKS = 8
+# Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
+SPAN_SHARE = 4
+# Parameters that lanes of one group may differ in: the load's history, which leaves the mechanics alone.
+HISTORY = ("p", "duration", "start")
 
 
 class Lane(eqx.Module):
@@ -45,6 +55,14 @@ class Lane(eqx.Module):
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
     verdict: Int[Array, ""]
+
+
+class Shared(eqx.Module):
+    """What the lanes of a group have in common, worked out once."""
+
+    values: Float[Array, " k"]  # the parameters that are not history
+    prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
+    modes: SlidingModes
 
 
 class Outcome(NamedTuple):
@@ -88,18 +106,25 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
     return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
 
 
-def follow(scene: Scene, method: AbstractStepper, modes: SlidingModes, lane: Lane, steps: int) -> Lane:
+def follow(
+    scene: Scene,
+    method: AbstractStepper,
+    resolution: orbits.Resolution,
+    prepared,
+    modes: SlidingModes,
+    lane: Lane,
+    steps,
+) -> Lane:
     """One lane, `steps` steps further, with the verdict if it can be proved by then."""
     mechanics = Mechanics(scene)
     structure = scene.structure
     # The square roots of the diagonals make squares of displacements and velocities comparable energies.
-    resolution = method.resolution
     weights = jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
 
     def step(_, lane: Lane) -> Lane:
         t = next_step_end(scene.load, lane.t, method.dt)
         load = scene.load(0.5 * (lane.t + t))
-        y, contact, h = method.advance(mechanics, lane.contact, load, lane.y, t - lane.t)
+        y, contact, h, peak = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
         t = jnp.where(h >= t - lane.t, t, lane.t + h)
         changed = contact.status != lane.contact.status
         orbit = orbits.observe(
@@ -110,6 +135,7 @@ def follow(scene: Scene, method: AbstractStepper, modes: SlidingModes, lane: Lan
             lane.y,
             y,
             changed,
+            peak,
             resolution,
         )
         return Lane(
@@ -149,11 +175,19 @@ def run_to_verdict(
     memory: float,
     progress: bool | None,
     label: str,
+    lingering: bool = False,
 ) -> Outcome:
     """Follow one lane for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
+    `lingering` says that the lanes were chosen to lie so close to a boundary that they stay with an unstable cycle for
+    long: then an orbit has to return for longer before it counts.
+
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
+    resolution = method.resolution
+    if not lingering:
+        resolution = eqx.tree_at(lambda r: r.span, resolution, np.asarray(resolution.span) // SPAN_SHARE)
+    method = in_bulk(method, scene)
     total = len(next(iter(values.values())))
     outcome = Outcome(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
@@ -163,13 +197,19 @@ def run_to_verdict(
         last_event=np.full(total, np.nan),
     )
     bar = tqdm(total=total, desc=label, unit="lane", disable=None if progress is None else not progress)
-    block = max(1, int(memory // bytes_per_lane(scene)))
+    distinct, group = _groups(values)
+    # The same in all rounds and blocks, because products of other shapes round differently.
+    in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
+    width = SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1
+    # Blocks that are filled group by group share the most.
+    order = np.argsort(group, kind="stable")
+    block = max(1, int(memory // bytes_per_lane(scene, sharing=total / len(distinct))))
     try:
         with bar:
             for start in range(0, total, block):
-                chosen = np.arange(start, min(start + block, total))
+                chosen = order[start : start + block]
                 rows = {name: column[chosen] for name, column in values.items()}
-                _run_block(scene, rows, method, t_max, outcome, chosen, bar)
+                _run_block(scene, rows, method, resolution, width, t_max, outcome, chosen, bar)
     except KeyboardInterrupt:
         open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
         warnings.warn(
@@ -179,26 +219,45 @@ def run_to_verdict(
     return outcome
 
 
-def bytes_per_lane(scene: Scene) -> int:
-    """Memory that a lane takes, its share of a step's intermediate results included."""
+def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper:
+    """The stepper that does the same for many lanes in less time, where there is one."""
+    return Windowed() if method == EventExact() and scene.friction.constant else method
+
+
+def bytes_per_lane(scene: Scene, sharing: float) -> int:
+    """Memory that a lane takes where `sharing` lanes make a group, its part of a step's intermediate results included."""
     n = scene.structure.size
     m = 2 * (n - 1)
     state_and_orbit = 8 * (2 * 2 * n + 20)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
-    return 3 * (state_and_orbit + modes)
+    prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
+    return int(3 * (state_and_orbit + (modes + prepared) / sharing))
 
 
-def _run_block(scene, values, method, t_max, outcome: Outcome, index: np.ndarray, bar) -> None:
+def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of parameters that are not history, and the row that each lane belongs to."""
+    own = [column for name, column in values.items() if name not in HISTORY]
+    if not own:
+        count = len(next(iter(values.values())))
+        return np.zeros((1, 0)), np.zeros(count, int)
+    distinct, group = np.unique(np.stack(own, axis=-1), axis=0, return_inverse=True)
+    return distinct, group.ravel()
+
+
+def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome, index: np.ndarray, bar) -> None:
     """Lanes that fit in memory together; writes their outcomes at `index`."""
-    modes = _modes(scene, values)
-    tile = _tile_size(len(index))
-    names = tuple(values)
-    columns = np.stack([values[name] for name in names], axis=-1)
-    lanes = _collect(_in_tiles(lambda *a: _begin(scene, names, *a), len(index), tile, (columns, modes)))
-    pending = np.arange(len(index))
+    names = tuple(name for name in values if name not in HISTORY)
+    history = tuple(name for name in values if name in HISTORY)
+    distinct, group = _groups(values)
+    shared = _shared(scene, method, names, distinct)
+    columns = np.stack([np.zeros(len(index)), *(values[name] for name in history)], axis=-1)[:, 1:]
     with ThreadPoolExecutor(max_workers=_workers()) as pool:
+        start = lambda *a: _begin(scene, names, history, *a)  # noqa: E731
+        lanes = _in_tiles(start, shared, group, (columns,), width, pool)
+        pending = np.arange(len(index))
+        done = 0
         while True:
-            verdict, t = np.asarray(lanes.verdict), np.asarray(lanes.t)
+            verdict, t = lanes.verdict, lanes.t
             finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
             _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
             bar.update(int(finished.sum()))
@@ -206,9 +265,11 @@ def _run_block(scene, values, method, t_max, outcome: Outcome, index: np.ndarray
                 return
             pending = pending[~finished]
             lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
-            inputs = (columns[pending], jax.tree.map(lambda leaf, rows=pending: leaf[rows], modes), lanes)
-            step = lambda *a: _follow(scene, method, names, *a)  # noqa: E731
-            lanes = _collect(_in_tiles(step, len(pending), _tile_size(len(pending)), inputs, pool))
+            # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
+            steps = max(method.round, done // LOOKS)
+            done += steps
+            step = lambda *a, steps=steps: _follow(scene, method, resolution, names, history, np.int32(steps), *a)  # noqa: E731
+            lanes = _in_tiles(step, shared, group[pending], (columns[pending], lanes), width, pool)
 
 
 def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
@@ -221,47 +282,51 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     outcome.last_event[index] = lanes.last_event
 
 
-def _modes(scene: Scene, values: dict[str, np.ndarray]) -> SlidingModes:
-    """Modal coordinates for each lane, worked out once for lanes that differ in their load history only."""
-    relevant = [name for name in values if name not in ("p", "duration", "start")]
-    if not relevant:
-        count = len(next(iter(values.values())))
-        distinct, which = np.zeros((1, 0)), np.zeros(count, int)
-    else:
-        rows = np.stack([values[name] for name in relevant], axis=-1)
-        distinct, which = np.unique(rows, axis=0, return_inverse=True)
-    tile = _tile_size(len(distinct))
-    linear = _collect(_in_tiles(lambda x: _linear(scene, tuple(relevant), x), len(distinct), tile, (distinct,)))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[which.ravel()], sliding_modes(linear))
+def _shared(scene: Scene, method: AbstractStepper, names: tuple[str, ...], distinct: np.ndarray) -> Shared:
+    """`Shared` of each row of `distinct`; arrays over groups."""
+    size, parts = 64, []
+    for start in range(0, len(distinct), size):
+        # Filled up with copies, so that one size is compiled.
+        rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
+        part = jax.tree.map(np.asarray, _prepared(scene, method, names, distinct[rows]))
+        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
+    prepared, linear = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return Shared(distinct, prepared, sliding_modes(linear))
 
 
 @eqx.filter_jit
-def _linear(scene: Scene, names: tuple[str, ...], values):
-    return jax.vmap(lambda row: linear_sliding(_with(scene, names, row)))(values)
+def _prepared(scene: Scene, method: AbstractStepper, names: tuple[str, ...], values):
+    def one(row):
+        own = _with(scene, names, row)
+        return method.prepare(Mechanics(own)), linear_sliding(own)
+
+    return jax.vmap(one)(values)
 
 
 @eqx.filter_jit
-def _begin(scene: Scene, names: tuple[str, ...], values, modes):
-    return jax.vmap(lambda row, own: begin(_with(scene, names, row), own))(values, modes)
+def _begin(scene: Scene, names: tuple[str, ...], history: tuple[str, ...], shared: Shared, columns):
+    def group(shared, columns):
+        own = _with(scene, names, shared.values)
+        return jax.vmap(lambda row: begin(_with(own, history, row), shared.modes))(columns)
+
+    return jax.vmap(group)(shared, columns)
 
 
 @eqx.filter_jit
-def _follow(scene: Scene, method: AbstractStepper, names: tuple[str, ...], values, modes, lanes):
-    def one(row, own, lane):
-        return follow(_with(scene, names, row), method, own, lane, method.round)
+def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, steps, shared: Shared, columns, lanes):
+    def group(shared, columns, lanes):
+        own = _with(scene, names, shared.values)
 
-    return jax.vmap(one)(values, modes, lanes)
+        def one(row, lane):
+            return follow(_with(own, history, row), method, resolution, shared.prepared, shared.modes, lane, steps)
+
+        return jax.vmap(one)(columns, lanes)
+
+    return jax.vmap(group)(shared, columns, lanes)
 
 
 def _with(scene: Scene, names: tuple[str, ...], row) -> Scene:
     return scene.replace(**{name: row[i] for i, name in enumerate(names)})
-
-
-def _tile_size(count: int) -> int:
-    """One of few sizes, so that a scene is compiled once and not once per size of map."""
-    if count <= SMALL_TILE:
-        return SMALL_TILE
-    return TILE_ON_CPU if jax.default_backend() == "cpu" else TILE_ELSEWHERE
 
 
 def _workers() -> int:
@@ -271,19 +336,37 @@ def _workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def _in_tiles(function, count: int, tile: int, inputs, pool: ThreadPoolExecutor | None = None) -> Iterator:
-    """`function` over tiles of the inputs' leading axis; the last tile is filled up with copies of its first lane."""
+def _in_tiles(function, shared: Shared, group: np.ndarray, inputs: tuple, width: int, pool: ThreadPoolExecutor):
+    """`function(shared, *inputs)` over all lanes, in tiles of one size, so that a scene is compiled once for any map."""
+    slots, filled = _side_by_side(group, width)
+    size = TILE_ON_CPU if jax.default_backend() == "cpu" else TILE_ELSEWHERE
+    rows = max(1, size // width)
 
     def run(start: int):
-        rows = np.arange(start, start + tile)
-        rows = np.where(rows < count, rows, start)
+        # The last tile is filled up with copies of its first row.
+        chosen = np.arange(start, start + rows)
+        real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
+        place = slots[np.where(chosen < len(slots), chosen, start)]
         with jax.enable_x64(True):  # the setting is a thread's own
-            result = function(*jax.tree.map(lambda leaf: leaf[rows], inputs))
-            return jax.tree.map(lambda leaf: np.asarray(leaf)[: count - start], result)
+            own = jax.tree.map(lambda leaf: leaf[group[place[:, 0]]], shared)
+            result = function(own, *jax.tree.map(lambda leaf: leaf[place], inputs))
+            return place[real], jax.tree.map(lambda leaf: np.asarray(leaf)[real], result)
 
-    starts = range(0, count, tile)
-    return map(run, starts) if pool is None else pool.map(run, starts)
+    places, results = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
+    back = np.argsort(np.concatenate(places))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[back], *results)
 
 
-def _collect(tiles: Iterator):
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *itertools.chain(tiles))
+def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `width` lanes of one group each, as places in `group`; what is left over repeats the row's first lane.
+
+    Second, which of the places are not such repetitions.
+    """
+    order = np.argsort(group, kind="stable")
+    _, first, count = np.unique(group[order], return_index=True, return_counts=True)
+    rows = -(-count // width)
+    before = np.cumsum(rows) - rows
+    start = np.repeat(first, rows) + width * (np.arange(rows.sum()) - np.repeat(before, rows))
+    places = start[:, None] + np.arange(width)
+    filled = places < np.repeat(first + count, rows)[:, None]
+    return order[np.where(filled, places, start[:, None])], filled

@@ -198,7 +198,7 @@ def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label:
     """Verdicts for every lane (rows) at its own values of p (columns)."""
     lanes, points = p.shape
     values = {name: np.repeat(column, points) for name, column in columns.items()}
-    outcome = run(values={**values, "p": p.ravel()}, method=method, label=label)
+    outcome = run(values={**values, "p": p.ravel()}, method=method, label=label, lingering=label != "scan")
     return Outcome(*(field.reshape(lanes, points) for field in outcome))
 
 

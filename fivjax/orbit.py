@@ -21,7 +21,7 @@ from .contact import State
 
 # A chain of returns counts when it is at least this long.
 LEAST_RETURNS = 3
-SHORTEST_SEARCH = 8
+SHORTEST_SEARCH = 32
 LONGEST_SEARCH = 64
 # A loose return: this close relative to the orbit's size, and to how far it had gone meanwhile.
 LOOSE_DISTANCE = 0.02
@@ -47,6 +47,8 @@ class Orbit(eqx.Module):
     lag: Int[Array, ""]  # crossings per return; 0 while none is known
     returns: Int[Array, ""]  # returns in a row at that lag
     first_distance: Float[Array, ""]  # of the first of these returns, relative
+    last_distance: Float[Array, ""]  # of the last of them
+    rising: Bool[Array, ""]  # each of them further than the one before
     excursion: Float[Array, ""]  # largest distance from the anchor since it was set, relative
     peak: Float[Array, ""]  # largest tangential speed since the anchor was set, m/s
     amplitude: Float[Array, ""]  # the same over the returns in a row
@@ -64,6 +66,8 @@ def new_orbit(y: State) -> Orbit:
         lag=none,
         returns=none,
         first_distance=zero,
+        last_distance=zero,
+        rising=jnp.zeros((), bool),
         excursion=zero,
         peak=zero,
         amplitude=zero,
@@ -79,12 +83,13 @@ def observe(
     before: State,
     after: State,
     changed: Bool[Array, ""],
+    peak: Float[Array, ""],
     resolution: Resolution,
 ) -> Orbit:
     """The orbit's memory after one more step, from the state `before` it to the state `after` it.
 
     `weights` make displacements and velocities comparable; distances are relative to that from `equilibrium`. `changed`
-    says whether the status changed in the step.
+    says whether the status changed in the step, `peak` is the largest tangential speed in it.
     """
     tangential_velocity = before.shape[0] // 2 + tangential
     speed = before[tangential_velocity], after[tangential_velocity]
@@ -95,7 +100,7 @@ def observe(
 
     crossings = orbit.crossings + 1
     changes = orbit.changes + changed
-    peak = jnp.maximum(orbit.peak, jnp.abs(speed[1]))
+    peak = jnp.maximum(orbit.peak, peak)
     # While the anchor is not set, the distance is infinite and says nothing.
     excursion = jnp.where(jnp.isfinite(distance), jnp.maximum(orbit.excursion, distance), orbit.excursion)
     loose = (distance <= LOOSE_DISTANCE) & (distance <= LOOSE_SHARE * excursion) & (excursion >= resolution.floor)
@@ -113,7 +118,9 @@ def observe(
     needed = jnp.maximum(LEAST_RETURNS, -(-span // jnp.maximum(lag, 1)))
     complete = again & (returns >= needed)
     # Below a hundredth of the method's error there is nothing left to drift.
-    drifting = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
+    further = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
+    rising = again & orbit.rising & (distance > orbit.last_distance)
+    drifting = jnp.where(loose, rising, further)
     restart = found | (complete & drifting)
     amplitude = jnp.where(found, peak, jnp.where(again, jnp.maximum(orbit.amplitude, peak), orbit.amplitude))
     new_anchor = found | again | lost | tired
@@ -130,6 +137,8 @@ def observe(
         lag=lag,
         returns=jnp.where(restart, 1, returns),
         first_distance=jnp.where(restart, distance, orbit.first_distance),
+        last_distance=distance,
+        rising=restart | rising,
         excursion=jnp.where(new_anchor, 0.0, excursion),
         peak=jnp.where(new_anchor, 0.0, peak),
         amplitude=amplitude,

@@ -54,6 +54,7 @@ class Advance(NamedTuple):
     y: State
     contact: Contact
     h: Float[Array, ""]  # how far it came, s
+    peak: Float[Array, ""]  # largest tangential speed it saw, m/s
 
 
 class AbstractStepper(diffrax.AbstractSolver[StepperState]):
@@ -69,6 +70,10 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     @abc.abstractmethod
     def resolution(self) -> Resolution:
         """What orbits computed by this method are good for, see `orbit`."""
+
+    @abc.abstractmethod
+    def prepare(self, mechanics: Mechanics):
+        """What `advance` wants to know of a scene, worked out once: the mechanics themselves, or matrices made of them."""
 
     @abc.abstractmethod
     def advance(

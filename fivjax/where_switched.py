@@ -56,12 +56,15 @@ class WhereSwitched(AbstractStepper):
         # Events come up to a step late, so crossings scatter by a few per cent and only many of them say something.
         return Resolution(jnp.asarray(0.02), jnp.asarray(256), jnp.asarray(0.05))
 
+    def prepare(self, mechanics: Mechanics) -> Mechanics:
+        return mechanics
+
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
         # No step straddles a jump, so the load in its middle is the load of the whole step.
         load, h = args.load(0.5 * (t0 + t1)), t1 - t0
         smooth, error = self._smooth_step(mechanics, contact, load, y0, h)
-        y1, next_contact, _ = self._switched(mechanics, contact, load, smooth, h)
+        y1, next_contact, *_ = self._switched(mechanics, contact, load, smooth, h)
         dense_info = {
             "y0": y0,
             "y1": y1,
@@ -92,7 +95,7 @@ class WhereSwitched(AbstractStepper):
         e = mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
         next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
-        return Advance(y, next_contact, h)
+        return Advance(y, next_contact, h, jnp.abs(y[y.shape[0] // 2 + mechanics.tangential]))
 
 
 def _weighted(weights, stages: list[State]) -> State:

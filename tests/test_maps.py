@@ -3,6 +3,7 @@
 import json
 import warnings
 
+import jax
 import numpy as np
 import oracle
 import pytest
@@ -131,20 +132,30 @@ def test_lanes_do_not_know_each_other(paper_scene, monkeypatch):
     """Neither the order of lanes nor the size of tiles and blocks may change a verdict; a poisoned lane harms no other."""
     axes = {"mu": [0.1, 0.2, 0.227], "p": [1.1, 1.5, 2.0, 3.0]}
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
-    scene_bytes = lanes.bytes_per_lane(paper_scene)
+    scene_bytes = lanes.bytes_per_lane(paper_scene, sharing=4)
     blocks = fj.bistability_map(paper_scene, progress=False, memory=5 * scene_bytes, **axes)
     for name in ("verdict", "amplitude", "decided_at", "contact_events"):
         np.testing.assert_array_equal(whole[name], blocks[name])
-    with np.errstate(all="ignore"):
-        values = {"mu": np.array([0.2, np.nan, 0.227]), "p": np.array([2.0, 2.0, 3.0])}
-        import jax
 
-        with jax.enable_x64(True):
-            poisoned = lanes.run_to_verdict(
+    def decided(mu, p):
+        with np.errstate(all="ignore"), jax.enable_x64(True):
+            values = {"mu": np.array(mu), "p": np.array(p)}
+            return lanes.run_to_verdict(
                 paper_scene, values, fj.EventExact(), t_max=20.0, memory=1e9, progress=False, label=""
             )
-    assert poisoned.verdict.tolist() == [1, fj.Verdict.NOT_FINITE, 1]
-    assert poisoned.decided_at[0] == whole["decided_at"].sel(mu=0.2, p=2.0)
+
+    healthy = whole.sel(mu=0.2)
+    # Poison in the history of the load, among lanes of the same mechanics, and in the mechanics of a neighbour.
+    among = decided([0.2] * 4, [1.1, 1.5, np.nan, 3.0])
+    assert among.verdict.tolist() == [0, 1, fj.Verdict.NOT_FINITE, 1]
+    beside = decided([0.2, np.nan, 0.2, 0.2, 0.2], [1.1, 2.0, 1.5, 2.0, 3.0])
+    assert beside.verdict.tolist() == [0, fj.Verdict.NOT_FINITE, 1, 1, 1]
+    np.testing.assert_array_equal(among.decided_at[[0, 1, 3]], healthy["decided_at"][[0, 1, 3]])
+    # Fewer lanes to a group, or one at a time: other shapes of the same products, which round differently.
+    np.testing.assert_allclose(beside.decided_at[[0, 2, 3, 4]], healthy["decided_at"], rtol=1e-9)
+    alone = decided([0.2], [2.0])
+    np.testing.assert_allclose(alone.decided_at, healthy["decided_at"].sel(p=2.0), rtol=1e-9)
+    np.testing.assert_allclose(alone.amplitude, healthy["amplitude"].sel(p=2.0), rtol=1e-9)
 
 
 def test_failures_are_verdicts_of_their_own(paper_scene):

@@ -95,7 +95,7 @@ def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True):
         resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
         step = jax.jit(
             lambda orbit, before, after, changed: observe(
-                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, resolution
+                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, jnp.abs(after[2]), resolution
             )
         )
         orbit, when = new_orbit(jnp.zeros(4)), None
