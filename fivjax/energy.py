@@ -13,13 +13,14 @@ Signs, for all of fivjax: **contact and load power are positive into the structu
 
 | line | power | |
 |---|---|---|
-| `stick` | $T v_{belt}$ | Eq. 9: what the belt does to the structure that it carries along |
-| `slide` | $T \dot q_t$ | Eq. 10: what the belt does to the structure that slides on it; zero while detached |
+| `stick` | $T v_{belt}$ | Eq. 9: from the belt that carries the structure along |
+| `slide` | $T \dot q_t$ | Eq. 10: from the belt that slides under it; zero while detached |
 | `damping` | $\dot q^T C \dot q$ | never negative; `dampers` has it apart by damper |
-| `load` | $F f \cdot \dot q$ | the load acts along $-y_1$, so this is $-F \dot y_1$: Eq. 12 with the sign that closes the balance |
-| `interface` | $-T v_{rel}$ | Eq. 8, dissipated between belt and structure, never negative; the belt's drive pays for it, so it is no part of $\dot E_m$ |
+| `load` | $F f \cdot \dot q$ | $-F \dot y_1$ in the paper's model: Eq. 12 has the other sign, which does not close |
+| `interface` | $-T v_{rel}$ | Eq. 8: dissipated between belt and structure, never negative |
 | `kick` | $(F - F_{final}) f \cdot \dot q$ | the part of `load` that the kick puts in |
 
+The belt's drive pays for what the interface dissipates, so that is no part of $\dot E_m$.
 Eq. 13 has no term for impacts. A re-contact takes energy at one instant, which is a line of its own (`impact`), and what
 is left after all lines is the `residual`: the error of the computation, and a meter for it.
 
@@ -80,10 +81,10 @@ class Ledger(eqx.Module):
     impact: Float[
         Array, "..."
     ]  # mechanical energy lost in re-contacts, J; negative where the belt gave more than was lost
-    impact_dissipated: Float[Array, "..."]  # the same seen from the belt, so without what the belt gave, J
+    impact_dissipated: Float[Array, "..."]  # the same with what the belt gave: dissipated between the two, J
     stick_time: Float[Array, "..."]  # time spent sticking, s
     detach_time: Float[Array, "..."]  # time spent detached, s
-    events: Int[Array, "..."]  # status changes and impacts
+    events: Int[Array, "..."]  # status changes, rebounds and reversals of slip
     crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity
     start: Float[Array, "..."]  # mechanical energy at the start, J
     worst: Float[Array, "..."]  # largest size of the residual so far, J
@@ -190,7 +191,7 @@ def open_ledger(books: Books, y: State) -> Ledger:
     """A ledger in which nothing has been entered yet."""
     none, no = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
     return Ledger(
-        work=Flows(none, none, none, none, {name: none for name in books.dampers}, none, none),
+        work=Flows(none, none, none, none, dict.fromkeys(books.dampers, none), none, none),
         impact=none,
         impact_dissipated=none,
         stick_time=none,
@@ -235,13 +236,15 @@ def enter(
     detached = contact.status == Status.DETACH
     loss, dissipated = jnp.where(detached, loss, 0.0), jnp.where(detached, loss + by_belt, 0.0)
     bounced = detached & (after.contact.status == Status.DETACH) & (after.y[normal] == 0) & (after.h > 0)
+    reversed_ = (contact.status == after.contact.status) & (contact.direction != after.contact.direction)
+    reversed_ = reversed_ & (contact.status == Status.SLIDE)
     entered = Ledger(
         work=work,
         impact=ledger.impact + loss,
         impact_dissipated=ledger.impact_dissipated + dissipated,
         stick_time=ledger.stick_time + jnp.where(contact.status == Status.STICK, after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(detached, after.h, 0.0),
-        events=ledger.events + ((after.contact.status != contact.status) | bounced),
+        events=ledger.events + ((after.contact.status != contact.status) | bounced | reversed_),
         crossings=ledger.crossings + ((y[n + tangential] < 0) & (after.y[n + tangential] >= 0)),
         start=ledger.start,
         worst=ledger.worst,

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 
 from . import arguments
 from . import energy as accounts
-from .contact import Contact, Mechanics, State, Status
-from .energy import Books, Energy, Flows, Ledger
+from .contact import Contact, Mechanics, State
+from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known
 from .results import labelled
@@ -37,7 +37,7 @@ class _Instant(NamedTuple):
 
 
 @in_double_precision
-def per_cycle(run: Trajectory) -> xr.Dataset:
+def energy_per_cycle(run: Trajectory) -> xr.Dataset:
     """The ledger of each whole cycle of a trajectory: what Figs. 13, 15 and 16 draw in black.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
@@ -52,7 +52,7 @@ def per_cycle(run: Trajectory) -> xr.Dataset:
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
     """
     _check(run)
-    found, _ = _marks(run, lambda ledger: ledger.crossings)
+    found, _ = _marks(run, _crossings)
     energy = _mechanical(run.scene, found)
     work = {**found.ledger.work.lines("work"), "contact_work": found.ledger.work.contact}
     lines = {
@@ -79,12 +79,12 @@ def per_cycle(run: Trajectory) -> xr.Dataset:
 
 
 @in_double_precision
-def per_event(run: Trajectory) -> xr.Dataset:
+def energy_per_event(run: Trajectory) -> xr.Dataset:
     """The ledger of each contact event of a trajectory: when, from which status to which, and what an impact cost.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
 
-    **Returns:** a dataset over `event`: `event_time` in s; `status_before` and `status_after` (equal for a rebound, or where
+    **Returns:** a dataset over `event`: `event_time` in s; `status_before` and `status_after` (equal for a rebound, and where
     slip goes straight from one direction to the other); `impact_loss` and `impact_dissipated` in J, zero but for
     re-contacts; and `mechanical_energy` just after, in J. Exact for `EventExact`; for other methods, times are found to
     within their own error.
@@ -92,7 +92,7 @@ def per_event(run: Trajectory) -> xr.Dataset:
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
     """
     _check(run)
-    found, before = _marks(run, lambda ledger: ledger.events)
+    found, before = _marks(run, _events)
     variables = {
         "status_before": before.astype(np.int8),
         "status_after": found.contact.status.astype(np.int8),
@@ -102,6 +102,15 @@ def per_event(run: Trajectory) -> xr.Dataset:
     }
     coords = {"event": np.arange(len(found.t)), "event_time": ("event", found.t)}
     return labelled(xr.Dataset({name: ("event", x) for name, x in variables.items()}, coords), run.scene)
+
+
+# Functions with a name, so that what is compiled for one of them is found again.
+def _crossings(ledger: Ledger) -> Array:
+    return ledger.crossings
+
+
+def _events(ledger: Ledger) -> Array:
+    return ledger.events
 
 
 def _check(run) -> None:
