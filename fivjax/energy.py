@@ -167,6 +167,16 @@ def mechanical_energy(structure: Structure, y: State) -> Float[Array, ""]:
     return kinetic_energy(structure, y) + elastic_energy(structure, y)
 
 
+def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: State) -> Float[Array, ""]:
+    """Kinetic energy, and elastic energy of the displacement from an equilibrium, in J: zero where nothing vibrates.
+
+    What a kick has done is to be read off this one. The load's own share of it, `kick`, is small and may be negative:
+    at the paper's parameters nearly all of the vibration is fed by the contact while the kick lasts.
+    """
+    displaced = jnp.concatenate([y[: structure.size] - equilibrium, y[structure.size :]])
+    return mechanical_energy(structure, displaced)
+
+
 def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Flows:
     """The flows at one instant, in W."""
     structure = books.structure

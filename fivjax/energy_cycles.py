@@ -134,14 +134,18 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
     rising = np.diff(counted) * finite[1:]
     chosen = np.flatnonzero(rising)
     # One of few shapes, so that not every trajectory compiles anew; surplus lanes repeat the first row and are dropped.
-    lanes = 1 << max(len(chosen) - 1, 15).bit_length()
-    most = 1 << int(rising.max(initial=1) - 1).bit_length()
+    lanes, most = _power_of_4(max(len(chosen), 64)), _power_of_4(int(rising.max(initial=1)))
     padded = np.concatenate([chosen, np.zeros(lanes - len(chosen), int)])
     starts = jax.tree.map(lambda leaf: leaf[padded], rows)
     found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
     wanted = np.zeros((lanes, most), bool)
     wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
+
+
+def _power_of_4(count: int) -> int:
+    """The next one at or above a count."""
+    return 4 ** -(-(count - 1).bit_length() // 2)
 
 
 @eqx.filter_jit

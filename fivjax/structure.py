@@ -83,6 +83,7 @@ class Structure(eqx.Module):
         self.dampers = tuple(dampers)
 
     @property
+    @in_double_precision
     def damping_parts(self) -> dict[str, Float[Array, "n n"]]:
         """The damping matrix apart by damper, in N·s/m; empty where the structure was given as matrices."""
         if self.builder is None:
