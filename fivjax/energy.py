@@ -244,8 +244,9 @@ def enter(
     loss = -0.5 * jnp.sum(impulses * (before + behind))
     by_belt = impulses[tangential] * mechanics.belt_speed
     detached = contact.status == Status.DETACH
-    loss, dissipated = jnp.where(detached, loss, 0.0), jnp.where(detached, loss + by_belt, 0.0)
-    bounced = detached & (after.contact.status == Status.DETACH) & (after.y[normal] == 0) & (after.h > 0)
+    landed = detached & (after.y[normal] == 0)
+    loss, dissipated = jnp.where(landed, loss, 0.0), jnp.where(landed, loss + by_belt, 0.0)
+    bounced = landed & (after.contact.status == Status.DETACH) & (after.h > 0)
     reversed_ = (contact.status == after.contact.status) & (contact.direction != after.contact.direction)
     reversed_ = reversed_ & (contact.status == Status.SLIDE)
     entered = Ledger(

@@ -1,6 +1,7 @@
 """The energy ledger against closed forms, against quadrature of the independent oracle, and against the paper's statements."""
 
 import dataclasses
+import sys
 
 import diffrax
 import equinox as eqx
@@ -20,11 +21,14 @@ from fivjax.contact import Mechanics, Status
 CLOSED = 1e-13
 
 
-# Compiling takes longer than running, and a number of rows is compiled once; so most runs here have this many.
+# Compiling takes longer than running, and one kind of scene with one number of rows is compiled once; so most runs here
+# are of that kind.
 ROWS = 12_000
 
 
 def simulate(scene: fj.Scene, t1: float, y0=None) -> fj.Trajectory:
+    if isinstance(scene.friction, fj.Coulomb) and scene.friction.mu_static is None:
+        scene = dataclasses.replace(scene, friction=fj.Coulomb(scene.friction.mu, scene.friction.mu))
     return fj.simulate(scene, t1, t1 / ROWS, y0=y0, energy=True)
 
 
@@ -171,28 +175,27 @@ def test_the_loss_of_each_impact_agrees_with_the_oracle():
     events = fj.energy_per_event(run)
     impacts = events.where(events["status_before"] == Status.DETACH, drop=True)
     np.testing.assert_allclose(impacts["event_time"], times, atol=1e-11)
-    # Power changes by some 10⁷ W/s, so going `aside` to second order costs 1e-7 J/s · 1e-7 s of it.
+    # Power changes at some 10⁵ W/s, so what going `aside` leaves out is 1e-9 J.
     np.testing.assert_allclose(impacts["impact_loss"], loss, atol=1e-8)
     assert len(times) > 5 and abs(loss).max() > 1e-3
-    assert np.all(events["impact_loss"].values[events["status_before"] != Status.DETACH] == 0)
+    others = events["impact_loss"].values[events["status_before"] != Status.DETACH]
+    np.testing.assert_allclose(others, 0.0, atol=1e-15)  # differences of what is cumulated, so rounding
 
 
 # ------------------------------------------------------------------------------------------------ closed forms
 
 
-def point_mass(mu=0.0, mu_static=0.0, stiffness=1.0, belt_speed=0.0, force=1.0, restitution=0.0) -> fj.Scene:
-    """One unit mass with a spring along the belt, pressed on by a load."""
-    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.diag([stiffness, 0.0]), [0.0, -1.0], normal=1)
-    return fj.Scene(
-        structure, fj.Coulomb(mu, max(mu, mu_static)), belt_speed, fj.ConstantLoad(force), restitution=restitution
-    )
+def block(mu, mu_static, belt_speed) -> fj.Scene:
+    """A unit mass on a unit spring along the belt, pressed on with 1 N: the paper's model on a level belt."""
+    structure = fj.belt_oscillator(m1=0.9, m2=0.1, c1=0.0, c2=0.0, k1=1.0, k2=1.0, theta=0.0)
+    return fj.Scene(structure, fj.Coulomb(mu, mu_static), belt_speed, fj.Pulse(1.0, 1.0))
 
 
 def test_stick_slip_of_a_block_with_two_friction_forces():
     """In each period the belt loads the spring by 2 F_d Δ/k while it sticks, and sliding takes it out again."""
     v, delta, low = 0.2, 0.5, 0.5
-    scene = point_mass(mu=low, mu_static=low + delta, belt_speed=v)
-    run = simulate(scene, 80.0, y0=([1.0, 0.0], [v, 0.0]))
+    scene = block(low, low + delta, v)
+    run = simulate(scene, 80.0, y0=([1.0, -1.0, 0.0], [v, 0.0, 0.0]))
     cycles = fj.energy_per_cycle(run)
     stick, slip = 2 * delta / v, 2 * (np.pi - np.arctan(delta / v))
     assert cycles.sizes["cycle"] == 8
@@ -212,26 +215,28 @@ def test_stick_slip_of_a_block_with_two_friction_forces():
     np.testing.assert_allclose(cycles["cycle_end"] - cycles["cycle_start"], stick + slip, atol=1e-12)
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_a_bouncing_mass_loses_what_its_restitution_says(restitution):
-    """Falling by h = 1 brings g J per kg; each impact takes the share 1 − e² of what is left, all together everything."""
-    scene = point_mass(force=9.81, restitution=restitution, stiffness=0.0)
-    run = simulate(scene, 2.0, y0=([0.0, 1.0], [0.0, 0.0]))
-    losses = fj.energy_per_event(run)["impact_loss"].values
-    count = min(len(losses), 12)
-    np.testing.assert_allclose(
-        losses[:count], 9.81 * (1 - restitution**2) * restitution ** (2 * np.arange(count)), atol=1e-12
-    )
-    assert run.energy.impact[-1] == pytest.approx(9.81 if restitution < 1 else 0.0, abs=1e-11)
-    assert run.energy.ledger.impact_dissipated[-1] == pytest.approx(run.energy.impact[-1], abs=1e-12)  # the floor rests
-
-
 def test_an_oscillator_that_friction_brings_to_rest_has_lost_its_energy_at_the_interface():
     """On a belt at rest, all that leaves the structure is dissipated there: Eqs. 8 and 10 are each other's negative."""
-    run = simulate(point_mass(mu=1.0), 30.0, y0=([12.0, 0.0], [6.0, 0.0]))
+    run = simulate(block(1.0, 1.0, 0.0), 30.0, y0=([12.0, -1.0, 0.0], [6.0, 0.0, 0.0]))
     lost = 0.5 * (12.0**2 + 6.0**2) - 0.5 * (15.0 - np.hypot(13.0, 6.0)) ** 2
     assert run.energy.work.interface[-1] == pytest.approx(lost, abs=1e-12)
     assert run.energy.work.slide[-1] == pytest.approx(-lost, abs=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_a_bouncing_mass_loses_what_its_restitution_says(restitution):
+    """Falling by h = 1 brings g J per kg; each impact takes the share 1 − e² of what is left, all together everything."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.zeros((2, 2)), [0.0, -1.0], normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.ConstantLoad(9.81), restitution=restitution)
+    # Before bounces without end at 1.355 s for a restitution of a half.
+    run = simulate(scene, 1.3, y0=([0.0, 1.0], [0.0, 0.0]))
+    losses = fj.energy_per_event(run)["impact_loss"].values
+    count = len(losses)
+    assert count == {0.0: 1, 0.5: 5, 1.0: 1}[restitution]
+    np.testing.assert_allclose(losses, 9.81 * (1 - restitution**2) * restitution ** (2 * np.arange(count)), atol=1e-12)
+    assert run.energy.impact[-1] == pytest.approx(9.81 * (1 - restitution ** (2 * count)), abs=1e-12)
+    assert run.energy.ledger.impact_dissipated[-1] == pytest.approx(run.energy.impact[-1], abs=1e-12)  # the floor rests
 
 
 def test_vibration_energy_is_that_of_the_deviation(paper_scene):
@@ -274,9 +279,9 @@ def test_signs(squeal):
     np.testing.assert_allclose(sum(energy.work.dampers.values()), energy.work.damping, rtol=1e-12)
 
 
-def test_impacts_seen_from_the_belt_never_gain(squeal):
+def test_impacts_seen_from_the_belt_never_gain():
     """The belt moves, so an impact may leave the structure with more energy than before; but not what the two have together."""
-    events = fj.energy_per_event(squeal)
+    events = fj.energy_per_event(simulate(mode_coupling(COULOMB, 3.0).replace(p=3.0), 3.0))
     impacts = events["status_before"] == Status.DETACH
     assert int(impacts.sum()) > 100
     assert np.all(events["impact_dissipated"].values >= -1e-15)
@@ -286,11 +291,12 @@ def test_impacts_seen_from_the_belt_never_gain(squeal):
 def test_damping_apart_by_damper():
     """The parts sum to the matrix and are linear in their own damper; a structure given as matrices names none."""
     structure = fj.belt_oscillator(c1=0.7, c2=1.9, theta=0.3)
-    parts = structure.damping_parts
+    parts = {name: np.asarray(part) for name, part in structure.damping_parts.items()}
     assert set(parts) == {"c1", "c2"}
     np.testing.assert_allclose(sum(parts.values()), structure.damping, atol=1e-15)
     with jax.enable_x64(True):
         slopes = jax.jacfwd(lambda c: fj.belt_oscillator(c1=c[0], c2=c[1], theta=0.3).damping)(jnp.array([0.7, 1.9]))
+    slopes = np.asarray(slopes)
     np.testing.assert_allclose(parts["c1"], 0.7 * slopes[..., 0], atol=1e-15)
     np.testing.assert_allclose(parts["c2"], 1.9 * slopes[..., 1], atol=1e-15)
 
@@ -449,11 +455,12 @@ def test_one_advance_entered_by_hand(paper_scene):
     assert int(ledger.events) == run.energy.ledger.events[-1] > 3
 
 
+@pytest.mark.slow
 def test_rows_that_were_not_reached_have_no_ledger(squeal):
     """Where the motion has no number, its ledger has none; tables leave out what lies beyond."""
     q = fj.sliding_equilibrium(squeal.scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fivjax.simulate.MOST_ADVANCES", 8)
+        patch.setattr(sys.modules["fivjax.simulate"], "MOST_ADVANCES", 8)
         cut = fj.simulate(squeal.scene, 12.0, 0.1, y0=(1.02 * q, 0 * q), energy=True)
     assert np.all(np.isnan(cut.energy.residual[1:])) and np.all(np.isnan(cut.energy.work.load[1:]))
     assert fj.energy_per_cycle(cut).sizes["cycle"] == 0
