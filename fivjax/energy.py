@@ -35,6 +35,7 @@ from jaxtyping import Array, Float, Int
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
+from .precision import returning_numpy
 from .scene import Scene
 from .steppers import AbstractStepper, Advance
 from .structure import Structure
@@ -167,12 +168,14 @@ def mechanical_energy(structure: Structure, y: State) -> Float[Array, ""]:
     return kinetic_energy(structure, y) + elastic_energy(structure, y)
 
 
+@returning_numpy
 def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: State) -> Float[Array, ""]:
     """Kinetic energy, and elastic energy of the displacement from an equilibrium, in J: zero where nothing vibrates.
 
     What a kick has done is to be read off this one. The load's own share of it, `kick`, is small and may be negative:
     at the paper's parameters nearly all of the vibration is fed by the contact while the kick lasts.
     """
+    y = jnp.asarray(y)
     displaced = jnp.concatenate([y[: structure.size] - equilibrium, y[structure.size :]])
     return mechanical_energy(structure, displaced)
 

@@ -134,9 +134,8 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
     rising = np.diff(counted) * finite[1:]
     chosen = np.flatnonzero(rising)
     # One of few shapes, so that not every trajectory compiles anew; surplus lanes repeat the first row and are dropped.
-    lanes, most = (
-        _power_of_4(max(count, least)) for count, least in ((len(chosen), 1024), (int(rising.max(initial=1)), 4))
-    )
+    most = _power_of_4(max(int(rising.max(initial=1)), 4))
+    lanes = _power_of_4(max(len(chosen), 4096 // most, 64))
     padded = np.concatenate([chosen, np.zeros(lanes - len(chosen), int)])
     starts = jax.tree.map(lambda leaf: leaf[padded], rows)
     found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))

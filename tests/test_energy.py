@@ -434,7 +434,7 @@ def test_one_advance_entered_by_hand(paper_scene):
     with jax.enable_x64(True):
         books, mechanics = accounts.Books(scene), Mechanics(scene)
         q = jnp.asarray(fj.sliding_equilibrium(scene))
-        y = jnp.concatenate([q, 0 * q])
+        y0 = y = jnp.concatenate([q, jnp.array([2.5, -1.0, 0.0])])
         ledger = accounts.open_ledger(books, y)
         contact = fj.contact.status_from_forces(mechanics, scene.load(0.0), y)
 
@@ -448,7 +448,7 @@ def test_one_advance_entered_by_hand(paper_scene):
             ledger, after = advance(ledger, contact, y, jnp.asarray(0.1 - t))
             t, y, contact = t + float(after.h), after.y, after.contact
         residual = float(accounts.residual(books, ledger, y))
-    run = simulate(scene, 0.1)
+    run = simulate(scene, 0.1, np.asarray(y0))
     assert float(ledger.work.load) == pytest.approx(run.energy.work.load[-1], abs=1e-13)
     assert float(ledger.impact) == pytest.approx(run.energy.impact[-1], abs=1e-13)
     assert abs(residual) <= float(ledger.worst) <= 1e-13
