@@ -21,8 +21,9 @@ Signs, for all of fivjax: **contact and load power are positive into the structu
 | `kick` | $(F - F_{final}) f \cdot \dot q$ | the part of `load` that the kick puts in |
 
 The belt's drive pays for what the interface dissipates, so that is no part of $\dot E_m$.
-Eq. 13 has no term for impacts. A re-contact takes energy at one instant, which is a line of its own (`impact`), and what
-is left after all lines is the `residual`: the error of the computation, and a meter for it.
+Eq. 13 has no term for impacts. A re-contact changes energy at one instant, which is a line of its own (`impact`): it takes
+energy, or where the moving belt drags the landing structure along, may give some. What is left after all lines is the
+`residual`: the error of the computation, and a meter for it.
 
 Work is integrated along each advance with the method's own states and to its own order: Gauss quadrature of the Taylor
 series for `EventExact`, the stages and weights of the Runge–Kutta step for `WhereSwitched`.
@@ -233,6 +234,9 @@ def enter(
     after: Advance,
 ) -> Ledger:
     """The ledger with one advance entered, from `contact` and `y` under `load` to what it reached.
+
+    The scene's "reset" impact law is no impulse of the contact; there, `impact_dissipated` is only the loss with the work that
+    the belt would do if it were.
 
     What a transition merely tidies up (a gap put at zero, slip that has run out) is no line: it goes into the residual.
     """

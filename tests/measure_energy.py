@@ -72,7 +72,14 @@ def cost() -> None:
 
 
 def paper() -> None:
-    """The statements of Sections 4.2 and 4.3 in numbers."""
+    """The statements of Sections 3.3, 4.2 and 4.3 in numbers."""
+    both = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.6, 0.5, 0.5), 0.5, fj.ConstantLoad(100.0))
+    q = fj.sliding_equilibrium(both)
+    c = fj.energy_per_cycle(fj.simulate(both, 3.0, 1e-3, y0=(1.001 * q, 0 * q), energy=True))
+    begin, end = (int(np.argmax(c[name].values > 0)) for name in ("stick_time", "detach_time"))
+    for name, unit in (("stick_time", "ms"), ("contact_work", "mJ"), ("energy_gain", "mJ")):
+        values = 1e3 * c[name].values[[begin + 2, end - 1]]
+        print(f"Section 3.3, first to last cycle of sticking alone: {name} {values[0]:.2f} to {values[1]:.2f} {unit}")
     for p in (1.20, 1.19):
         run = fj.simulate(scene(p=p), 12.0, 1e-3, energy=True)
         detached = fj.energy_per_cycle(run)["detach_time"].values
