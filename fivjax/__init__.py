@@ -2,9 +2,13 @@
 
 from . import cea as cea
 from . import design as design
+from . import energy as energy
 from . import plot as plot
+from . import plot_energy as plot_energy
 from . import plot_linear as plot_linear
 from .contact import Status as Status
+from .energy_cycles import energy_per_cycle as energy_per_cycle
+from .energy_cycles import energy_per_event as energy_per_event
 from .event_exact import EventExact as EventExact
 from .friction import Coulomb as Coulomb
 from .friction import ExponentialDecay as ExponentialDecay

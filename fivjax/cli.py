@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import tyro
 
-from . import cea, plot, plot_linear
+from . import cea, plot, plot_energy, plot_linear
 from .event_exact import EventExact
 from .friction import Coulomb, ExponentialDecay
 from .load import Pulse
@@ -126,7 +126,7 @@ class Map:
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
-    """One trajectory from sliding equilibrium through the kick. Writes OUT.nc and OUT.png."""
+    """One trajectory from sliding equilibrium through the kick. Writes OUT.nc and OUT.png, with --energy OUT_energy.png."""
 
     t1: float = 2.0
     """end (s)"""
@@ -134,6 +134,8 @@ class Simulate:
     """distance of saved instants (s)"""
     quantity: Literal["displacement", "velocity", "acceleration"] = "acceleration"
     """what to draw, along the belt"""
+    energy: bool = False
+    """keep the energy ledger: its lines go into the data, and into a picture of their own"""
     out: Path = Path("response")
     """files to write, without suffix"""
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
@@ -141,10 +143,13 @@ class Simulate:
 
     def run(self) -> None:
         data, picture = _outputs(self.out)
-        run = simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper())
+        balance = [check_writable(picture.with_name(f"{picture.stem}_energy.png"))] if self.energy else []
+        run = simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
         save(run.to_dataset(), data)
         save_figure(plot.response(run, self.quantity), picture)
-        _say(data, picture)
+        for path in balance:
+            save_figure(plot_energy.balance(run), path)
+        _say(data, picture, *balance)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from . import contact as physics
 from .contact import Contact, Mechanics, State
 from .orbit import Resolution
 from .scene import Scene
-from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, advance_by
+from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
 
 # A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
 ROUNDING = 1e-12
@@ -115,6 +115,17 @@ class EventExact(AbstractStepper):
         reached = physics.on_constraint(mechanics, contact, reached)
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, RESTING * reach)
         return Advance(y_next, next_contact, h_used, jnp.abs(y_next[n + mechanics.tangential]))
+
+    def within(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Within:
+        # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
+        # product of two series is integrated with an error far below that of the series itself.
+        states, _ = _series(mechanics, contact, load, y, self.order_)
+        points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
+        inside, _ = _value_and_slope([state[None] for state in states], (0.5 * (points[:, None] + 1.0)) * h)
+        end, _ = _value_and_slope(states, h)
+        return Within(inside, 0.5 * h * weights, end)
 
 
 def _series(

@@ -46,6 +46,42 @@ QUANTITIES = {
     "decided_at": ("time at which the verdict was proved", "s"),
     "contact_events": ("number of status changes up to the verdict", "1"),
     "last_event": ("time of the last status change up to the verdict", "s"),
+    "kinetic_energy": ("kinetic energy", "J"),
+    "elastic_energy": ("elastic energy", "J"),
+    "mechanical_energy": ("mechanical energy", "J"),
+    "energy_residual": ("residual of the energy balance", "J"),
+    **{
+        f"{line}_{kind}": (f"{kind} {what}", unit)
+        for kind, unit in (("power", "W"), ("work", "J"))
+        for line, what in {
+            "contact": "of the contact on the structure",
+            "stick": "of the contact on the structure while sticking",
+            "slide": "of the contact on the structure while sliding",
+            "interface": "dissipated at the interface",
+            "damping": "dissipated by the dampers",
+            "load": "of the load",
+            "kick": "of the load beyond its final value",
+        }.items()
+    },
+    **{
+        f"damping_{kind}_{name}": (f"{kind} dissipated by damper {name[1:]}", unit)
+        for kind, unit in (("power", "W"), ("work", "J"))
+        for name in ("c1", "c2")
+    },
+    "impact_loss": ("mechanical energy lost in re-contacts", "J"),
+    "impact_dissipated": ("energy dissipated in re-contacts", "J"),
+    "energy_gain": ("growth of mechanical energy", "J"),
+    "stick_time": ("time spent sticking", "s"),
+    "slide_time": ("time spent sliding", "s"),
+    "detach_time": ("time spent detached", "s"),
+    "cycle": ("cycle", "1"),
+    "cycle_start": ("start of the cycle", "s"),
+    "cycle_end": ("end of the cycle", "s"),
+    "turning_point": ("tangential displacement at the start of the cycle", "m"),
+    "event": ("contact event", "1"),
+    "event_time": ("time of the contact event", "s"),
+    "status_before": ("contact status before (0 stick, 1 slide, 2 detach)", "1"),
+    "status_after": ("contact status after (0 stick, 1 slide, 2 detach)", "1"),
     "p_crit": ("critical perturbation", "1"),
     "p_crit_low": ("largest perturbation proved to return to sliding below the crossing", "1"),
     "p_crit_high": ("smallest perturbation proved to end on a limit cycle above the crossing", "1"),

@@ -11,12 +11,14 @@ from jaxtyping import Array, Float, Int
 
 from . import arguments
 from . import contact as physics
+from . import energy as accounts
 from .contact import Mechanics, State
+from .energy import Books, Energy
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper, advance_by
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
 
 
 class Trajectory(eqx.Module):
@@ -31,6 +33,7 @@ class Trajectory(eqx.Module):
     friction_force: Float[Array, " T"]  # N
     load: Float[Array, " T"]  # N
     scene: Scene
+    energy: Energy | None = None  # the ledger, when asked for
 
     @property
     def slip_velocity(self) -> Float[Array, " T"]:
@@ -57,6 +60,8 @@ class Trajectory(eqx.Module):
             },
             coords={"t": np.asarray(self.t), "coordinate": np.arange(self.displacement.shape[1])},
         )
+        if self.energy is not None:
+            dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
         return labelled(dataset, self.scene)
 
 
@@ -80,8 +85,7 @@ def simulate(
     - `method`: how to step, `EventExact()` unless given.
     - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
       equilibrium at rest unless given.
-
-    - `energy`: the energy ledger, which is not built yet; anything but False is refused.
+    - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
     being finite, or contact events come without end, the rows from there on are NaN.
@@ -89,44 +93,57 @@ def simulate(
     **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
     equilibrium to start from, or friction beyond Painlevé's limit.
     """
-    if energy is not False:
-        raise NotImplementedError("Argument `energy` must be False: the energy ledger is not built yet.")
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
+    if not isinstance(energy, bool | np.bool_):
+        raise TypeError(f"Argument `energy` must be True or False, but is {arguments.describe(energy)}.")
     _refuse_painleve(scene)
     y0 = _initial_state(scene, y0)
     rows = math.ceil(t1 / dt_save - 1e-9)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    return Trajectory(**jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most)), scene=scene)
+    rows = _simulate(scene, method, y0, saved, most, bool(energy))
+    return Trajectory(**jax.tree.map(known_to_numpy, rows), scene=scene)
 
 
 @eqx.filter_jit
-def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int) -> dict:
+def _simulate(
+    scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int, energy: bool
+) -> dict:
     mechanics = Mechanics(scene)
+    books = Books(scene) if energy else None
     # Steps end on the load's jumps as well as on the saved instants.
     jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
     ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
 
     def to_next(carry, end):
-        t, y, contact = carry
-        y, contact, reached = advance_by(method, mechanics, contact, scene.load(0.5 * (t + end)), y, end - t, most)
-        y = jnp.where(reached, y, jnp.nan)
-        return (end, y, contact), (y, contact)
+        t, y, contact, ledger = carry
+        load = scene.load(0.5 * (t + end))
+
+        def enter(ledger, contact, y, after):
+            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+
+        y, contact, ledger, reached = advance_adding(method, mechanics, contact, load, y, end - t, most, ledger, enter)
+        # A number that was not reached is no number; counts stay what they are.
+        y, ledger = jax.tree.map(
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
+        )
+        return (end, y, contact, ledger), (y, contact, ledger)
 
     contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
-    _, (ys, contacts) = jax.lax.scan(to_next, (saved[0], y0, contact0), ends)
+    ledger0 = None if books is None else accounts.open_ledger(books, y0)
+    _, (ys, contacts, ledgers) = jax.lax.scan(to_next, (saved[0], y0, contact0, ledger0), ends)
     rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
 
     def with_start(first, rest):
         return jnp.concatenate([first[None], rest[rows]])
 
     y = with_start(y0, ys)
-    contacts = jax.tree.map(with_start, contact0, contacts)
+    contacts, ledgers = jax.tree.map(with_start, (contact0, ledger0), (contacts, ledgers))
     load = jax.vmap(scene.load)(saved)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
@@ -141,6 +158,7 @@ def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Arr
         "normal_force": normal_force,
         "friction_force": friction_force,
         "load": load,
+        "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
     }
 
 

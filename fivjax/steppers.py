@@ -12,7 +12,8 @@ The state `y` is the displacements followed by the velocities, in m and m/s; the
 """
 
 import abc
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -26,6 +27,8 @@ from .scene import Scene
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
+
+Total = TypeVar("Total")
 
 
 class StepperState(eqx.Module):
@@ -57,6 +60,14 @@ class Advance(NamedTuple):
     peak: Float[Array, ""]  # largest tangential speed it saw, m/s
 
 
+class Within(NamedTuple):
+    """The motion inside one advance, in a form to integrate along it: the sum of weight times integrand over the states."""
+
+    states: Float[Array, "k 2n"]
+    weights: Float[Array, " k"]  # s
+    end: State  # where the status's own motion ends, before anything that follows from its end
+
+
 class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     """A diffrax solver that knows the contact. `simulate` and the maps call its `advance`, diffrax its `step`."""
 
@@ -81,6 +92,12 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     ) -> Advance:
         """Go on from a state under a load that does not change, by `h` (s) or less."""
 
+    @abc.abstractmethod
+    def within(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Within:
+        """States inside an advance that came `h` (s) far, and the weights that integrate over it to the method's order."""
+
     def init(self, terms, t0, t1, y0: State, args: Scene) -> StepperState:
         mechanics = Mechanics(args)
         return StepperState(mechanics, physics.status_from_forces(mechanics, args.load(0.5 * (t0 + t1)), y0))
@@ -99,16 +116,33 @@ def advance_by(
     most: int,
 ) -> tuple[State, Contact, Bool[Array, ""]]:
     """As many advances as it takes to get `h` (s) further; last, whether `most` of them were enough."""
+    y, contact, _, arrived = advance_adding(stepper, mechanics, contact, load, y, h, most, None, lambda *_: None)
+    return y, contact, arrived
+
+
+def advance_adding(
+    stepper: AbstractStepper,
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    h: Float[Array, ""],
+    most: int,
+    total: Total,
+    add: Callable[[Total, Contact, State, Advance], Total],
+) -> tuple[State, Contact, Total, Bool[Array, ""]]:
+    """`advance_by`, with a `total` to which `add` adds what each advance contributes, from its start and what it reached."""
 
     def body(carry):
-        y, contact, left = carry
+        y, contact, left, total = carry
         # Equal parts; the allowance keeps rounding from adding one more, vanishingly short.
         parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
         after = stepper.advance(mechanics, contact, load, y, left / parts)
         arrived = (parts == 1) & (after.h >= left)
-        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h)
+        total = add(total, contact, y, after)
+        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
 
-    y, contact, left = eqx.internal.while_loop(
-        lambda carry: carry[2] > 0, body, (y, contact, jnp.asarray(h, y.dtype)), max_steps=most, kind="bounded"
+    y, contact, left, total = eqx.internal.while_loop(
+        lambda carry: carry[2] > 0, body, (y, contact, jnp.asarray(h, y.dtype), total), max_steps=most, kind="bounded"
     )
-    return y, contact, left <= 0
+    return y, contact, total, left <= 0

@@ -39,6 +39,8 @@ class Structure(eqx.Module):
     # How the matrices came about, where a builder such as `belt_oscillator` made them: its arguments by name, and itself.
     parameters: dict[str, Float[Array, ""]]
     builder: Callable[..., "Structure"] | None = eqx.field(static=True)
+    # Which of these parameters are dampers: the damping matrix is a sum of parts, each proportional to one of them.
+    dampers: tuple[str, ...] = eqx.field(static=True)
 
     @in_double_precision
     def __init__(
@@ -52,6 +54,7 @@ class Structure(eqx.Module):
         *,
         parameters: dict | None = None,
         builder: Callable[..., "Structure"] | None = None,
+        dampers: tuple[str, ...] = (),
     ):
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
         for name, matrix in matrices.items():
@@ -77,6 +80,21 @@ class Structure(eqx.Module):
             )
         self.parameters = {name: real(value) for name, value in (parameters or {}).items()}
         self.builder = builder
+        self.dampers = tuple(dampers)
+
+    @property
+    @in_double_precision
+    def damping_parts(self) -> dict[str, Float[Array, "n n"]]:
+        """The damping matrix apart by damper, in N·s/m; empty where the structure was given as matrices."""
+        if self.builder is None:
+            return {}
+        # The matrix is linear in the dampers, so a part is what is left of it without the others.
+        return {
+            name: self.replace(
+                **{other: jnp.zeros_like(self.parameters[other]) for other in self.dampers if other != name}
+            ).damping
+            for name in self.dampers
+        }
 
     @property
     def size(self) -> int:
@@ -138,6 +156,7 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
         normal=2,
         parameters=parameters,
         builder=belt_oscillator,
+        dampers=("c1", "c2"),
     )
 
 

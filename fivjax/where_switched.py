@@ -11,7 +11,7 @@ from . import contact as physics
 from .contact import Contact, Mechanics, State
 from .orbit import Resolution
 from .scene import Scene
-from .steppers import AbstractStepper, Advance, StepperState, rates
+from .steppers import AbstractStepper, Advance, StepperState, Within, rates
 
 
 class WhereSwitched(AbstractStepper):
@@ -79,15 +79,30 @@ class WhereSwitched(AbstractStepper):
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
         return self._switched(mechanics, contact, load, smooth, h)
 
+    def within(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Within:
+        # The stages and weights of the step itself, which is what the method does to an integral carried as one more state.
+        tableau = self.solver.tableau
+        states, stages = self._stages(mechanics, contact, load, y, h)
+        weights = h * jnp.asarray(tableau.b_sol, y.dtype)
+        return Within(jnp.stack(states), weights, y + h * _weighted(tableau.b_sol, stages))
+
     def _smooth_step(self, mechanics, contact, load, y, h) -> tuple[State, State]:
         """The status's own field integrated over the step, and diffrax's error estimate of it."""
+        tableau = self.solver.tableau
+        _, stages = self._stages(mechanics, contact, load, y, h)
+        return y + h * _weighted(tableau.b_sol, stages), h * _weighted(tableau.b_error, stages)
+
+    def _stages(self, mechanics, contact, load, y, h) -> tuple[list[State], list[State]]:
+        """The states of the Runge–Kutta stages, and the rates there."""
         # The stages are written out instead of calling `solver.step`: diffrax loops over a buffer of stages, which
         # XLA cannot fuse; written out, a batch runs three to five times faster.
-        tableau = self.solver.tableau
-        stages = [rates(mechanics, contact, load, y)]
-        for row in tableau.a_lower:
-            stages.append(rates(mechanics, contact, load, y + h * _weighted(row, stages)))
-        return y + h * _weighted(tableau.b_sol, stages), h * _weighted(tableau.b_error, stages)
+        states, stages = [y], [rates(mechanics, contact, load, y)]
+        for row in self.solver.tableau.a_lower:
+            states.append(y + h * _weighted(row, stages))
+            stages.append(rates(mechanics, contact, load, states[-1]))
+        return states, stages
 
     def _switched(self, mechanics, contact, load, smooth, h) -> Advance:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
