@@ -108,7 +108,7 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
 
 def follow(
     scene: Scene,
-    method: AbstractStepper,
+    method: AbstractStepper | Windowed,
     resolution: orbits.Resolution,
     prepared,
     modes: SlidingModes,
@@ -187,7 +187,7 @@ def run_to_verdict(
     resolution = method.resolution
     if not lingering:
         resolution = eqx.tree_at(lambda r: r.span, resolution, np.asarray(resolution.span) // SPAN_SHARE)
-    method = in_bulk(method, scene)
+    stepper = in_bulk(method, scene)
     total = len(next(iter(values.values())))
     outcome = Outcome(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
@@ -209,7 +209,7 @@ def run_to_verdict(
             for start in range(0, total, block):
                 chosen = order[start : start + block]
                 rows = {name: column[chosen] for name, column in values.items()}
-                _run_block(scene, rows, method, resolution, width, t_max, outcome, chosen, bar)
+                _run_block(scene, rows, stepper, resolution, width, t_max, outcome, chosen, bar)
     except KeyboardInterrupt:
         open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
         warnings.warn(
@@ -219,7 +219,7 @@ def run_to_verdict(
     return outcome
 
 
-def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper:
+def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
     """The stepper that does the same for many lanes in less time, where there is one."""
     return Windowed() if method == EventExact() and scene.friction.constant else method
 
@@ -282,7 +282,7 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     outcome.last_event[index] = lanes.last_event
 
 
-def _shared(scene: Scene, method: AbstractStepper, names: tuple[str, ...], distinct: np.ndarray) -> Shared:
+def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], distinct: np.ndarray) -> Shared:
     """`Shared` of each row of `distinct`; arrays over groups."""
     size, parts = 64, []
     for start in range(0, len(distinct), size):
@@ -295,7 +295,7 @@ def _shared(scene: Scene, method: AbstractStepper, names: tuple[str, ...], disti
 
 
 @eqx.filter_jit
-def _prepared(scene: Scene, method: AbstractStepper, names: tuple[str, ...], values):
+def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
         return method.prepare(Mechanics(own)), linear_sliding(own)

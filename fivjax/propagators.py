@@ -12,7 +12,6 @@ does best. Between them stand a few stages of plain arithmetic, see `_stage`.
 import itertools
 from typing import ClassVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,8 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
-from .event_exact import EventExact, Resolution
-from .steppers import AbstractStepper, Advance
+from .steppers import Advance
 
 # Intervals in a window: long windows waste work after an event, short ones pay for their stages more often.
 INTERVALS = 16
@@ -48,28 +46,18 @@ class Propagators(eqx.Module):
     series: Float[Array, "q c"]  # series of the guards and of the displacements, in units of the interval
 
 
-class Windowed(AbstractStepper):
+class Windowed(eqx.Module):
     """`EventExact` for many lanes at once: the same motion to rounding, from matrices prepared per scene.
 
-    It needs constant friction, and gives no derivatives; `lanes` uses it in place of `EventExact` where it can.
+    It needs constant friction and gives no derivatives. `lanes` uses it in place of `EventExact` where it can, by the same
+    three names as any stepper's: `round`, `prepare` and `advance`.
     """
 
-    dt: float = np.inf
+    dt: ClassVar = np.inf
     round: ClassVar = 32
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
-    def order(self, terms) -> int:
-        return ORDER
-
-    @property
-    def resolution(self) -> Resolution:
-        return EventExact().resolution
 
     def prepare(self, mechanics: Mechanics) -> Propagators:
         return propagators(mechanics)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        raise NotImplementedError("This stepper serves batches of lanes; use `EventExact` with diffrax.")
 
     def advance(
         self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
