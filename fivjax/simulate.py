@@ -98,8 +98,7 @@ def simulate(
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
-    if not isinstance(energy, bool | np.bool_):
-        raise TypeError(f"Argument `energy` must be True or False, but is {arguments.describe(energy)}.")
+    arguments.truth("energy", energy)
     _refuse_painleve(scene)
     y0 = _initial_state(scene, y0)
     rows = math.ceil(t1 / dt_save - 1e-9)
