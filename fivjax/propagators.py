@@ -71,7 +71,7 @@ class Windowed(eqx.Module):
         interval = _stage(lambda: _safe_intervals(samples, steps), none.astype(jnp.int32))
         there = _stage(lambda: samples.state_at(interval), [none] * 2 * n)
         series = _Series(prepared.series @ _stacked(mechanics, contact, load, there), n, mechanics.tangential)
-        brackets = _stage(series.brackets, [_no_bracket(none)] * 3)
+        brackets = _dipped(series, _stage(series.brackets, [_no_bracket(none)] * 3))
         roots = _polished(series, brackets)
         no = none > 0
         share, fires = _stage(lambda: _first_root(brackets, roots, steps, interval), (none, [no] * 3))
@@ -318,13 +318,15 @@ class _Bracket(eqx.Module):
 
     guess: Float[Array, ""]
     zeros: Int[Array, ""]  # roots at the very start, not meant
+    end: Float[Array, ""]  # where it is no longer positive, if it crosses
     crosses: Bool[Array, ""]
     spent: Bool[Array, ""]  # negative from the start
+    dips: Bool[Array, ""]  # positive at both ends, perhaps not in between
 
 
 def _no_bracket(like: Float[Array, ""]) -> _Bracket:
     no = like > like
-    return _Bracket(like, jnp.zeros_like(like, jnp.int32), no, no)
+    return _Bracket(like, jnp.zeros_like(like, jnp.int32), like, no, no, no)
 
 
 def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""] | bool) -> _Bracket:
@@ -341,7 +343,41 @@ def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""] | bool) -> _Brack
     below = jnp.where(rises, bend, half)
     guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
     guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
-    return _Bracket(guess, zeros, crosses, spent)
+    lowest = lead - slope**2 / (4 * jnp.where(bend > 0, bend, 1.0))
+    # With allowance for what is not parabolic.
+    dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0) & (lowest <= 0.1 * bend)
+    return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+
+
+def _dipped(series: _Series, brackets: list[_Bracket]) -> list[_Bracket]:
+    """The brackets of polynomials that seemed to dip below zero, decided at their lowest points; seldom run at all."""
+
+    def decided(brackets: list[_Bracket]) -> list[_Bracket]:
+        return [_decided(c, b) for c, b in zip(series.watched, brackets, strict=True)]
+
+    def any_dips(brackets: list[_Bracket]) -> Bool[Array, ""]:
+        return brackets[0].dips | brackets[1].dips
+
+    return jax.lax.while_loop(any_dips, decided, brackets)
+
+
+def _decided(c: list[Float[Array, ""]], bracket: _Bracket) -> _Bracket:
+    def halve(_, ends):
+        middle = 0.5 * (ends[0] + ends[1])
+        falls = _value_and_slope(c, middle)[1] < 0
+        return jnp.where(falls, middle, ends[0]), jnp.where(falls, ends[1], middle)
+
+    none = jnp.zeros_like(bracket.end)
+    _, lowest = jax.lax.fori_loop(0, 54, halve, (none, none + 1))
+    below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
+    return _Bracket(
+        guess=jnp.where(below, 0.5 * lowest, bracket.guess),
+        zeros=bracket.zeros,
+        end=jnp.where(below, lowest, bracket.end),
+        crosses=bracket.crosses | below,
+        spent=bracket.spent,
+        dips=jnp.zeros_like(bracket.dips),
+    )
 
 
 def _polished(series: _Series, brackets: list[_Bracket]) -> list[Float[Array, ""]]:
@@ -358,7 +394,7 @@ def _polished(series: _Series, brackets: list[_Bracket]) -> list[Float[Array, ""
         after = [_newton(c, bracket.zeros, *lane) for c, bracket, *lane in own]
         return (*map(list, zip(*after, strict=True)), count + 1)
 
-    start = [none] * 3, [none + 1] * 3, [b.guess for b in brackets], [b.crosses for b in brackets]
+    start = [none] * 3, [b.end for b in brackets], [b.guess for b in brackets], [b.crosses for b in brackets]
     _, _, roots, _, _ = jax.lax.while_loop(going, newton, (*start, jnp.zeros((), jnp.int32)))
     return roots
 
