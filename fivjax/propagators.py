@@ -71,7 +71,8 @@ class Windowed(eqx.Module):
         interval = _stage(lambda: _safe_intervals(samples, steps), none.astype(jnp.int32))
         there = _stage(lambda: samples.state_at(interval), [none] * 2 * n)
         series = _Series(prepared.series @ _stacked(mechanics, contact, load, there), n, mechanics.tangential)
-        brackets = _dipped(series, _stage(series.brackets, [_no_bracket(none)] * 3))
+        inside = interval < INTERVALS
+        brackets = _dipped(series, _stage(lambda: series.brackets(inside), [_no_bracket(none)] * 3))
         roots = _polished(series, brackets)
         no = none > 0
         share, fires = _stage(lambda: _first_root(brackets, roots, steps, interval), (none, [no] * 3))
@@ -259,9 +260,10 @@ class _Series(eqx.Module):
         path = self.paths[self.tangential]
         return [*_cut(self.rows, 2, ORDER + 1, 0), [-(k + 1) * path[k + 1] for k in range(ORDER + 1)]]
 
-    def brackets(self) -> list["_Bracket"]:
+    def brackets(self, inside: Bool[Array, ""]) -> list["_Bracket"]:
+        """Of each watched polynomial; at the end of the window, not `inside` an interval, there is nothing to look for."""
         first, second, falling = self.watched
-        return [_bracket(first, True), _bracket(second, True), _bracket(falling, falling[0] > 0)]
+        return [_bracket(first, inside), _bracket(second, inside), _bracket(falling, inside & (falling[0] > 0))]
 
     def state(self, x: Float[Array, ""]) -> list[Float[Array, ""]]:
         """Displacements, and velocities in m per interval."""
@@ -329,7 +331,7 @@ def _no_bracket(like: Float[Array, ""]) -> _Bracket:
     return _Bracket(like, jnp.zeros_like(like, jnp.int32), like, no, no, no)
 
 
-def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""] | bool) -> _Bracket:
+def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""]) -> _Bracket:
     zeros, lead = _start(c)
     end = sum((jnp.where(zeros > k, 0.0, c[k]) for k in range(3)), sum(c[3:]))
     spent = watch & (lead < 0)
@@ -362,13 +364,14 @@ def _dipped(series: _Series, brackets: list[_Bracket]) -> list[_Bracket]:
 
 
 def _decided(c: list[Float[Array, ""]], bracket: _Bracket) -> _Bracket:
-    def halve(_, ends):
-        middle = 0.5 * (ends[0] + ends[1])
-        falls = _value_and_slope(c, middle)[1] < 0
-        return jnp.where(falls, middle, ends[0]), jnp.where(falls, ends[1], middle)
+    slopes = [k * ck for k, ck in enumerate(c)][1:]
 
-    none = jnp.zeros_like(bracket.end)
-    _, lowest = jax.lax.fori_loop(0, 54, halve, (none, none + 1))
+    def nearer(_, x):
+        slope, bend = _value_and_slope(slopes, x)
+        return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
+
+    # Newton's method: within an interval a slope is all but a straight line.
+    lowest = jax.lax.fori_loop(0, 6, nearer, jnp.full_like(bracket.end, 0.5))
     below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
     return _Bracket(
         guess=jnp.where(below, 0.5 * lowest, bracket.guess),
