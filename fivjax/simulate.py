@@ -11,12 +11,12 @@ from jaxtyping import Array, Float, Int
 
 from . import arguments
 from . import contact as physics
-from .contact import Mechanics, State
+from .contact import Contact, Mechanics, State
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper, advance_by
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_by, rates
 
 
 class Trajectory(eqx.Module):
@@ -108,25 +108,7 @@ def simulate(
 @eqx.filter_jit
 def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int) -> dict:
     mechanics = Mechanics(scene)
-    # Steps end on the load's jumps as well as on the saved instants.
-    jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
-    ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
-
-    def to_next(carry, end):
-        t, y, contact = carry
-        y, contact, reached = advance_by(method, mechanics, contact, scene.load(0.5 * (t + end)), y, end - t, most)
-        y = jnp.where(reached, y, jnp.nan)
-        return (end, y, contact), (y, contact)
-
-    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
-    _, (ys, contacts) = jax.lax.scan(to_next, (saved[0], y0, contact0), ends)
-    rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
-
-    def with_start(first, rest):
-        return jnp.concatenate([first[None], rest[rows]])
-
-    y = with_start(y0, ys)
-    contacts = jax.tree.map(with_start, contact0, contacts)
+    y, contacts = states_at(scene, method, y0, saved, most)
     load = jax.vmap(scene.load)(saved)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
@@ -142,6 +124,46 @@ def _simulate(scene: Scene, method: AbstractStepper, y0: State, saved: Float[Arr
         "friction_force": friction_force,
         "load": load,
     }
+
+
+def states_at(
+    scene: Scene, method: AbstractStepper, y0: State, instants: Float[Array, " T"], most: int
+) -> tuple[Float[Array, "T 2n"], Contact]:
+    """States and contacts at instants that do not fall, the first of them the start; NaN from where `most` advances
+    between two of them were not enough.
+
+    Differentiable in both modes, in the instants and in the load's jumps too. In reverse mode only the states at the
+    instants are kept; what lies between is computed again.
+    """
+    mechanics = Mechanics(scene)
+    # Steps end on the load's jumps as well as on the instants.
+    jumps = scene.load.jumps
+    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
+    # A jump outside has no share in the derivative, one exactly on an end has its full one, which `clip` would halve.
+    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
+    ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
+
+    def to_next(carry, end):
+        t, y, contact = carry
+        h = end - t
+        # A jump that falls on an instant leaves no time between them, but either may move: what happens in between is
+        # the motion under the load just before the jump.
+        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
+        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+        moved, following, reached = advance_by(method, mechanics, contact, scene.load(0.5 * (t + end)), y, h, most)
+        y = jnp.where(h > 0, jnp.where(reached, moved, jnp.nan), y + drift)
+        return (end, y, following), (y, following)
+
+    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
+    # Inside a scan nothing can be merged across the checkpoint anyway.
+    step = jax.checkpoint(to_next, prevent_cse=False)
+    _, (ys, contacts) = jax.lax.scan(step, (instants[0], y0, contact0), ends)
+    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    return with_start(y0, ys), jax.tree.map(with_start, contact0, contacts)
 
 
 def _initial_state(scene: Scene, y0) -> State:
