@@ -55,12 +55,11 @@ class AbstractMisfit(eqx.Module):
         """Residuals that lead to the right period from afar; may be empty."""
 
     @abc.abstractmethod
-    def residual(self, scene: Scene, offset: Float[Array, ""], share: Float[Array, ""]) -> Float[Array, " r"]:
-        """Residuals over the first `share` of the recording, in standard deviations of the noise."""
-
-    @abc.abstractmethod
-    def model(self, scene: Scene, offset: Float[Array, ""]) -> Float[Array, "B k"]:
-        """The block means that the scene would have given; NaN where it gave none."""
+    def residual(
+        self, scene: Scene, offset: Float[Array, ""], share: Float[Array, ""]
+    ) -> tuple[Float[Array, " r"], Float[Array, "B k"]]:
+        """Residuals over the first `share` of the recording, in standard deviations of the noise, and the block means that
+        the scene gives; NaN where it gives none."""
 
 
 class SlidingMisfit(AbstractMisfit):
@@ -82,15 +81,10 @@ class SlidingMisfit(AbstractMisfit):
     def residual(self, scene, offset, share):
         weight = _window(self.edges, share)[:, None] / self.sigma
         waves, target = self._waves(scene), weight * self.means
-        q, _ = jnp.linalg.qr((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
+        q, r = jnp.linalg.qr((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
         target = target.ravel()
-        return _finite(target - q @ (q.T @ target))
-
-    def model(self, scene, offset):
-        waves = self._waves(scene)
-        columns = (waves / self.sigma[:, None]).reshape(-1, waves.shape[-1])
-        amplitudes = jnp.linalg.lstsq(columns, (self.means / self.sigma).ravel())[0]
-        return waves @ amplitudes
+        amplitudes = jax.scipy.linalg.solve_triangular(r, q.T @ target)
+        return _finite(target - q @ (q.T @ target)), waves @ amplitudes
 
     def _waves(self, scene) -> Float[Array, "B k m"]:
         """Block means for each unit initial state, scaled alike."""
@@ -120,6 +114,8 @@ class KickMisfit(AbstractMisfit):
     shapes: Complex[Array, "j k"]
     method: AbstractStepper
     channels: tuple[Channel, ...] = eqx.field(static=True)
+    # Whether no contact event is taken to happen: then matrix exponentials do, a hundred times as fast.
+    uneventful: bool = eqx.field(static=True)
     fitted_by_elimination: int = eqx.field(static=True, default=0)
 
     def coarse(self, scene):
@@ -127,11 +123,14 @@ class KickMisfit(AbstractMisfit):
 
     def residual(self, scene, offset, share):
         weight = _window(self.edges, share)[:, None] / self.sigma
-        return _finite(weight * (self.means - self.model(scene, offset))).ravel()
+        model = jnp.diff(self.integrals(scene, self.edges + offset), axis=0) / (self.edges[1] - self.edges[0])
+        return _finite(weight * (self.means - model)).ravel(), model
 
-    def model(self, scene, offset):
-        found = integrals_from_kick(scene.replace(**self.known), self.method, self.edges + offset, self.channels)
-        return jnp.diff(found, axis=0) / (self.edges[1] - self.edges[0])
+    def integrals(self, scene: Scene, instants: Float[Array, " i"], eventful: bool = False) -> Float[Array, "i k"]:
+        """What the channels are rates of, velocities and displacements, at evenly spaced instants of the simulation (s)."""
+        respond = _sliding_throughout if self.uneventful and not eventful else _through_events
+        y = respond(scene.replace(**self.known), self.method, instants)
+        return _integrals(y, self.channels)
 
 
 class CycleMisfit(AbstractMisfit):
@@ -146,13 +145,14 @@ class CycleMisfit(AbstractMisfit):
     method: AbstractStepper
     width: Float[Array, ""]  # of a block, s
     frequency: Float[Array, ""]  # Hz, as measured
+    timed: bool = eqx.field(static=True)  # whether any fraction was measured
     blocks: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
     fitted_by_elimination: int = eqx.field(static=True, default=0)
 
     def coarse(self, scene):
-        found = self._features(self.model(scene, jnp.zeros(()))) / self.measured[1]
+        found = self._features(self._orbit(scene)[0]) / self.measured[1]
         expected = self.measured / self.measured[1]
         # Frequency to a per mille, lines to 5 % of the largest.
         error = jnp.full(found.shape, 0.05).at[0].set(1e-3 * expected[0])
@@ -161,10 +161,7 @@ class CycleMisfit(AbstractMisfit):
     def residual(self, scene, offset, share):
         means, fractions = self._orbit(scene)
         lines = self.whitening @ (self.measured - self._features(means))
-        return _finite(jnp.concatenate([lines, (self.fractions[:, 0] - fractions) / self.fractions[:, 1]]))
-
-    def model(self, scene, offset):
-        return self._orbit(scene)[0]
+        return _finite(jnp.concatenate([lines, (self.fractions[:, 0] - fractions) / self.fractions[:, 1]])), means
 
     def _features(self, means):
         return features.harmonics(means, self.width, self.count, 0.6 * self.frequency, 1.6 * self.frequency)
@@ -180,8 +177,9 @@ class CycleMisfit(AbstractMisfit):
         instants = jnp.concatenate([jnp.zeros(1), begin + self.width * jnp.arange(self.blocks + 1)])
         y, contacts = states_at(scene, self.method, y0, instants, MOST_ADVANCES)
         means = jnp.diff(_integrals(y[1:], self.channels), axis=0) / self.width
-        spent = self._spent(scene, y[1], jax.tree.map(lambda leaf: leaf[1], contacts))
-        return means, spent
+        if not self.timed:
+            return means, jnp.zeros(2)
+        return means, self._spent(scene, y[1], jax.tree.map(lambda leaf: leaf[1], contacts))
 
     def _spent(self, scene, y, contact) -> Float[Array, "2"]:
         """Fractions of time sticking and detached over the periods looked at."""
@@ -196,22 +194,45 @@ class CycleMisfit(AbstractMisfit):
             return after.y, after.contact, left - after.h, spent
 
         def going(carry):
-            return (carry[2] > 1e-12 * span) & jnp.any(jnp.isfinite(self.fractions[:, 1]))
+            return carry[2] > 1e-12 * span
 
         start = (y, contact, jnp.asarray(span), jnp.zeros(2))
         return jax.lax.while_loop(going, body, start)[3] / span
 
 
-def integrals_from_kick(
-    scene: Scene, method: AbstractStepper, instants: Float[Array, " B+1"], channels: tuple[Channel, ...]
-) -> Float[Array, "B+1 k"]:
-    """What the channels are rates of, velocities and displacements, at instants of the simulation (s): the response from
-    steady sliding, which it was in before, too."""
+def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """States at instants of the simulation (s): the response from steady sliding, which it was in before, too."""
     q, _ = steady_sliding(scene, scene.load.force)
     y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
     y, _ = states_at(scene, method, y0, instants, MOST_ADVANCES)
-    return _integrals(y[1:], channels)
+    return y[1:]
+
+
+def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
+    matrix, keep = linear_sliding(scene).matrix, _sliding_coordinates(scene)
+    n = scene.structure.size
+    steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
+
+    def equilibrium(force):
+        q, _ = steady_sliding(scene, force)
+        return jnp.concatenate([q[jnp.array(keep)], jnp.zeros(len(keep))])
+
+    rest = equilibrium(scene.load.force)
+    begin, z = jnp.zeros(()), rest
+    found = jnp.broadcast_to(rest, (instants.shape[0], len(rest)))
+    jumps = scene.load.jumps
+    for k in range(jumps.shape[0]):
+        z = rest + jax.scipy.linalg.expm((jumps[k] - begin) * matrix) @ (z - rest)
+        begin = jumps[k]
+        until = jumps[k + 1] if k + 1 < jumps.shape[0] else jnp.inf
+        middle = begin + jnp.minimum(0.5 * (until - begin), 1.0)
+        rest = equilibrium(scene.load(middle))
+        moving = steps @ (jax.scipy.linalg.expm((instants[0] - begin) * matrix) @ (z - rest)) + rest
+        found = jnp.where((instants >= begin)[:, None], moving, found)
+    columns = jnp.array([*keep, *(n + i for i in keep)])
+    return jnp.zeros((instants.shape[0], 2 * n)).at[:, columns].set(found)
 
 
 def _integrals(y, channels: tuple[Channel, ...]):
@@ -276,17 +297,27 @@ def _finite(residual):
     return jnp.where(good, jnp.clip(jnp.where(good, residual, 0.0), -HOPELESS, HOPELESS), HOPELESS)
 
 
-def noise_of_means(recording: Recording, blocks: Averaged) -> np.ndarray | None:
-    """Standard deviations of block means, where those of single samples are known."""
-    return None if recording.noise is None else recording.noise / np.sqrt(blocks.per_block)
+def noise_of_means(recording: Recording, blocks: Averaged) -> np.ndarray:
+    """Standard deviations of block means, from those of single samples.
+
+    Where these are not stated, from third differences of the samples: what is left of a signal that is sampled many times
+    a period is the noise, and the median passes over its jumps. For sparse samples this is too large.
+    """
+    if recording.noise is not None:
+        return recording.noise / np.sqrt(blocks.per_block)
+    differences = np.abs(np.diff(recording.values, 3, axis=0))
+    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance; 0.6745 is the median of |normal|.
+    return np.median(differences, axis=0) / (0.6745 * np.sqrt(20.0) * np.sqrt(blocks.per_block))
 
 
-def misfit(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> AbstractMisfit:
+def misfit(
+    recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene, uneventful: bool
+) -> AbstractMisfit:
     """A recording, averaged over blocks, ready to be compared."""
     known = {name: jnp.asarray(value) for name, value in recording.known.items()}
     size = np.sqrt(np.mean(blocks.means**2, axis=0))
-    sigma = noise_of_means(recording, blocks)
-    sigma = np.maximum(0.02 * size, 1e-300) if sigma is None else sigma
+    # A recording without any noise would leave rounding to be fitted.
+    sigma = np.maximum(noise_of_means(recording, blocks), 1e-9 * size + 1e-300)
     if recording.regime == "limit cycle":
         return _cycle(recording, blocks, method, known, sigma, scene)
     width = blocks.edges[1] - blocks.edges[0]
@@ -300,7 +331,7 @@ def misfit(recording: Recording, blocks: Averaged, method: AbstractStepper, scen
     common = (*arrays, known, jnp.asarray(values), jnp.asarray(shapes))
     if recording.regime == "sliding":
         return SlidingMisfit(*common, channels=recording.channels, fitted_by_elimination=2 * (scene.structure.size - 1))
-    return KickMisfit(*common, method=method, channels=recording.channels)
+    return KickMisfit(*common, method=method, channels=recording.channels, uneventful=uneventful)
 
 
 def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
@@ -319,7 +350,8 @@ def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> C
     waves = np.exp(2j * np.pi * frequency * np.outer(t, np.arange(1, count + 1)))
     left = blocks.means - blocks.means.mean(axis=0) - (waves @ found).real
     if recording.noise is None:
-        sigma = np.sqrt(np.sum(left**2, axis=0) / (len(left) - 2 * count - 1))
+        # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
+        sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / (len(left) - 2 * count - 1)))
 
     def measure(values):
         return features.harmonics(values, width, count, *limits)
@@ -336,6 +368,7 @@ def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> C
         measured=measure(means),
         whitening=jnp.asarray(whitening),
         fractions=jnp.asarray(fractions),
+        timed=bool(np.any(np.isfinite(fractions[:, 1]))),
         method=method,
         width=jnp.asarray(width),
         frequency=jnp.asarray(frequency),
