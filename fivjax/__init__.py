@@ -4,10 +4,14 @@ from . import cea as cea
 from . import design as design
 from . import plot as plot
 from . import plot_linear as plot_linear
+from .calibrate import Calibration as Calibration
+from .calibrate import calibrate as calibrate
 from .contact import Status as Status
 from .event_exact import EventExact as EventExact
 from .friction import Coulomb as Coulomb
 from .friction import ExponentialDecay as ExponentialDecay
+from .gradients import Derivatives as Derivatives
+from .gradients import derivatives as derivatives
 from .load import ConstantLoad as ConstantLoad
 from .load import Pulse as Pulse
 from .maps import bistability_map as bistability_map
@@ -17,6 +21,8 @@ from .results import save_figure as save_figure
 from .scene import Scene as Scene
 from .scene import painleve_friction as painleve_friction
 from .scene import sliding_equilibrium as sliding_equilibrium
+from .signals import Recording as Recording
+from .signals import read_recording as read_recording
 from .simulate import Trajectory as Trajectory
 from .simulate import simulate as simulate
 from .steppers import vector_field as vector_field

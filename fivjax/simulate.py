@@ -97,7 +97,7 @@ def simulate(
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
     _refuse_painleve(scene)
-    y0 = _initial_state(scene, y0)
+    y0 = start_state(scene, y0)
     rows = math.ceil(t1 / dt_save - 1e-9)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
@@ -166,7 +166,8 @@ def states_at(
     return with_start(y0, ys), jax.tree.map(with_start, contact0, contacts)
 
 
-def _initial_state(scene: Scene, y0) -> State:
+def start_state(scene: Scene, y0) -> State:
+    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
     n, normal = scene.structure.size, scene.structure.normal
     if y0 is None:
         if is_known(scene.belt_speed):
