@@ -3,6 +3,7 @@
 from . import cea as cea
 from . import design as design
 from . import plot as plot
+from . import plot_calibration as plot_calibration
 from . import plot_linear as plot_linear
 from .calibrate import Calibration as Calibration
 from .calibrate import calibrate as calibrate

@@ -14,7 +14,6 @@ exceeds a stated share of itself is reported as *not identifiable*, not as a num
 """
 
 import enum
-import functools
 from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
@@ -74,7 +73,9 @@ class Calibration(eqx.Module):
     deviations: Float[np.ndarray, " k"]  # standard deviations, in the parameters' own units
     identified: Bool[np.ndarray, " k"]
     correlation: Float[np.ndarray, "k k"]
-    singular_values: Float[np.ndarray, " j"]  # of the Jacobian in units of noise per whole parameter; time offsets included
+    singular_values: Float[
+        np.ndarray, " j"
+    ]  # of the Jacobian in units of noise per whole parameter; time offsets included
     offsets: tuple[tuple[float, float] | None, ...]  # value and standard deviation, s; None where there is none
     recordings: tuple[Recording, ...]
     t: tuple[np.ndarray, ...]  # middle of the blocks, s after the recording's first sample
@@ -200,7 +201,9 @@ def calibrate(
     for k, recording in enumerate(recordings):
         both = [name for name in parameters.names if name in recording.known]
         if both:
-            raise ValueError(f"Parameter `{both[0]}` is free, but recording {k} states it as known. Drop one of the two.")
+            raise ValueError(
+                f"Parameter `{both[0]}` is free, but recording {k} states it as known. Drop one of the two."
+            )
     if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
         raise ValueError(f"Argument `starts` must be a whole number of at least 1, but is {starts!r}.")
     arguments.real_number("spread", spread, above=0, maximum=0.9)
@@ -394,7 +397,7 @@ class _Fit:
         cost = np.empty((len(chosen), len(WINDOWS), shifts))
         ends = [max(1, int(share * len(means))) for share in WINDOWS[::-1]]
         for i, shift in np.ndindex(len(chosen), shifts):
-            model = np.diff(found[i, shift :: OFFSETS_PER_BLOCK][: len(edges)], axis=0) / (edges[1] - edges[0])
+            model = np.diff(found[i, shift::OFFSETS_PER_BLOCK][: len(edges)], axis=0) / (edges[1] - edges[0])
             squares = np.cumsum(np.sum(((means - model) / sigma) ** 2, axis=1))
             cost[i, :, shift] = squares[[end - 1 for end in ends]]
         best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
@@ -510,7 +513,8 @@ class _Fit:
             if np.any(np.abs(alike) > STRUCTURE):
                 return True
         # With a stated noise, or features of known error, the size of what is left says it as well.
-        stated = any(r.noise is not None or isinstance(m, CycleMisfit) for r, m in zip(self.recordings, self.problem.misfits, strict=True))
+        pairs = zip(self.recordings, self.problem.misfits, strict=True)
+        stated = any(r.noise is not None or isinstance(m, CycleMisfit) for r, m in pairs)
         return stated and misfit > 2.0
 
 
@@ -556,7 +560,11 @@ def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
     n, normal = scene.structure.size, scene.structure.normal
     for channel in recording.channels:
         if channel.coordinate >= n:
-            raise ValueError(f"Recording {k} has a channel `{channel}`, but the structure's coordinates are 0 to {n - 1}.")
+            raise ValueError(
+                f"Recording {k} has a channel `{channel}`, but the structure's coordinates are 0 to {n - 1}."
+            )
         if recording.regime == "sliding" and channel.coordinate == normal:
-            raise ValueError(f"Recording {k} has a channel `{channel}`: the normal coordinate does not move while sliding.")
+            raise ValueError(
+                f"Recording {k} has a channel `{channel}`: the normal coordinate does not move while sliding."
+            )
     sliding_equilibrium(scene.replace(**recording.known))

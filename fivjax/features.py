@@ -57,10 +57,8 @@ def poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> Poles:
     return Poles(upper[order], (shares[: len(upper)] * size)[order], 1.0 - float(np.mean(left**2)))
 
 
-def lines(
-    means: Float[Array, "B k"], dt: float, frequency: Float[Array, ""], count: int
-) -> Complex[Array, "count k"]:
-    r"""Complex amplitudes $c_h$ of $\mathrm{Re}\, c_h e^{2πi h f t}$ for h = 1 … `count`, by least squares; t = 0 at the first."""
+def lines(means: Float[Array, "B k"], dt: float, frequency: Float[Array, ""], count: int) -> Complex[Array, "count k"]:
+    r"""Complex amplitudes $c_h$ of $\mathrm{Re}\, c_h e^{2πi h f t}$ for h = 1 … `count`, by least squares."""
     t = dt * jnp.arange(means.shape[0])
     turns = 2 * jnp.pi * frequency * t[:, None] * jnp.arange(1, count + 1)
     waves = jnp.concatenate([jnp.ones_like(t)[:, None], jnp.cos(turns), jnp.sin(turns)], axis=1)
@@ -69,9 +67,7 @@ def lines(
     return shares[1 : count + 1] - 1j * shares[count + 1 :]
 
 
-def fundamental(
-    means: Float[Array, "B k"], dt: float, count: int, lowest: float, highest: float
-) -> Float[Array, ""]:
+def fundamental(means: Float[Array, "B k"], dt: float, count: int, lowest: float, highest: float) -> Float[Array, ""]:
     """The frequency (Hz) of which the signals are harmonics: the phase that the fundamental gains between two halves.
 
     Sought between `lowest` and `highest`; exact for a signal of `count` harmonics.

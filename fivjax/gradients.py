@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import arguments
 from . import contact as physics
@@ -27,8 +27,8 @@ from .scene import Scene
 from .simulate import Trajectory, simulate, start_state
 from .steppers import AbstractStepper, rates
 
-# Looks at the guards within one advance; the series of an advance turns once or twice at most.
-LOOKS = 8
+# Looks at the guards within one advance; between two of them a guard is told from its derivatives.
+LOOKS = 32
 GUARDS = {
     (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
     (Status.STICK, 1): "the friction force reaching the other edge of the friction cone",
@@ -57,7 +57,9 @@ class Derivatives(eqx.Module):
         """Why the derivatives exist or do not, as a sentence."""
         if not np.isfinite(self.closest):
             return "The derivatives exist: no contact event comes anywhere near."
-        where = f"{self.closest_event} at t = {self.closest_at:.6g} s, {self.closest:.1e} of its range away from changing"
+        where = (
+            f"{self.closest_event} at t = {self.closest_at:.6g} s, {self.closest:.1e} of its range away from changing"
+        )
         if self.exist:
             return f"The derivatives exist. The closest call is {where}."
         return f"No derivative can be relied on: {where}, the sequence of events is about to be another."
@@ -97,7 +99,9 @@ def derivatives(
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     if not callable(functional):
-        raise TypeError(f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}.")
+        raise TypeError(
+            f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."
+        )
     if isinstance(wrt, str):
         raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
     names = tuple(wrt)
@@ -136,11 +140,11 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
     jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
     found, value = jacobian(of, has_aux=True)({name: scene.parameters[name] for name in names})
     # A functional of several numbers has the parameters innermost.
-    return value, {name: jax.tree.map(lambda leaf: leaf[name], found, is_leaf=_is_by_name) for name in names}
+    return value, {name: _of_parameter(found, name) for name in names}
 
 
-def _is_by_name(node) -> bool:
-    return isinstance(node, dict)
+def _of_parameter(found, name: str):
+    return jax.tree.map(lambda leaf: leaf[name], found, is_leaf=lambda node: isinstance(node, dict))
 
 
 class _Calls(eqx.Module):
@@ -165,22 +169,25 @@ def _closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> _Call
         while t < end:
             look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
             status = int(contact.status)
-            fired = status != int(look.contact.status) or bool(look.turned)
-            for which in range(1 if status == Status.DETACH else 2):
+            normal = scene.structure.normal
+            # Detached before and after, but put on the belt in between: a rebound.
+            bounced = status == Status.DETACH == int(look.contact.status) and look.y[normal] == 0
+            fired = status != int(look.contact.status) or bool(look.turned) or bounced
+            relevant = range(1 if status == Status.DETACH else 2)
+            for which in relevant:
                 guard, key = look.guards[:, which], (status, which)
                 largest[key] = max(largest.get(key, 0.0), float(np.abs(guard).max()))
-                inside = np.flatnonzero((guard[1:-1] < guard[:-2]) & (guard[1:-1] < guard[2:]))
-                calls += [(key, float(guard[i + 1]), t + float(look.h) * (i + 1) / LOOKS) for i in inside]
+                turns = np.flatnonzero(look.turns[:, which])
+                calls += [(key, float(look.lowest[i, which]), t + float(look.h) * i / LOOKS) for i in turns]
             if fired:
                 # What ran out is the guard that is nearest to zero at the end, in units of its size.
-                sizes = [max(largest.get((status, k), 0.0), 1e-300) for k in range(2)]
-                which = 0 if status == Status.DETACH else int(np.argmin(np.abs(look.guards[-1]) / sizes))
+                which = min(relevant, key=lambda k: abs(look.guards[-1, k]) / max(largest[status, k], 1e-300))
                 depth = float(look.slope[which] ** 2 / (2 * max(abs(look.bend[which]), 1e-300)))
                 calls.append(((status, which), depth, t + float(look.h)))
                 events += 1
             t = end if look.h >= end - t else t + float(look.h)
             y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
-            if not np.all(np.isfinite(look.y)) or look.h <= 0 and not fired:
+            if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not fired):
                 return _Calls(events, 0.0, t, "the motion stopping to be finite")
     closest = [(value / max(largest[key], 1e-300), at, GUARDS[Status(key[0]), key[1]]) for key, value, at in calls]
     return _Calls(events, *min(closest, default=(float("inf"), float("nan"), "none")))
@@ -194,6 +201,8 @@ class _Look(eqx.Module):
     h: Float[Array, ""]
     turned: Array  # whether it slides the other way now
     guards: Float[Array, "l 2"]
+    turns: Bool[Array, "l 2"]  # whether the guard has its smallest value about this look, and recovers
+    lowest: Float[Array, "l 2"]  # that value
     slope: Float[Array, "2"]  # of the guards at the end, per s, and per s²
     bend: Float[Array, "2"]
 
@@ -201,19 +210,25 @@ class _Look(eqx.Module):
 @eqx.filter_jit
 def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     after = method.advance(mechanics, contact, load, y, h)
-    shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
     # Just short of the end the status is still the same.
+    shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
     inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
     states = jnp.concatenate([y[None], inside])
 
-    def guards(state):
-        return physics.guards(mechanics, contact, load, state)
+    def along(function):
+        return lambda state: jax.jvp(function, (state,), (rates(mechanics, contact, load, state),))[1]
 
-    def slope(state):
-        return jax.jvp(guards, (state,), (rates(mechanics, contact, load, state),))[1]
-
-    last = states[-1]
-    bend = jax.jvp(slope, (last,), (rates(mechanics, contact, load, last),))[1]
+    orders = [lambda state: physics.guards(mechanics, contact, load, state)]
+    for _ in range(3):
+        orders.append(along(orders[-1]))
+    value, slope, bend, third = (jax.vmap(order)(states) for order in orders)
+    # Where the slope comes to zero, by the parabola; half a look to either side, but not beyond the ends.
+    to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
+    spacing = after.h / LOOKS
+    near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
+    look = jnp.arange(LOOKS + 1)[:, None]
+    near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
+    lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
     turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
     turned = turned & (after.contact.status == Status.SLIDE)
-    return _Look(after.y, after.contact, after.h, turned, jax.vmap(guards)(states), slope(last), bend)
+    return _Look(after.y, after.contact, after.h, turned, value, near, lowest, slope[-1], bend[-1])

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from . import contact as physics
 from . import features
 from .contact import Mechanics, Status
 from .load import ConstantLoad
@@ -141,7 +140,9 @@ class CycleMisfit(AbstractMisfit):
     known: dict[str, Array]
     measured: Float[Array, " h"]
     whitening: Float[Array, "h h"]
-    fractions: Float[Array, "2 2"]  # sticking, detached; value and standard deviation, which is infinite if not measured
+    fractions: Float[
+        Array, "2 2"
+    ]  # sticking, detached; value and standard deviation, which is infinite if not measured
     method: AbstractStepper
     width: Float[Array, ""]  # of a block, s
     frequency: Float[Array, ""]  # Hz, as measured
@@ -243,7 +244,7 @@ def _integrals(y, channels: tuple[Channel, ...]):
 def _characteristic(
     scene: Scene, poles: Complex[Array, " j"], shapes: Complex[Array, "j k"], channels: tuple[Channel, ...]
 ) -> Float[Array, " c"]:
-    r"""Measured poles and shapes in $(λ^2 - A_{22}λ - A_{21})\,φ = 0$, relative to $λ^2 φ$; without all of φ, its determinant."""
+    r"""Measured poles and shapes in $(λ^2 - A_{22}λ - A_{21})\,φ = 0$, relative to $λ^2 φ$; and its determinant."""
     matrix = linear_sliding(scene).matrix
     m = matrix.shape[0] // 2
     if poles.shape[0] == 0:
@@ -327,11 +328,18 @@ def misfit(
     # Poles that leave much of the signal unexplained are not those of a small motion.
     good = found.explained > 0.7
     values, shapes = (found.values, found.shapes) if good else (found.values[:0], found.shapes[:0])
-    arrays = tuple(map(jnp.asarray, (blocks.edges, blocks.means, sigma)))
-    common = (*arrays, known, jnp.asarray(values), jnp.asarray(shapes))
+    common: dict = {
+        "edges": jnp.asarray(blocks.edges),
+        "means": jnp.asarray(blocks.means),
+        "sigma": jnp.asarray(sigma),
+        "known": known,
+        "poles": jnp.asarray(values),
+        "shapes": jnp.asarray(shapes),
+        "channels": recording.channels,
+    }
     if recording.regime == "sliding":
-        return SlidingMisfit(*common, channels=recording.channels, fitted_by_elimination=2 * (scene.structure.size - 1))
-    return KickMisfit(*common, method=method, channels=recording.channels, uneventful=uneventful)
+        return SlidingMisfit(**common, fitted_by_elimination=2 * (scene.structure.size - 1))
+    return KickMisfit(**common, method=method, uneventful=uneventful)
 
 
 def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:

@@ -43,7 +43,9 @@ class FreeParameters(eqx.Module):
             raise ValueError(f"Argument `free` names a parameter twice: {', '.join(names)}.")
         for name in bounds:
             if name not in names:
-                raise ValueError(f"Argument `bounds` names `{name}`, which is not among the free ones: {', '.join(names)}.")
+                raise ValueError(
+                    f"Argument `bounds` names `{name}`, which is not among the free ones: {', '.join(names)}."
+                )
         lower, upper, size, kinds = [], [], [], []
         for name in names:
             value = float(known[name])

@@ -26,7 +26,15 @@ REGIMES = ("sliding", "kick", "limit cycle")
 QUANTITIES = ("acceleration", "velocity")
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
-    "acceleration": {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "mm/s^2": 1e-3, "mm/s²": 1e-3, "g": 9.80665},
+    "acceleration": {
+        "m/s2": 1.0,
+        "m/s^2": 1.0,
+        "m/s²": 1.0,
+        "mm/s2": 1e-3,
+        "mm/s^2": 1e-3,
+        "mm/s²": 1e-3,
+        "g": 9.80665,
+    },
     "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2},
 }
 # Time stamps are written with few digits; steps that differ by more than this share of a step are not rounding.
@@ -116,15 +124,15 @@ class Recording(eqx.Module):
                 f"special. Leave it out."
             )
         self.offset = _offset((0.0, 0.5) if offset is None else offset)
+        by_name: dict = {}
         if noise is not None:
             for name, value in noise.items():
                 arguments.real_number(f"noise[{name!r}]", value, above=0)
             missing = [str(c) for c in by_channel if c not in {channel(name) for name in noise}]
             if missing:
                 raise ValueError(f"Argument `noise` must name every channel, but {missing[0]} is missing.")
-            noise = {channel(name): float(value) for name, value in noise.items()}
-            noise = np.array([noise[c] for c in by_channel])
-        self.noise = noise
+            by_name = {channel(name): float(value) for name, value in noise.items()}
+        self.noise = None if noise is None else np.array([by_name[c] for c in by_channel])
         self.sticking, self.detached = _fraction("sticking", sticking, regime), _fraction("detached", detached, regime)
         for name, value in known.items():
             arguments.real_number(name, value)
@@ -210,7 +218,9 @@ def read_recording(
     path = Path(path)
     readers = {".csv": _csv, ".txt": _csv, ".npy": _numpy, ".npz": _numpy, ".wav": _wav, ".mat": _matlab}
     if path.suffix.lower() not in readers:
-        raise ValueError(f"File `{path}` must be one of {', '.join(readers)}, but ends in {path.suffix or 'nothing'!r}.")
+        raise ValueError(
+            f"File `{path}` must be one of {', '.join(readers)}, but ends in {path.suffix or 'nothing'!r}."
+        )
     if not path.is_file():
         raise ValueError(f"File `{path}` does not exist.")
     arguments.real_number("full_scale", full_scale, above=0)
@@ -252,7 +262,9 @@ def _csv(path: Path):
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"File `{path}` is not text: byte {error.start} is no UTF-8.") from None
-    rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    rows = [
+        (number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
+    ]
     if len(rows) < 2:
         raise ValueError(f"File `{path}` must hold a line of names and lines of numbers, but has {len(rows)} lines.")
     (first, head), *rows = rows
