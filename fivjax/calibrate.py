@@ -150,7 +150,9 @@ class Calibration(eqx.Module):
                 {dims[0]: self.t[k], dims[1]: [str(channel) for channel in recording.channels]}
             )
             dataset[f"measured_{k}"].attrs["regime"] = recording.regime
-        return labelled(dataset, self.scene, outcome=str(self.outcome), misfit=self.misfit)
+        dataset = labelled(dataset, self.scene)
+        dataset.attrs.update(outcome=str(self.outcome), misfit=self.misfit)
+        return dataset
 
 
 @in_double_precision
@@ -191,7 +193,7 @@ def calibrate(
     **Raises:** `ValueError` or `TypeError`, as a sentence, for names, bounds or channels that do not fit the scene.
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, Sequence) else data
+    recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, list | tuple) else data
     if not isinstance(recordings, tuple) or not recordings:
         raise TypeError(f"Argument `data` must be a Recording or a list of them, but is {arguments.describe(data)}.")
     for k, recording in enumerate(recordings):
@@ -522,7 +524,7 @@ def _covariance(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """Standard deviations, correlations and singular values; infinite deviations along directions that change nothing."""
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     # What is below rounding is nothing. Parameters with no share in such a direction keep their own deviation.
-    told = np.maximum(singular, 1e-12 * max(singular[0], 1e-300))
+    told = np.maximum(singular, max(1e-12 * singular[0], 1e-100))
     shares = np.where(np.abs(directions) < 1e-9, 0.0, directions)
     covariance = (shares / told[:, None] ** 2).T @ shares
     deviations = np.sqrt(np.diagonal(covariance))

@@ -332,12 +332,14 @@ def _wav(path: Path):
 
 
 def _matlab(path: Path):
+    # The reader of MATLAB files has errors of its own kind beside these.
+    unreadable = (ValueError, TypeError, OSError, EOFError, scipy.io.matlab.MatReadError)
     try:
         loaded = scipy.io.loadmat(path, squeeze_me=True)
     except NotImplementedError:  # version 7.3 is HDF5
         with h5py.File(path) as file:
             loaded = {name: np.squeeze(item[()]) for name, item in file.items() if isinstance(item, h5py.Dataset)}
-    except (ValueError, TypeError, OSError, EOFError) as error:
+    except unreadable as error:
         raise ValueError(f"File `{path}` cannot be read as MATLAB: {str(error).rstrip('.')}.") from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}, {}, None
 

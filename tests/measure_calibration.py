@@ -40,8 +40,8 @@ def draws(name: str, count: int, total: int, starts: int = 4) -> None:
         converged += fit.converged
         inside += bool(np.all(score[fit.identified] <= 3))
         scores.append(np.where(fit.identified, score, np.nan))
-    with np.errstate(all="ignore"):
-        spread = np.sqrt(np.nanmean(np.square(scores), axis=0))
+    # Over the draws in which a parameter was identifiable.
+    spread = np.sqrt(np.nansum(np.square(scores), axis=0) / np.maximum(told, 1))
     print(
         f"{name}, {count} parameters: all identifiable ones within three standard deviations in {inside} of {total} draws; "
         f"{converged} converged; median {np.median(walls):.1f} s a draw"
@@ -53,8 +53,8 @@ def draws(name: str, count: int, total: int, starts: int = 4) -> None:
 
 def recovery(total):
     """Linear phase and decaying response."""
-    for name in ("linear phase", "linear phase after a known kick", "decaying response"):
-        for count in FREE:
+    for count in FREE:
+        for name in ("decaying response", "linear phase", "linear phase after a known kick"):
             draws(name, count, total)
 
 
