@@ -228,6 +228,9 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
     look = jnp.arange(LOOKS + 1)[:, None]
     near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
+    # A guard that begins at zero, because the status has just begun there, does not turn at its own start.
+    begins = jnp.abs(value[0]) <= 1e-9 * jnp.max(jnp.abs(value), axis=0)
+    near = near & ~(begins & (look <= 1))
     lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
     turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
     turned = turned & (after.contact.status == Status.SLIDE)

@@ -35,7 +35,8 @@ def test_reverse_equals_forward_in_the_table():
     """Both modes through up to 35 events, sticking included: one transposed wrong would differ in the first digits."""
     for changes, t1 in measure.CASES.values():
         scene = measure.paper(**changes)
-        _, forward = measure.jacobian(scene, t1)
+        found, forward = measure.jacobian(scene, t1)
+        assert found.exist
         _, reverse = measure.jacobian(scene, t1, "reverse")
         expected, _ = measure.differences(scene, t1)
         assert measure.relative(reverse, forward).max() < 1e-10
