@@ -237,7 +237,10 @@ def calibrate(
                 bar.set_postfix_str(stage)
                 bar.update()
         result = fit.result(blocks, float(identifiable_within))
-        if not uneventful or (result.outcome is not Outcome.STRUCTURE_LEFT and fit.slid_throughout()):
+        # Noise alone is not explained any better by contact events.
+        if not uneventful or result.outcome is Outcome.NO_SIGNAL:
+            break
+        if result.outcome is not Outcome.STRUCTURE_LEFT and fit.slid_throughout():
             break
     return result
 
