@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
-from .contact import Mechanics, State
-from .energy import Books, Energy
+from .contact import Contact, Mechanics, State
+from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding, rates
 
 
 class Trajectory(eqx.Module):
@@ -100,7 +100,7 @@ def simulate(
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)
     _refuse_painleve(scene)
-    y0 = _initial_state(scene, y0)
+    y0 = start_state(scene, y0)
     rows = math.ceil(t1 / dt_save - 1e-9)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
@@ -115,34 +115,7 @@ def _simulate(
 ) -> dict:
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
-    # Steps end on the load's jumps as well as on the saved instants.
-    jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
-    ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
-
-    def to_next(carry, end):
-        t, y, contact, ledger = carry
-        load = scene.load(0.5 * (t + end))
-
-        def enter(ledger, contact, y, after):
-            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
-
-        y, contact, ledger, reached = advance_adding(method, mechanics, contact, load, y, end - t, most, ledger, enter)
-        # A number that was not reached is no number; counts stay what they are.
-        y, ledger = jax.tree.map(
-            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
-        )
-        return (end, y, contact, ledger), (y, contact, ledger)
-
-    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
-    ledger0 = None if books is None else accounts.open_ledger(books, y0)
-    _, (ys, contacts, ledgers) = jax.lax.scan(to_next, (saved[0], y0, contact0, ledger0), ends)
-    rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
-
-    def with_start(first, rest):
-        return jnp.concatenate([first[None], rest[rows]])
-
-    y = with_start(y0, ys)
-    contacts, ledgers = jax.tree.map(with_start, (contact0, ledger0), (contacts, ledgers))
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books)
     load = jax.vmap(scene.load)(saved)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
@@ -161,7 +134,63 @@ def _simulate(
     }
 
 
-def _initial_state(scene: Scene, y0) -> State:
+def states_at(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    instants: Float[Array, " T"],
+    most: int,
+    books: Books | None = None,
+) -> tuple[Float[Array, "T 2n"], Contact, Ledger | None]:
+    """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
+    where `most` advances between two of them were not enough.
+
+    Differentiable in both modes, in the instants and in the load's jumps too. In reverse mode only the states at the
+    instants are kept; what lies between is computed again.
+    """
+    mechanics = Mechanics(scene)
+    # Steps end on the load's jumps as well as on the instants.
+    jumps = scene.load.jumps
+    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
+    # A jump outside has no share in the derivative, one exactly on an end has its full one, which `clip` would halve.
+    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
+    ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
+
+    def to_next(carry, end):
+        t, y, contact, ledger = carry
+        h = end - t
+        load = scene.load(0.5 * (t + end))
+        # A jump that falls on an instant leaves no time between them, but either may move: what happens in between is
+        # the motion under the load just before the jump.
+        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
+        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+
+        def enter(ledger, contact, y, after):
+            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+
+        moved, following, ledger, reached = advance_adding(method, mechanics, contact, load, y, h, most, ledger, enter)
+        # A number that was not reached is no number; counts stay what they are.
+        moved, ledger = jax.tree.map(
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
+        )
+        y = jnp.where(h > 0, moved, y + drift)
+        return (end, y, following, ledger), (y, following, ledger)
+
+    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
+    ledger0 = None if books is None else accounts.open_ledger(books, y0)
+    # Inside a scan nothing can be merged across the checkpoint anyway.
+    step = jax.checkpoint(to_next, prevent_cse=False)
+    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
+    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    return jax.tree.map(with_start, (y0, contact0, ledger0), after)
+
+
+def start_state(scene: Scene, y0) -> State:
+    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
     n, normal = scene.structure.size, scene.structure.normal
     if y0 is None:
         if is_known(scene.belt_speed):
