@@ -22,6 +22,7 @@ from .signals import read_recording
 from .simulate import simulate
 from .steppers import AbstractStepper
 from .structure import belt_oscillator
+from .tradeoff import table, tradeoff
 from .verdict import Verdict
 from .where_switched import WhereSwitched
 
@@ -235,11 +236,34 @@ class Calibrate:
         return (self.column, "--column"), (self.unit, "--unit")
 
 
+@dataclasses.dataclass(frozen=True)
+class Tradeoff:
+    """What accuracy costs on a scene: methods, steps and precisions compared. Writes OUT.nc and OUT.png."""
+
+    t1: float = 0.5
+    """time after which states are compared (s)"""
+    lanes: int = 256
+    """trajectories side by side when cost is measured"""
+    boundary: bool = True
+    """compare p_crit and verdicts too, which takes minutes"""
+    out: Path = Path("tradeoff")
+    """files to write, without suffix"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=lambda: SceneOptions(p=1.3))
+
+    def run(self) -> None:
+        data, picture = _outputs(self.out)
+        dataset = tradeoff(self.scene.scene(), t1=self.t1, lanes=self.lanes, boundary=self.boundary)
+        save(dataset, data)
+        save_figure(plot.tradeoff(dataset), picture)
+        _say(data, picture)
+        print(table(dataset))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; sentences on standard error and exit code 2 for what is refused."""
     keep_compiled_code()
     command = tyro.extras.subcommand_cli_from_dict(
-        {"map": Map, "simulate": Simulate, "cea": Cea, "calibrate": Calibrate},
+        {"map": Map, "simulate": Simulate, "cea": Cea, "calibrate": Calibrate, "tradeoff": Tradeoff},
         prog="fivjax",
         description="Friction-induced vibration: what a scene does after a kick.",
         args=arguments,

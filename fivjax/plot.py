@@ -207,6 +207,27 @@ def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     return figure
 
 
+def tradeoff(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """A work–precision picture of `fj.tradeoff`: what a lane-cycle costs, against the error of the state."""
+    figure = figure or Figure(figsize=(7.2, 4.8), layout="constrained")
+    axes = figure.add_subplot(xscale="log", yscale="log")
+    fills = {"float64": BLUE, "float32": "white"}
+    for kind in dataset["precision"].values:
+        rows = dataset.sel(precision=kind)
+        shown = np.isfinite(rows["state_error"].values) & (rows["state_error"].values > 0)
+        x, y = 1e6 * rows["cost"].values[shown], rows["state_error"].values[shown]
+        axes.scatter(x, y, s=36, facecolor=fills[str(kind)], edgecolor=BLUE, label=str(kind), zorder=3)
+        if kind == "float64":
+            for name, at, error in zip(rows["stepper"].values[shown], x, y, strict=True):
+                axes.annotate(str(name), (at, error), (6, 3), textcoords="offset points", fontsize="small")
+    axes.set_xlabel("cost of a lane-cycle (µs)")
+    axes.set_ylabel("relative error of the state")
+    axes.margins(x=0.25)
+    axes.grid(alpha=0.3, which="major")
+    axes.legend(title="precision")
+    return figure
+
+
 def _of(run: Trajectory, quantity: str) -> np.ndarray:
     if quantity not in ("displacement", "velocity", "acceleration"):
         raise ValueError(

@@ -1,0 +1,83 @@
+"""The trade-off table: its errors are those that the oracle finds, and its recommendations follow from it."""
+
+import json
+
+import numpy as np
+import oracle
+import pytest
+
+import fivjax as fj
+from fivjax.tradeoff import recommend, table
+
+
+@pytest.fixture(scope="module")
+def measured():
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
+    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "fine": fj.WhereSwitched(dt=2e-5), "exact": fj.EventExact()}
+    return fj.tradeoff(scene, methods=methods, t1=0.15, lanes=4, boundary=False, progress=False)
+
+
+def test_state_errors_are_those_against_the_oracle(measured):
+    """After the first events; SciPy with events and restarts is the reference that the table itself does not use."""
+    reference = oracle.simulate(
+        oracle.paper_model(mu=0.2, belt_speed=3.0, p=3.0), 0.15, np.array([0.0, 0.15]), rtol=1e-12
+    )
+    assert len(reference.events) >= 5
+    q, v = reference.q[-1], reference.v[-1]
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
+    for name, dt in (("coarse", 2e-4), ("fine", 2e-5)):
+        run = fj.simulate(scene, 0.15, 0.15, fj.WhereSwitched(dt=dt))
+        error = max(
+            np.abs(run.displacement[-1] - q).max() / np.abs(q).max(),
+            np.abs(run.velocity[-1] - v).max() / np.abs(v).max(),
+        )
+        assert float(measured["state_error"].sel(stepper=name, precision="float64")) == pytest.approx(error, rel=1e-4)
+    assert measured["state_error"].sel(stepper="exact", precision="float64") < 1e-11
+    # Half the digits: what is left of an exact method in single precision is rounding.
+    assert measured["state_error"].sel(stepper="fine", precision="float32") > 1e-9
+
+
+def test_costs_are_costs_and_parts_are_named(measured):
+    assert (measured["cost"] > 0).all() and measured["cost"].attrs["units"] == "s"
+    assert float(measured["cost"].sel(stepper="fine", precision="float64")) > float(
+        measured["cost"].sel(stepper="coarse", precision="float64")
+    )
+    assert {"end state alone", "energy ledger", "stored output, 1000 rows"} <= set(measured["part"].values.tolist())
+
+
+def test_a_recommendation_is_the_cheapest_that_is_good_enough(measured):
+    assert recommend(measured, 1e-10) == "exact"
+    assert recommend(measured, 1e-30) == ""
+    cheapest = measured["cost"].where(np.isfinite(measured["state_error"])).min()
+    loosest = recommend(measured, 1e9).split(",")[0]
+    assert np.isclose(measured["cost"].sel(stepper=loosest), cheapest).any()
+    assert json.loads(measured.attrs["recommendation"])["1e-09"] == "exact"
+    assert "exact" in table(measured) and "energy ledger" in table(measured)
+
+
+def test_bad_input_is_refused():
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad(100.0))
+    with pytest.raises(TypeError, match="must be a Pulse"):
+        fj.tradeoff(scene)
+    with pytest.raises(TypeError, match="dict of steppers"):
+        fj.tradeoff(scene, methods=[fj.EventExact()])
+    with pytest.raises(TypeError, match="must be a stepper"):
+        fj.tradeoff(scene, methods={"x": 3}, boundary=False)
+    with pytest.raises(ValueError, match="`lanes` must be a whole number"):
+        fj.tradeoff(scene, lanes=0, boundary=False)
+    with pytest.raises(ValueError, match="`t1`"):
+        fj.tradeoff(scene, t1=-1.0, boundary=False)
+    with pytest.raises(ValueError, match="`precisions`"):
+        fj.tradeoff(scene, precisions=("float16",), boundary=False)
+
+
+@pytest.mark.slow
+def test_the_boundary_of_each_method(paper_scene):
+    """Verdicts and p_crit: exact for the exact method, first order in the step for where-switching."""
+    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "fine": fj.WhereSwitched(dt=5e-5), "exact": fj.EventExact()}
+    found = fj.tradeoff(paper_scene, methods=methods, precisions=("float64",), lanes=4, progress=False).sel(
+        precision="float64"
+    )
+    assert found["wrong_verdicts"].sel(stepper="exact") == 0
+    assert found["p_crit_error"].sel(stepper="exact") < 1e-5
+    assert found["p_crit_error"].sel(stepper="fine") < found["p_crit_error"].sel(stepper="coarse")
