@@ -33,7 +33,10 @@ from .verdict import Verdict
 
 # Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
 TILE_ON_CPU = 128
+LARGE_TILE_ON_CPU = 512
 TILE_ELSEWHERE = 65536
+# Lanes from which on it pays to compile the larger tile.
+MANY = 8192
 # Lanes of a group that stand side by side in a tile: enough to fill a vector unit and to make matrix products pay.
 SIDE_BY_SIDE = 16
 # What a lane that shares nothing costs, in lanes that stand side by side.
@@ -386,7 +389,9 @@ def _workers() -> int:
 def _in_tiles(function, shared: Shared, group: np.ndarray, inputs: tuple, width: int, pool: ThreadPoolExecutor):
     """`function(shared, *inputs)` over all lanes, in tiles of one size, so that a scene is compiled once for any map."""
     slots, filled = _side_by_side(group, width)
-    size = TILE_ON_CPU if jax.default_backend() == "cpu" else TILE_ELSEWHERE
+    size = TILE_ELSEWHERE
+    if jax.default_backend() == "cpu":
+        size = LARGE_TILE_ON_CPU if len(group) >= MANY else TILE_ON_CPU
     rows = max(1, size // width)
 
     def run(start: int):

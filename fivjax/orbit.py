@@ -27,6 +27,9 @@ LONGEST_SEARCH = 64
 LOOSE_DISTANCE = 0.02
 LOOSE_SHARE = 0.15
 LOOSE_SPAN = 16
+ROOM = 1.5
+# Loose returns each this much further than the one before drift off; on a torus they scatter, or stay the same.
+DRIFT = 0.02
 
 
 class Resolution(eqx.Module):
@@ -103,7 +106,10 @@ def observe(
     peak = jnp.maximum(orbit.peak, peak)
     # While the anchor is not set, the distance is infinite and says nothing.
     excursion = jnp.where(jnp.isfinite(distance), jnp.maximum(orbit.excursion, distance), orbit.excursion)
-    loose = (distance <= LOOSE_DISTANCE) & (distance <= LOOSE_SHARE * excursion) & (excursion >= resolution.floor)
+    # On a torus distances at one lag scatter a little; a lag once found is given some room.
+    room = jnp.where(orbit.lag == 0, 1.0, ROOM)
+    loose = (distance <= room * LOOSE_DISTANCE) & (distance <= room * LOOSE_SHARE * excursion)
+    loose = loose & (excursion >= resolution.floor)
     close = ((distance <= resolution.tight) | loose) & (changes > 0)
     searching = orbit.lag == 0
     due = crossings == orbit.lag
@@ -119,7 +125,7 @@ def observe(
     complete = again & (returns >= needed)
     # Below a hundredth of the method's error there is nothing left to drift.
     further = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
-    rising = again & orbit.rising & (distance > orbit.last_distance)
+    rising = jnp.where(again, orbit.rising & (distance > (1 + DRIFT) * orbit.last_distance), orbit.rising)
     drifting = jnp.where(loose, rising, further)
     restart = found | (complete & drifting)
     amplitude = jnp.where(found, peak, jnp.where(again, jnp.maximum(orbit.amplitude, peak), orbit.amplitude))
@@ -137,7 +143,7 @@ def observe(
         lag=lag,
         returns=jnp.where(restart, 1, returns),
         first_distance=jnp.where(restart, distance, orbit.first_distance),
-        last_distance=distance,
+        last_distance=jnp.where(found | again, distance, orbit.last_distance),
         rising=restart | rising,
         excursion=jnp.where(new_anchor, 0.0, excursion),
         peak=jnp.where(new_anchor, 0.0, peak),

@@ -24,6 +24,8 @@ from .scene import Scene, steady_sliding
 LOWEST_SLIP = 0.5
 ENVELOPE_DECADES = 12.0
 ENVELOPE_INSTANTS = 161
+# Modes this close, relative to the fastest, are near-parallel or may become so.
+CLOSE = 0.2
 
 
 class LinearSliding(eqx.Module):
@@ -101,6 +103,7 @@ class SlidingModes(eqx.Module):
     pressing: Complex[Array, " k"]  # shares of the modes in the two signals
     slip: Complex[Array, " k"]
     remainder: Complex[Array, " k"]
+    clusters: Float[Array, "c k"]  # which of them are so close that they are bounded together
     stable: Bool[Array, ""]
 
 
@@ -132,8 +135,16 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         pressing=count * np.einsum("li,lik->lk", linear.pressing, vectors),
         slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
         remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        clusters=_clusters(eigenvalues),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
+
+
+def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
+    """For each set of eigenvalues, in falling order of frequency, rows of ones where modes are close to each other."""
+    gaps = np.abs(np.diff(eigenvalues, axis=-1)) > CLOSE * np.abs(eigenvalues[:, :1])
+    number = np.cumsum(np.concatenate([np.zeros((len(gaps), 1), int), gaps], axis=-1), axis=-1)
+    return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
 
 
 def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, y: State) -> Bool[Array, ""]:
@@ -142,8 +153,8 @@ def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, 
     z = (y - linear.equilibrium)[_sliding_coordinates(y.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
     if mechanics.friction.constant:
-        proved = (envelope_peak(modes.pressing * modal, modes.eigenvalues) < linear.pressing_margin) & (
-            envelope_peak(modes.slip * modal, modes.eigenvalues) < linear.slip_margin
+        proved = (envelope_peak(modes.pressing * modal, modes.eigenvalues, modes.clusters) < linear.pressing_margin) & (
+            envelope_peak(modes.slip * modal, modes.eigenvalues, modes.clusters) < linear.slip_margin
         )
     else:
         proved = decays_nonlinearly(modes, modal)
@@ -151,30 +162,40 @@ def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, 
     return sliding & proved & modes.stable & linear.exists
 
 
-def envelope_peak(shares: Complex[Array, " k"], eigenvalues: Complex[Array, " k"]) -> Float[Array, ""]:
+def envelope_peak(
+    shares: Complex[Array, " k"], eigenvalues: Complex[Array, " k"], clusters: Float[Array, "c k"]
+) -> Float[Array, ""]:
     r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes,
     tight also for near-parallel ones.
 
     Near a coalescence the shares $a_k$ are huge and cancel, so the sum of their sizes is a useless bound. With the mean
-    exponent $\bar λ$ taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two instants a distance $h$
-    apart it lies within $h^2 \max|u''| / 8$ of the chord, and $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past
-    the last instant the sum of sizes has decayed and is bound enough.
+    exponent $\bar λ$ of such a cluster of modes taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two
+    instants a distance $h$ apart it lies within $h^2 \max|u''| / 8$ of the chord, and
+    $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past the last instant the sum of sizes has decayed and is bound
+    enough. Clusters (rows of ones and zeros) are bounded one by one.
     """
     sizes = jnp.abs(shares)
-    total = jnp.sum(sizes)
-    weights = sizes / jnp.where(total > 0, total, 1.0)
-    mean = jnp.sum(weights * eigenvalues)
-    offsets = eigenvalues - mean
-    # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
-    horizon = ENVELOPE_DECADES / jnp.maximum(-mean.real, 1e-6 * jnp.max(jnp.abs(eigenvalues)) + 1e-300)
-    t = horizon * jnp.linspace(0.0, 1.0, ENVELOPE_INSTANTS, dtype=total.dtype) ** 2
-    growth = jnp.exp(offsets * t[:, None])
-    slow = jnp.abs(growth @ shares)
-    bend = jnp.abs(growth) @ (sizes * jnp.abs(offsets) ** 2)
-    chord = jnp.maximum(slow[1:], slow[:-1]) + jnp.diff(t) ** 2 / 8 * jnp.maximum(bend[1:], bend[:-1])
-    inside = jnp.max(jnp.exp(mean.real * t[:-1]) * chord)
-    beyond = jnp.sum(sizes * jnp.exp(eigenvalues.real * horizon))
-    bound = jnp.minimum(jnp.maximum(inside, beyond), total)
+    bounds = []
+    for members in clusters:
+        # Nothing of this depends on the shares: lanes with the same modes share it.
+        mean = jnp.sum(members * eigenvalues) / jnp.maximum(jnp.sum(members), 1.0)
+        offsets = members * (eigenvalues - mean)
+        # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
+        horizon = ENVELOPE_DECADES / jnp.maximum(-mean.real, 1e-6 * jnp.max(jnp.abs(eigenvalues)) + 1e-300)
+        t = horizon * jnp.linspace(0.0, 1.0, ENVELOPE_INSTANTS, dtype=sizes.dtype) ** 2
+        growth = members * jnp.exp(offsets * t[:, None])
+        bending = jnp.abs(growth) * jnp.abs(offsets) ** 2
+        decay = jnp.exp(mean.real * t[:-1])
+        last = members * jnp.exp(eigenvalues.real * horizon)
+        # From here on it is one product of a matrix with the shares, and a maximum.
+        slow = jnp.hypot(
+            growth.real @ shares.real - growth.imag @ shares.imag, growth.real @ shares.imag + growth.imag @ shares.real
+        )
+        bend = bending @ sizes
+        chord = jnp.maximum(slow[1:], slow[:-1]) + jnp.diff(t) ** 2 / 8 * jnp.maximum(bend[1:], bend[:-1])
+        peak = jnp.maximum(jnp.max(decay * chord), last @ sizes)
+        bounds.append(jnp.minimum(peak, members @ sizes))
+    bound = sum(bounds)
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 

@@ -37,7 +37,7 @@ def default_methods() -> dict[str, AbstractStepper]:
     solvers = {"Heun": diffrax.Heun(), "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()}
     steps = {"Heun": (2e-5,), "Tsit5": (2e-4, 5e-5, 1e-5), "Dopri8": (2e-4,)}
     switched = {f"{name}, {dt:g} s": WhereSwitched(solvers[name], dt) for name in solvers for dt in steps[name]}
-    return {**switched, "event-exact, order 8": EventExact(8), "event-exact": EventExact()}
+    return {**switched, "event-exact, order 8, 1e-8": EventExact(8, tolerance=1e-8), "event-exact": EventExact()}
 
 
 @in_double_precision
@@ -126,7 +126,7 @@ def table(dataset: xr.Dataset) -> str:
 
         def number(name, form, row=row):
             value = float(row[name])
-            return format(value, form) if np.isfinite(value) else "-"
+            return "-" if np.isnan(value) else format(value, form) if np.isfinite(value) else "failed"
 
         lines.append(
             f"{method:28s} {kind:9s} {1e9 * float(row['cost']):9.0f} {number('state_error', '8.1e'):>8s} "

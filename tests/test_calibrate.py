@@ -51,6 +51,7 @@ def test_decaying_response_from_thirty_per_cent_off(decay, decay_fit):
     np.testing.assert_allclose(decay_fit.residuals[0].std(axis=0), expected, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_linear_phase_of_unknown_origin_tells_ratios_only():
     """Whatever set a growing vibration off, all masses, springs and dampers could be twice as large: none is told."""
     scene, accelerations, regime = case("linear phase")
@@ -93,6 +94,7 @@ def test_friction_from_a_quiet_run_is_not_identifiable(regime):
     assert np.isnan(fit.values["mu"])
 
 
+@pytest.mark.slow
 def test_what_the_scene_cannot_explain_is_said(decay):
     """A response with a wrong, fixed damper fits badly; the outcome must not be a plain "converged"."""
     scene, data = decay

@@ -45,6 +45,7 @@ def test_reverse_equals_forward_in_the_table():
         assert measure.relative(found, expected).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_the_end_of_a_kick_on_a_saved_instant():
     """A step of no length between the saved instant and the jump of the load must pass the derivative on, not lose it."""
     with jax.enable_x64(True):

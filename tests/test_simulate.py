@@ -163,6 +163,7 @@ def test_batch_equals_loop(paper_scene):
         np.testing.assert_array_equal(status[lane], alone.status)
 
 
+@pytest.mark.slow
 def test_derivatives_through_events_agree_forward_reverse_and_with_differences(paper_scene):
     """μ = 0.227, p = 1.3, nine events: the derivative of the state in μ and p, three ways."""
 

@@ -29,7 +29,7 @@ def test_the_envelope_is_a_bound_and_a_tight_one(apart):
         # Near-parallel modes: huge shares that cancel to a sum of size one.
         shares = rng.normal() / apart * np.array([1, -1]) + rng.normal(size=2) + 1j * rng.normal(size=2)
         with jax.enable_x64(True):
-            bound = float(envelope_peak(jnp.asarray(shares), jnp.asarray(eigenvalues)))
+            bound = float(envelope_peak(jnp.asarray(shares), jnp.asarray(eigenvalues), jnp.ones((1, 2))))
         true = brute_force_peak(shares, eigenvalues)
         assert bound >= true * (1 - 1e-9)
         # What is lost: chords between instants, and the sum of sizes at the end of the horizon.
