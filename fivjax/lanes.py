@@ -7,7 +7,9 @@ filled anew: work is spent only where the verdict is open.
 """
 
 import os
+import time
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -22,6 +24,7 @@ from . import contact as physics
 from . import orbit as orbits
 from .contact import Contact, Mechanics, State
 from .event_exact import EventExact
+from .interrupts import noted
 from .load import AbstractLoad
 from .orbit import Orbit
 from .propagators import MATRIX_ROWS, Windowed
@@ -41,6 +44,8 @@ COST_OF_STANDING_ALONE = 4
 LOOKS = 8
 # Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
 SPAN_SHARE = 4
+# How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
+KEEP_EVERY = 2.0
 # Parameters that lanes of one group may differ in: the load's history, which leaves the mechanics alone.
 HISTORY = ("p", "duration", "start")
 
@@ -176,11 +181,16 @@ def run_to_verdict(
     progress: bool | None,
     label: str,
     lingering: bool = False,
+    known: Outcome | None = None,
+    keep: Callable[[Outcome], None] | None = None,
 ) -> Outcome:
     """Follow one lane for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
     `lingering` says that the lanes were chosen to lie so close to a boundary that they stay with an unstable cycle for
     long: then an orbit has to return for longer before it counts.
+
+    `known` is what an earlier run of the same lanes has finished; those are not run again. `keep` is handed everything that is
+    finished, every few seconds and at the end.
 
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
@@ -196,7 +206,24 @@ def run_to_verdict(
         events=np.zeros(total, np.int32),
         last_event=np.full(total, np.nan),
     )
-    bar = tqdm(total=total, desc=label, unit="lane", disable=None if progress is None else not progress)
+    if known is not None:
+        outcome = Outcome(*(np.array(field) for field in known))
+    already = int(np.sum(outcome.verdict != Verdict.NOT_RUN))
+    bar = tqdm(
+        total=total, initial=already, desc=label, unit="lane", disable=None if progress is None else not progress
+    )
+    kept, new = time.monotonic(), 0
+
+    def finished(count: int) -> None:
+        nonlocal kept, new
+        bar.update(count)
+        new += count
+        if signals:
+            raise KeyboardInterrupt
+        if keep is not None and new > 0 and time.monotonic() - kept >= KEEP_EVERY:
+            keep(outcome)
+            kept, new = time.monotonic(), 0
+
     distinct, group = _groups(values)
     # The same in all rounds and blocks, because products of other shapes round differently.
     in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
@@ -204,18 +231,22 @@ def run_to_verdict(
     # Blocks that are filled group by group share the most.
     order = np.argsort(group, kind="stable")
     block = max(1, int(memory // bytes_per_lane(scene, sharing=total / len(distinct))))
-    try:
-        with bar:
+    with noted() as signals, bar:
+        try:
             for start in range(0, total, block):
                 chosen = order[start : start + block]
-                rows = {name: column[chosen] for name, column in values.items()}
-                _run_block(scene, rows, stepper, resolution, width, t_max, outcome, chosen, bar)
-    except KeyboardInterrupt:
-        open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
-        warnings.warn(
-            f"Interrupted: {open_lanes} of {total} lanes have no verdict and are labelled {Verdict.NOT_RUN.value}.",
-            stacklevel=2,
-        )
+                if np.any(outcome.verdict[chosen] == Verdict.NOT_RUN):
+                    rows = {name: column[chosen] for name, column in values.items()}
+                    _run_block(scene, rows, stepper, resolution, width, t_max, outcome, chosen, finished)
+        except KeyboardInterrupt:
+            open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
+            warnings.warn(
+                f"Interrupted: {open_lanes} of {total} lanes have no verdict and are labelled {Verdict.NOT_RUN.value}.",
+                stacklevel=2,
+            )
+        finally:
+            if keep is not None:
+                keep(outcome)
     return outcome
 
 
@@ -244,8 +275,8 @@ def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return distinct, group.ravel()
 
 
-def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome, index: np.ndarray, bar) -> None:
-    """Lanes that fit in memory together; writes their outcomes at `index`."""
+def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome, index: np.ndarray, report) -> None:
+    """Lanes that fit in memory together; writes the outcomes of those not run yet at `index`."""
     names = tuple(name for name in values if name not in HISTORY)
     history = tuple(name for name in values if name in HISTORY)
     distinct, group = _groups(values)
@@ -253,14 +284,15 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in history)], axis=-1)[:, 1:]
     with ThreadPoolExecutor(max_workers=_workers()) as pool:
         start = lambda *a: _begin(scene, names, history, *a)  # noqa: E731
-        lanes = _in_tiles(start, shared, group, (columns,), width, pool)
-        pending = np.arange(len(index))
+        # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
+        pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
+        lanes = _in_tiles(start, shared, group[pending], (columns[pending],), width, pool)
         done = 0
         while True:
             verdict, t = lanes.verdict, lanes.t
             finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
             _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
-            bar.update(int(finished.sum()))
+            report(int(finished.sum()))
             if finished.all():
                 return
             pending = pending[~finished]
@@ -274,12 +306,13 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
 
 def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     verdict = np.asarray(lanes.verdict)
-    outcome.verdict[index] = verdict
     amplitude = np.where(verdict == Verdict.LIMIT_CYCLE, lanes.orbit.amplitude, np.nan)
     outcome.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, amplitude)
     outcome.decided_at[index] = np.where(verdict >= 0, lanes.t, np.nan)
     outcome.events[index] = lanes.events
     outcome.last_event[index] = lanes.last_event
+    # Last, and in one go: a lane with a verdict is complete, whenever an interrupt comes.
+    outcome.verdict[index] = verdict
 
 
 def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], distinct: np.ndarray) -> Shared:

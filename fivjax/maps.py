@@ -3,17 +3,20 @@
 import functools
 import itertools
 import json
+from importlib import metadata
+from pathlib import Path
 
+import jax
 import numpy as np
 import xarray as xr
 
-from . import arguments
+from . import arguments, checkpoint
 from .critical import critical_friction
 from .event_exact import EventExact
 from .lanes import Outcome, run_to_verdict
 from .load import Pulse
 from .precision import in_double_precision
-from .results import labelled
+from .results import describe, labelled
 from .scene import Scene
 from .steppers import AbstractStepper
 from .verdict import MEANING, Verdict
@@ -28,6 +31,7 @@ def bistability_map(
     t_max: float = 20.0,
     memory: float = 2e9,
     progress: bool | None = None,
+    resume: str | Path | None = None,
     **axes,
 ) -> xr.Dataset:
     """Where a scene returns to sliding after its kick, and where it ends on a limit cycle; one batch run.
@@ -43,6 +47,9 @@ def bistability_map(
     - `t_max`: time after which a lane without a verdict is called undecided, in s.
     - `memory`: how much memory the lanes under way may take, in bytes.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
+    - `resume`: a file in which finished lanes are kept while the map runs, every few seconds. If it exists, the map goes on
+      from there: interrupted in whatever way and called again, the same call gives the same map, bit for bit. The file stays;
+      delete it when the map is saved.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
@@ -52,7 +59,7 @@ def bistability_map(
     friction of linear theory.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
-    not increasing, and values that the scene refuses.
+    not increasing, values that the scene refuses, and a `resume` file that belongs to another run.
     """
     method = EventExact() if method is None else method
     _check_run(scene, method, t_max, memory)
@@ -64,6 +71,7 @@ def bistability_map(
     axes = _checked_axes(scene, axes)
     shape = tuple(len(values) for values in axes.values())
     grid = np.meshgrid(*axes.values(), indexing="ij")
+    known, keep = _kept(resume, scene, method, t_max, axes)
     outcome = run_to_verdict(
         scene,
         {name: values.ravel() for name, values in zip(axes, grid, strict=True)},
@@ -72,6 +80,8 @@ def bistability_map(
         memory=memory,
         progress=progress,
         label="map",
+        known=known,
+        keep=keep,
     )
     dataset = xr.Dataset(
         {
@@ -249,6 +259,26 @@ def _narrowed(run, method, columns, brackets: np.ndarray, tolerance: float) -> n
 def _widened(brackets: np.ndarray, by: float) -> np.ndarray:
     width = np.where(np.diff(brackets) > 0, by, 0.0)
     return brackets + width * np.array([-1.0, 1.0])
+
+
+def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, t_max: float, axes: dict[str, np.ndarray]):
+    """What an earlier run has left in the file, and how to keep more there."""
+    if path is None:
+        return None, None
+    arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part"')
+    run = {
+        "fivjax": metadata.version("fivjax"),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "scene": describe(scene),
+        "method": repr(method),
+        "t_max": float(t_max),
+        "axes": {name: values.tolist() for name, values in axes.items()},
+        "results": list(Outcome._fields),
+    }
+    found = checkpoint.recall(path, run)
+    known = None if found is None else Outcome(**found)
+    return known, lambda outcome: checkpoint.keep(path, run, outcome._asdict())
 
 
 def _add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
