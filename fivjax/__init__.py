@@ -26,5 +26,6 @@ from .simulate import simulate as simulate
 from .steppers import vector_field as vector_field
 from .structure import Structure as Structure
 from .structure import belt_oscillator as belt_oscillator
+from .verdict import Ending as Ending
 from .verdict import Verdict as Verdict
 from .where_switched import WhereSwitched as WhereSwitched

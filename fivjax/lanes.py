@@ -32,6 +32,7 @@ from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
 from .steppers import AbstractStepper
 from .verdict import Verdict
+from .wedging import Wedge, sticks_forever, wedge
 
 # Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
 TILE_ON_CPU = 128
@@ -44,6 +45,10 @@ COST_OF_STANDING_ALONE = 4
 LOOKS = 8
 # Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
 SPAN_SHARE = 4
+# A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
+GROWTH = 1e9
+# Steps that a lane may take: 10⁵ cycles with their events, and some hours of work for a map of them.
+MOST_STEPS = 2**21
 # How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
 KEEP_EVERY = 2.0
 # Parameters that lanes of one group may differ in: the load's history, which leaves the mechanics alone.
@@ -68,6 +73,7 @@ class Shared(eqx.Module):
     values: Float[Array, " k"]  # the parameters that are not history
     prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
     modes: SlidingModes
+    wedge: Wedge
 
 
 class Outcome(NamedTuple):
@@ -117,6 +123,7 @@ def follow(
     resolution: orbits.Resolution,
     prepared,
     modes: SlidingModes,
+    wedge: Wedge,
     lane: Lane,
     steps,
 ) -> Lane:
@@ -154,6 +161,9 @@ def follow(
         )
 
     after = jax.lax.fori_loop(0, steps, step, lane)
+    deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
+    yardstick = jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    grown = jnp.max(jnp.abs(weights * deviation)) > GROWTH * yardstick
     quiet_load = jnp.all(scene.load.jumps <= after.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(after.y)),
@@ -164,7 +174,15 @@ def follow(
             jnp.where(
                 quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
                 Verdict.SLIDING,
-                jnp.where(quiet_load & after.orbit.returned, Verdict.LIMIT_CYCLE, Verdict.UNDECIDED),
+                jnp.where(
+                    quiet_load & after.orbit.returned,
+                    Verdict.LIMIT_CYCLE,
+                    jnp.where(
+                        quiet_load & (sticks_forever(wedge, mechanics, after.contact, after.y) | grown),
+                        Verdict.UNBOUNDED,
+                        Verdict.UNDECIDED,
+                    ),
+                ),
             ),
         ),
     )
@@ -178,6 +196,7 @@ def run_to_verdict(
     *,
     t_max: float,
     memory: float,
+    max_steps: int = MOST_STEPS,
     progress: bool | None,
     label: str,
     lingering: bool = False,
@@ -237,7 +256,7 @@ def run_to_verdict(
                 chosen = order[start : start + block]
                 if np.any(outcome.verdict[chosen] == Verdict.NOT_RUN):
                     rows = {name: column[chosen] for name, column in values.items()}
-                    _run_block(scene, rows, stepper, resolution, width, t_max, outcome, chosen, finished)
+                    _run_block(scene, rows, stepper, resolution, width, t_max, max_steps, outcome, chosen, finished)
         except KeyboardInterrupt:
             open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
             warnings.warn(
@@ -275,7 +294,9 @@ def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return distinct, group.ravel()
 
 
-def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome, index: np.ndarray, report) -> None:
+def _run_block(
+    scene, values, method, resolution, width, t_max, max_steps, outcome: Outcome, index: np.ndarray, report
+) -> None:
     """Lanes that fit in memory together; writes the outcomes of those not run yet at `index`."""
     names = tuple(name for name in values if name not in HISTORY)
     history = tuple(name for name in values if name in HISTORY)
@@ -290,6 +311,10 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
         done = 0
         while True:
             verdict, t = lanes.verdict, lanes.t
+            if done >= max_steps:
+                out_of_steps = np.where(lanes.events > done // 2, Verdict.TOO_MANY_EVENTS, Verdict.STEP_FAILURE)
+                verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), out_of_steps, verdict)
+                lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
             finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
             _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
             report(int(finished.sum()))
@@ -298,7 +323,7 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
             pending = pending[~finished]
             lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
             # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
-            steps = max(method.round, done // LOOKS)
+            steps = min(max(method.round, done // LOOKS), max(max_steps - done, 1))
             done += steps
             step = lambda *a, steps=steps: _follow(scene, method, resolution, names, history, np.int32(steps), *a)  # noqa: E731
             lanes = _in_tiles(step, shared, group[pending], (columns[pending], lanes), width, pool)
@@ -323,15 +348,15 @@ def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, 
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(scene, method, names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    prepared, linear = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Shared(distinct, prepared, sliding_modes(linear))
+    prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return Shared(distinct, prepared, sliding_modes(linear), wedges)
 
 
 @eqx.filter_jit
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
-        return method.prepare(Mechanics(own)), linear_sliding(own)
+        return method.prepare(Mechanics(own)), linear_sliding(own), wedge(own)
 
     return jax.vmap(one)(values)
 
@@ -350,8 +375,10 @@ def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, s
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
+        known = shared.prepared, shared.modes, shared.wedge
+
         def one(row, lane):
-            return follow(_with(own, history, row), method, resolution, shared.prepared, shared.modes, lane, steps)
+            return follow(_with(own, history, row), method, resolution, *known, lane, steps)
 
         return jax.vmap(one)(columns, lanes)
 

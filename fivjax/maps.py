@@ -13,7 +13,7 @@ import xarray as xr
 from . import arguments, checkpoint
 from .critical import critical_friction
 from .event_exact import EventExact
-from .lanes import Outcome, run_to_verdict
+from .lanes import MOST_STEPS, Outcome, run_to_verdict
 from .load import Pulse
 from .precision import in_double_precision
 from .results import describe, labelled
@@ -30,6 +30,7 @@ def bistability_map(
     method: AbstractStepper | None = None,
     t_max: float = 20.0,
     memory: float = 2e9,
+    max_steps: int = MOST_STEPS,
     progress: bool | None = None,
     resume: str | Path | None = None,
     **axes,
@@ -46,6 +47,7 @@ def bistability_map(
     - `method`: how to step, `EventExact()` unless given.
     - `t_max`: time after which a lane without a verdict is called undecided, in s.
     - `memory`: how much memory the lanes under way may take, in bytes.
+    - `max_steps`: steps after which a lane without a verdict is called a step failure.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
     - `resume`: a file in which finished lanes are kept while the map runs, every few seconds. If it exists, the map goes on
       from there: interrupted in whatever way and called again, the same call gives the same map, bit for bit. The file stays;
@@ -63,6 +65,7 @@ def bistability_map(
     """
     method = EventExact() if method is None else method
     _check_run(scene, method, t_max, memory)
+    arguments.whole_number("max_steps", max_steps, minimum=1)
     if not axes:
         raise ValueError(
             "A map needs at least one axis, such as `mu=np.linspace(0.05, 0.228, 64)`; the scene has: "
@@ -71,13 +74,14 @@ def bistability_map(
     axes = _checked_axes(scene, axes)
     shape = tuple(len(values) for values in axes.values())
     grid = np.meshgrid(*axes.values(), indexing="ij")
-    known, keep = _kept(resume, scene, method, t_max, axes)
+    known, keep = _kept(resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps)}, axes)
     outcome = run_to_verdict(
         scene,
         {name: values.ravel() for name, values in zip(axes, grid, strict=True)},
         method,
         t_max=t_max,
         memory=memory,
+        max_steps=max_steps,
         progress=progress,
         label="map",
         known=known,
@@ -261,7 +265,7 @@ def _widened(brackets: np.ndarray, by: float) -> np.ndarray:
     return brackets + width * np.array([-1.0, 1.0])
 
 
-def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, t_max: float, axes: dict[str, np.ndarray]):
+def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits: dict, axes: dict[str, np.ndarray]):
     """What an earlier run has left in the file, and how to keep more there."""
     if path is None:
         return None, None
@@ -272,7 +276,7 @@ def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, t_max:
         "device": jax.devices()[0].device_kind,
         "scene": describe(scene),
         "method": repr(method),
-        "t_max": float(t_max),
+        **limits,
         "axes": {name: values.tolist() for name, values in axes.items()},
         "results": list(Outcome._fields),
     }

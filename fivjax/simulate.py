@@ -12,13 +12,14 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
-from .contact import Mechanics, State
+from .contact import Mechanics, State, Status
 from .energy import Books, Energy
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
 from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
+from .verdict import ENDING, Ending
 
 
 class Trajectory(eqx.Module):
@@ -34,6 +35,12 @@ class Trajectory(eqx.Module):
     load: Float[Array, " T"]  # N
     scene: Scene
     energy: Energy | None = None  # the ledger, when asked for
+    outcome: Int[Array, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
+
+    @property
+    def meaning(self) -> str:
+        """How the trajectory ended, in a sentence."""
+        return ENDING[Ending(int(self.outcome))]
 
     @property
     def slip_velocity(self) -> Float[Array, " T"]:
@@ -62,7 +69,9 @@ class Trajectory(eqx.Module):
         )
         if self.energy is not None:
             dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
-        return labelled(dataset, self.scene)
+        return labelled(dataset, self.scene).assign_attrs(
+            outcome=Ending(int(self.outcome)).name.lower(), meaning=self.meaning
+        )
 
 
 @in_double_precision
@@ -88,7 +97,8 @@ def simulate(
     - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
-    being finite, or contact events come without end, the rows from there on are NaN.
+    being finite, or contact events come without end, the rows from there on are NaN; `run.outcome` (an `Ending`) and
+    `run.meaning` (a sentence) say which.
 
     **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
     equilibrium to start from, or friction beyond Painlevé's limit.
@@ -121,22 +131,40 @@ def _simulate(
     ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
 
     def to_next(carry, end):
-        t, y, contact, ledger = carry
+        t, y, contact, ledger, outcome = carry
         load = scene.load(0.5 * (t + end))
 
-        def enter(ledger, contact, y, after):
-            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+        def enter(total, contact, y, after):
+            ledger, events = total
+            # A rebound keeps its status; it ends on the belt all the same.
+            landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
+            events = events + (landed | (after.contact.status != contact.status))
+            if books is not None:
+                ledger = accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+            return ledger, events
 
-        y, contact, ledger, reached = advance_adding(method, mechanics, contact, load, y, end - t, most, ledger, enter)
+        total = ledger, jnp.zeros((), jnp.int32)
+        y, contact, (ledger, events), reached = advance_adding(
+            method, mechanics, contact, load, y, end - t, most, total, enter
+        )
+        failure = jnp.where(
+            ~jnp.all(jnp.isfinite(y)),
+            Ending.NOT_FINITE,
+            jnp.where(
+                reached, Ending.FINISHED, jnp.where(2 * events > most, Ending.TOO_MANY_EVENTS, Ending.STEP_FAILURE)
+            ),
+        )
+        outcome = jnp.where(outcome == Ending.FINISHED, failure, outcome).astype(jnp.int8)
         # A number that was not reached is no number; counts stay what they are.
         y, ledger = jax.tree.map(
             lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
         )
-        return (end, y, contact, ledger), (y, contact, ledger)
+        return (end, y, contact, ledger, outcome), (y, contact, ledger)
 
     contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
     ledger0 = None if books is None else accounts.open_ledger(books, y0)
-    _, (ys, contacts, ledgers) = jax.lax.scan(to_next, (saved[0], y0, contact0, ledger0), ends)
+    outcome0 = jnp.where(_solvable(mechanics), Ending.FINISHED, Ending.PAINLEVE).astype(jnp.int8)
+    carry, (ys, contacts, ledgers) = jax.lax.scan(to_next, (saved[0], y0, contact0, ledger0, outcome0), ends)
     rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
 
     def with_start(first, rest):
@@ -158,8 +186,15 @@ def _simulate(
         "normal_force": normal_force,
         "friction_force": friction_force,
         "load": load,
+        "outcome": carry[-1],
         "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
     }
+
+
+def _solvable(mechanics: Mechanics):
+    """Whether the contact problem has one solution in either direction of slip; for parameters that are not known before."""
+    static = mechanics.friction.static
+    return jnp.all(jnp.stack([mechanics.normal_compliance(side, static) > 0 for side in (-1.0, 1.0)]))
 
 
 def _initial_state(scene: Scene, y0) -> State:
