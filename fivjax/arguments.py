@@ -96,3 +96,9 @@ def describe(value) -> str:
     if isinstance(value, np.ndarray | jax.Array):
         return f"an array of {value.dtype} with shape {value.shape}"
     return f"of type {type(value).__name__}"
+
+
+def truth(name: str, value) -> None:
+    """Refuse what is not True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"Argument `{name}` must be True or False, but is {describe(value)}.")

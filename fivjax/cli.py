@@ -14,13 +14,15 @@ import jax
 import numpy as np
 import tyro
 
-from . import cea, plot, plot_energy, plot_linear
+from . import cea, plot, plot_calibration, plot_energy, plot_linear
+from .calibrate import calibrate
 from .event_exact import EventExact
 from .friction import Coulomb, ExponentialDecay
 from .load import Pulse
 from .maps import bistability_map
 from .results import check_writable, save, save_figure
 from .scene import Scene
+from .signals import read_recording
 from .simulate import simulate
 from .steppers import AbstractStepper
 from .structure import belt_oscillator
@@ -200,6 +202,61 @@ class Cea:
             print(f"  constant friction: {limit.outcome.value}")
 
 
+@dataclasses.dataclass(frozen=True)
+class Calibrate:
+    """Parameters from a recording, with uncertainties. Writes OUT.nc and OUT.png."""
+
+    recording: tyro.conf.Positional[Path]
+    """what was measured: .csv, .npy, .npz, .wav or .mat"""
+    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
+    """parameters to find, such as `mu c1 k1` or `mu,c1,k1`; all others are taken from the scene"""
+    regime: Literal["sliding", "kick", "limit cycle"] = "kick"
+    """what was recorded: a small motion about sliding, the response to the scene's kick, or a steady vibration"""
+    column: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=CHANNEL …")] = ()
+    """which column is which channel, such as `Acc_X=acceleration0`; by their names unless given"""
+    unit: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=UNIT …")] = ()
+    """units of columns, such as `t=ms Acc_X=g`; the file's own or SI unless given"""
+    time: str | None = None
+    """column of the time base; `t` or `time` unless given"""
+    rate: float | None = None
+    """sampling rate, where the file has no time base (Hz)"""
+    full_scale: float = 1.0
+    """what the largest sample of a .wav means, in the channel's unit"""
+    offset: tuple[float, float] | None = None
+    """kick: where the first sample may lie on the simulation's time (s), 0 to 0.5 unless given"""
+    bound: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW:HIGH …")] = ()
+    """bounds of free parameters, such as `mu=0.05:0.5`"""
+    starts: int = 8
+    """how many starts, the scene's own and others around it"""
+    out: Path = Path("calibration")
+    """files to write, without suffix"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+
+    def run(self) -> None:
+        data, picture = _outputs(self.out)
+        free = [name for text in self.free for name in text.split(",") if name]
+        columns, units = (dict(_pair(text, option) for text in texts) for texts, option in self._pairs())
+        recording = read_recording(
+            self.recording,
+            self.regime,
+            columns=columns or None,
+            time=self.time,
+            rate=self.rate,
+            units=units,
+            full_scale=self.full_scale,
+            offset=self.offset,
+        )
+        bounds = dict(_bound(text) for text in self.bound)
+        fit = calibrate(self.scene.scene(), recording, free, bounds, starts=self.starts)
+        save(fit.to_dataset(), data)
+        save_figure(plot_calibration.calibration(fit), picture)
+        _say(data, picture)
+        print(fit)
+
+    def _pairs(self):
+        return (self.column, "--column"), (self.unit, "--unit")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; sentences on standard error and an exit code that is not zero for what does not end well.
 
@@ -207,7 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     keep_compiled_code()
     command = tyro.extras.subcommand_cli_from_dict(
-        {"map": Map, "simulate": Simulate, "cea": Cea},
+        {"map": Map, "simulate": Simulate, "cea": Cea, "calibrate": Calibrate},
         prog="fivjax",
         description="Friction-induced vibration: what a scene does after a kick.",
         args=arguments,
@@ -275,6 +332,22 @@ def _axis(text: str) -> tuple[str, np.ndarray]:
     if points > 1 and not high > low:
         raise ValueError(f"Axis `{name}` must go up, but goes from {low:g} to {high:g}.")
     return name, np.linspace(low, high, points)
+
+
+def _pair(text: str, option: str) -> tuple[str, str]:
+    name, equals, meaning = text.partition("=")
+    if not (name and equals and meaning):
+        raise ValueError(f"Option `{option}` must read COLUMN=…, such as `t=ms`, but reads {text!r}.")
+    return name, meaning
+
+
+def _bound(text: str) -> tuple[str, tuple[float, float]]:
+    try:
+        name, values = text.split("=")
+        low, high = map(float, values.split(":"))
+    except ValueError:
+        raise ValueError(f"A bound must read NAME=LOW:HIGH, such as mu=0.05:0.5, but reads {text!r}.") from None
+    return name, (low, high)
 
 
 def _outputs(stem: Path) -> tuple[Path, Path]:

@@ -122,8 +122,7 @@ class Energy(eqx.Module):
     @property
     def exchanged(self) -> Float[Array, " T"]:
         """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
-        work = self.work
-        return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(self.impact)
+        return exchanged(self.ledger)
 
     def variables(self) -> dict[str, Float[Array, " T"]]:
         """The ledger's lines under the names that they have in a dataset."""
@@ -221,6 +220,12 @@ def residual(books: Books, ledger: Ledger, y: State) -> Float[Array, ""]:
     """Growth of mechanical energy that no line accounts for, in J: the error of the computation."""
     grown = mechanical_energy(books.structure, y) - ledger.start
     return grown - (ledger.work.mechanical - ledger.impact)
+
+
+def exchanged(ledger: Ledger) -> Float[Array, "..."]:
+    """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
+    work = ledger.work
+    return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(ledger.impact)
 
 
 def enter(

@@ -23,6 +23,7 @@ from tqdm.auto import tqdm
 from . import contact as physics
 from . import orbit as orbits
 from .contact import Contact, Mechanics, State
+from .energy import Books, Ledger, enter, exchanged, open_ledger, vibration_energy
 from .event_exact import EventExact
 from .interrupts import noted
 from .load import AbstractLoad
@@ -30,7 +31,7 @@ from .orbit import Orbit
 from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
-from .steppers import AbstractStepper
+from .steppers import AbstractStepper, Advance
 from .verdict import Verdict
 from .wedging import Wedge, sticks_forever, wedge
 
@@ -43,6 +44,21 @@ SIDE_BY_SIDE = 16
 COST_OF_STANDING_ALONE = 4
 # Looks at a lane's verdict while its time grows e-fold.
 LOOKS = 8
+# The longest advance that a ledger is asked to enter, s.
+LONGEST_ENTRY = 1.0
+# What a ledger leaves of a lane, see `energy`; `kick_energy` is that of the vibration when the kick ends.
+ENERGIES = (
+    "stick_work",
+    "slide_work",
+    "interface_work",
+    "damping_work",
+    "load_work",
+    "kick_work",
+    "impact_loss",
+    "kick_energy",
+    "energy_residual",
+    "energy_exchanged",
+)
 # Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
 SPAN_SHARE = 4
 # A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
@@ -65,6 +81,14 @@ class Lane(eqx.Module):
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
     verdict: Int[Array, ""]
+    account: "Account | None" = None  # where its energy went, when asked for
+
+
+class Account(eqx.Module):
+    """Where the energy of one lane went."""
+
+    ledger: Ledger
+    vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
 
 
 class Shared(eqx.Module):
@@ -84,9 +108,10 @@ class Outcome(NamedTuple):
     decided_at: np.ndarray  # s
     events: np.ndarray
     last_event: np.ndarray  # s
+    energy: dict[str, np.ndarray]  # lines of the ledger by name, J; empty where not asked for
 
 
-def begin(scene: Scene, modes: SlidingModes) -> Lane:
+def begin(scene: Scene, modes: SlidingModes, energy: bool) -> Lane:
     """A lane at the sliding equilibrium of its scene, just before anything happens."""
     mechanics = Mechanics(scene)
     q, _ = steady_sliding(scene, scene.load.force)
@@ -105,6 +130,7 @@ def begin(scene: Scene, modes: SlidingModes) -> Lane:
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
+        account=Account(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
     )
 
 
@@ -132,11 +158,14 @@ def follow(
     structure = scene.structure
     # The square roots of the diagonals make squares of displacements and velocities comparable energies.
     weights = jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
+    # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
+    longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
 
     def step(_, lane: Lane) -> Lane:
-        t = next_step_end(scene.load, lane.t, method.dt)
+        t = next_step_end(scene.load, lane.t, longest)
         load = scene.load(0.5 * (lane.t + t))
-        y, contact, h, peak = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
+        after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
+        y, contact, h, peak = after
         t = jnp.where(h >= t - lane.t, t, lane.t + h)
         changed = contact.status != lane.contact.status
         orbit = orbits.observe(
@@ -158,7 +187,16 @@ def follow(
             events=lane.events + changed,
             last_event=jnp.where(changed, t, lane.last_event),
             verdict=lane.verdict,
+            account=None if lane.account is None else entered(lane.account, lane, load, after, t),
         )
+
+    def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
+        ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
+        rest = modes.linear.equilibrium[: structure.size]
+        kick_ends = jnp.max(scene.load.jumps, initial=0.0)
+        just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
+        vibration = vibration_energy(structure, rest, after.y)
+        return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
     after = jax.lax.fori_loop(0, steps, step, lane)
     deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
@@ -202,11 +240,12 @@ def run_to_verdict(
     lingering: bool = False,
     known: Outcome | None = None,
     keep: Callable[[Outcome], None] | None = None,
+    energy: bool = False,
 ) -> Outcome:
     """Follow one lane for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
     `lingering` says that the lanes were chosen to lie so close to a boundary that they stay with an unstable cycle for
-    long: then an orbit has to return for longer before it counts.
+    long: then an orbit has to return for longer before it counts. `energy` asks for the ledger of each lane at its end.
 
     `known` is what an earlier run of the same lanes has finished; those are not run again. `keep` is handed everything that is
     finished, every few seconds and at the end.
@@ -216,7 +255,7 @@ def run_to_verdict(
     resolution = method.resolution
     if not lingering:
         resolution = eqx.tree_at(lambda r: r.span, resolution, np.asarray(resolution.span) // SPAN_SHARE)
-    stepper = in_bulk(method, scene)
+    stepper = method if energy else in_bulk(method, scene)
     total = len(next(iter(values.values())))
     outcome = Outcome(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
@@ -224,9 +263,10 @@ def run_to_verdict(
         decided_at=np.full(total, np.nan),
         events=np.zeros(total, np.int32),
         last_event=np.full(total, np.nan),
+        energy={name: np.full(total, np.nan) for name in ENERGIES} if energy else {},
     )
     if known is not None:
-        outcome = Outcome(*(np.array(field) for field in known))
+        outcome = jax.tree.map(np.array, known)
     already = int(np.sum(outcome.verdict != Verdict.NOT_RUN))
     bar = tqdm(
         total=total, initial=already, desc=label, unit="lane", disable=None if progress is None else not progress
@@ -304,7 +344,7 @@ def _run_block(
     shared = _shared(scene, method, names, distinct)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in history)], axis=-1)[:, 1:]
     with ThreadPoolExecutor(max_workers=_workers()) as pool:
-        start = lambda *a: _begin(scene, names, history, *a)  # noqa: E731
+        start = lambda *a: _begin(scene, names, history, bool(outcome.energy), *a)  # noqa: E731
         # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
         pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
         lanes = _in_tiles(start, shared, group[pending], (columns[pending],), width, pool)
@@ -336,6 +376,13 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     outcome.decided_at[index] = np.where(verdict >= 0, lanes.t, np.nan)
     outcome.events[index] = lanes.events
     outcome.last_event[index] = lanes.last_event
+    if lanes.account is not None:
+        ledger = lanes.account.ledger
+        lines = {**ledger.work.lines("work"), "impact_loss": ledger.impact, "energy_residual": ledger.worst}
+        lines["energy_exchanged"] = exchanged(ledger)
+        lines["kick_energy"] = lanes.account.vibration
+        for name, line in outcome.energy.items():
+            line[index] = lines[name]
     # Last, and in one go: a lane with a verdict is complete, whenever an interrupt comes.
     outcome.verdict[index] = verdict
 
@@ -362,10 +409,10 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
 
 
 @eqx.filter_jit
-def _begin(scene: Scene, names: tuple[str, ...], history: tuple[str, ...], shared: Shared, columns):
+def _begin(scene: Scene, names: tuple[str, ...], history: tuple[str, ...], energy: bool, shared: Shared, columns):
     def group(shared, columns):
         own = _with(scene, names, shared.values)
-        return jax.vmap(lambda row: begin(_with(own, history, row), shared.modes))(columns)
+        return jax.vmap(lambda row: begin(_with(own, history, row), shared.modes, energy))(columns)
 
     return jax.vmap(group)(shared, columns)
 

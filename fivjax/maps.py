@@ -33,6 +33,7 @@ def bistability_map(
     max_steps: int = MOST_STEPS,
     progress: bool | None = None,
     resume: str | Path | None = None,
+    energy: bool = False,
     **axes,
 ) -> xr.Dataset:
     """Where a scene returns to sliding after its kick, and where it ends on a limit cycle; one batch run.
@@ -52,6 +53,9 @@ def bistability_map(
     - `resume`: a file in which finished lanes are kept while the map runs, every few seconds. If it exists, the map goes on
       from there: interrupted in whatever way and called again, the same call gives the same map, bit for bit. The file stays;
       delete it when the map is saved.
+    - `energy`: whether to keep each lane's energy ledger up to its verdict (see `fivjax.energy`): the works, the energy
+      lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
+      error of the balance on the way, with `energy_exchanged` to measure it against. It makes a map some ten times slower.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
@@ -66,6 +70,7 @@ def bistability_map(
     method = EventExact() if method is None else method
     _check_run(scene, method, t_max, memory)
     arguments.whole_number("max_steps", max_steps, minimum=1)
+    arguments.truth("energy", energy)
     if not axes:
         raise ValueError(
             "A map needs at least one axis, such as `mu=np.linspace(0.05, 0.228, 64)`; the scene has: "
@@ -74,7 +79,9 @@ def bistability_map(
     axes = _checked_axes(scene, axes)
     shape = tuple(len(values) for values in axes.values())
     grid = np.meshgrid(*axes.values(), indexing="ij")
-    known, keep = _kept(resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps)}, axes)
+    known, keep = _kept(
+        resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}, axes
+    )
     outcome = run_to_verdict(
         scene,
         {name: values.ravel() for name, values in zip(axes, grid, strict=True)},
@@ -86,6 +93,7 @@ def bistability_map(
         label="map",
         known=known,
         keep=keep,
+        energy=bool(energy),
     )
     dataset = xr.Dataset(
         {
@@ -94,6 +102,7 @@ def bistability_map(
             "decided_at": (tuple(axes), outcome.decided_at.reshape(shape)),
             "contact_events": (tuple(axes), outcome.events.reshape(shape)),
             "last_event": (tuple(axes), outcome.last_event.reshape(shape)),
+            **{name: (tuple(axes), line.reshape(shape)) for name, line in outcome.energy.items()},
         },
         coords=axes,
     )
@@ -126,6 +135,7 @@ def critical_perturbation(
     t_max: float = 30.0,
     memory: float = 2e9,
     progress: bool | None = None,
+    energy: bool = False,
     **axis,
 ) -> xr.Dataset:
     """The smallest kick that leads to the limit cycle, along one or several axes; all lanes bracketed in batch.
@@ -143,16 +153,21 @@ def critical_perturbation(
     - `p_range`, `p_step`: where to look, and how finely.
     - `tolerance`: the width of the bracket at which to stop.
     - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
+    - `energy`: whether to add the energies of the critical kick.
 
     **Returns:** a dataset over the axes with `p_crit` (middle of the bracket), `p_crit_low` and `p_crit_high` (proved to
     slide, proved to end on a limit cycle), `p_crit_error` (half the bracket plus the change of `p_crit` from a step twice
     as long to the method's), `crossings` and `only_crossing`. Where no change lies in the range, `p_crit` is NaN, except
     that it is the lower end of the range where the limit cycle is reached from there on.
 
+    With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J: what the sliding
+    state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
+
     **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
     """
     method = EventExact() if method is None else method
     _check_run(scene, method, t_max, memory)
+    arguments.truth("energy", energy)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
     if "p" in axis:
         raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
@@ -174,7 +189,7 @@ def critical_perturbation(
 
     run = functools.partial(run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress)
     scan = np.linspace(low, high, round((high - low) / p_step) + 1)
-    verdicts = _verdicts(run, method, columns, np.tile(scan, (len(columns[next(iter(columns))]), 1)), "scan").verdict
+    verdicts = _verdicts(run, method, columns, np.tile(scan, (len(columns[next(iter(columns))]), 1)), "scan")
     bracket, changes = _first_crossing(scan, verdicts)
     fine = _narrowed(run, method, columns, bracket, tolerance)
     if isinstance(method, WhereSwitched):
@@ -199,21 +214,42 @@ def critical_perturbation(
         },
         coords=axes,
     )
+    if energy:
+        for name, values in _energies_of_the_kick(run, method, scene, {**columns, "p": p_crit}).items():
+            dataset[name] = (tuple(axes), values.reshape(shape))
     _add_linear_limit(dataset, scene)
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
     return labelled(dataset, scene, method=describe_method(method), t_max=t_max, tolerance=tolerance, p_step=p_step)
+
+
+def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The vibration's energy at the end of each lane's kick, and the work that the kick did on the way."""
+    known = np.flatnonzero(np.isfinite(columns["p"]))
+    start, duration = (np.asarray(columns.get(name, scene.parameters[name])) for name in ("start", "duration"))
+    energies = {name: np.full(len(columns["p"]), np.nan) for name in ("critical_energy", "kick_work")}
+    if len(known):
+        outcome = run(
+            values={name: column[known] for name, column in columns.items()},
+            method=method,
+            t_max=float(np.max(start + duration)),
+            label="energy",
+            energy=True,
+        )
+        energies["critical_energy"][known] = outcome.energy["kick_energy"]
+        energies["kick_work"][known] = outcome.energy["kick_work"]
+    return energies
 
 
 # Points inside a bracket that are tried at once: more of them means fewer rounds, and the rounds are what takes time.
 POINTS_PER_ROUND = 15
 
 
-def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> Outcome:
+def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> np.ndarray:
     """Verdicts for every lane (rows) at its own values of p (columns)."""
     lanes, points = p.shape
     values = {name: np.repeat(column, points) for name, column in columns.items()}
     outcome = run(values={**values, "p": p.ravel()}, method=method, label=label, lingering=label != "scan")
-    return Outcome(*(field.reshape(lanes, points) for field in outcome))
+    return outcome.verdict.reshape(lanes, points)
 
 
 def _first_crossing(scan: np.ndarray, verdicts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -246,7 +282,7 @@ def _narrowed(run, method, columns, brackets: np.ndarray, tolerance: float) -> n
         shares = np.linspace(0, 1, POINTS_PER_ROUND + 2)
         p = brackets[open_, :1] + shares * np.diff(brackets[open_])
         chosen = {name: column[open_] for name, column in columns.items()}
-        inner = _verdicts(run, method, chosen, p[:, 1:-1], f"narrowing {round_}").verdict
+        inner = _verdicts(run, method, chosen, p[:, 1:-1], f"narrowing {round_}")
         still = []
         for row, lane in enumerate(open_):
             # The ends carry the verdicts that made them ends.
@@ -278,11 +314,17 @@ def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits
         "method": repr(method),
         **limits,
         "axes": {name: values.tolist() for name, values in axes.items()},
-        "results": list(Outcome._fields),
     }
     found = checkpoint.recall(path, run)
-    known = None if found is None else Outcome(**found)
-    return known, lambda outcome: checkpoint.keep(path, run, outcome._asdict())
+    if found is not None:
+        parts = {name: found.pop(name) for name in Outcome._fields if name != "energy"}
+        found = Outcome(**parts, energy=found)
+
+    def keep(outcome: Outcome) -> None:
+        parts = outcome._asdict()
+        checkpoint.keep(path, run, {**parts.pop("energy"), **parts})
+
+    return found, keep
 
 
 def _add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:

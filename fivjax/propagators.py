@@ -71,7 +71,8 @@ class Windowed(eqx.Module):
         interval = _stage(lambda: _safe_intervals(samples, steps), none.astype(jnp.int32))
         there = _stage(lambda: samples.state_at(interval), [none] * 2 * n)
         series = _Series(prepared.series @ _stacked(mechanics, contact, load, there), n, mechanics.tangential)
-        brackets = _stage(series.brackets, [_no_bracket(none)] * 3)
+        inside = interval < INTERVALS
+        brackets = _dipped(series, _stage(lambda: series.brackets(inside), [_no_bracket(none)] * 3))
         roots = _polished(series, brackets)
         no = none > 0
         share, fires = _stage(lambda: _first_root(brackets, roots, steps, interval), (none, [no] * 3))
@@ -259,9 +260,10 @@ class _Series(eqx.Module):
         path = self.paths[self.tangential]
         return [*_cut(self.rows, 2, ORDER + 1, 0), [-(k + 1) * path[k + 1] for k in range(ORDER + 1)]]
 
-    def brackets(self) -> list["_Bracket"]:
+    def brackets(self, inside: Bool[Array, ""]) -> list["_Bracket"]:
+        """Of each watched polynomial; at the end of the window, not `inside` an interval, there is nothing to look for."""
         first, second, falling = self.watched
-        return [_bracket(first, True), _bracket(second, True), _bracket(falling, falling[0] > 0)]
+        return [_bracket(first, inside), _bracket(second, inside), _bracket(falling, inside & (falling[0] > 0))]
 
     def state(self, x: Float[Array, ""]) -> list[Float[Array, ""]]:
         """Displacements, and velocities in m per interval."""
@@ -318,16 +320,18 @@ class _Bracket(eqx.Module):
 
     guess: Float[Array, ""]
     zeros: Int[Array, ""]  # roots at the very start, not meant
+    end: Float[Array, ""]  # where it is no longer positive, if it crosses
     crosses: Bool[Array, ""]
     spent: Bool[Array, ""]  # negative from the start
+    dips: Bool[Array, ""]  # positive at both ends, perhaps not in between
 
 
 def _no_bracket(like: Float[Array, ""]) -> _Bracket:
     no = like > like
-    return _Bracket(like, jnp.zeros_like(like, jnp.int32), no, no)
+    return _Bracket(like, jnp.zeros_like(like, jnp.int32), like, no, no, no)
 
 
-def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""] | bool) -> _Bracket:
+def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""]) -> _Bracket:
     zeros, lead = _start(c)
     end = sum((jnp.where(zeros > k, 0.0, c[k]) for k in range(3)), sum(c[3:]))
     spent = watch & (lead < 0)
@@ -341,7 +345,42 @@ def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""] | bool) -> _Brack
     below = jnp.where(rises, bend, half)
     guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
     guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
-    return _Bracket(guess, zeros, crosses, spent)
+    lowest = lead - slope**2 / (4 * jnp.where(bend > 0, bend, 1.0))
+    # With allowance for what is not parabolic.
+    dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0) & (lowest <= 0.1 * bend)
+    return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+
+
+def _dipped(series: _Series, brackets: list[_Bracket]) -> list[_Bracket]:
+    """The brackets of polynomials that seemed to dip below zero, decided at their lowest points; seldom run at all."""
+
+    def decided(brackets: list[_Bracket]) -> list[_Bracket]:
+        return [_decided(c, b) for c, b in zip(series.watched, brackets, strict=True)]
+
+    def any_dips(brackets: list[_Bracket]) -> Bool[Array, ""]:
+        return brackets[0].dips | brackets[1].dips
+
+    return jax.lax.while_loop(any_dips, decided, brackets)
+
+
+def _decided(c: list[Float[Array, ""]], bracket: _Bracket) -> _Bracket:
+    slopes = [k * ck for k, ck in enumerate(c)][1:]
+
+    def nearer(_, x):
+        slope, bend = _value_and_slope(slopes, x)
+        return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
+
+    # Newton's method: within an interval a slope is all but a straight line.
+    lowest = jax.lax.fori_loop(0, 6, nearer, jnp.full_like(bracket.end, 0.5))
+    below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
+    return _Bracket(
+        guess=jnp.where(below, 0.5 * lowest, bracket.guess),
+        zeros=bracket.zeros,
+        end=jnp.where(below, lowest, bracket.end),
+        crosses=bracket.crosses | below,
+        spent=bracket.spent,
+        dips=jnp.zeros_like(bracket.dips),
+    )
 
 
 def _polished(series: _Series, brackets: list[_Bracket]) -> list[Float[Array, ""]]:
@@ -358,7 +397,7 @@ def _polished(series: _Series, brackets: list[_Bracket]) -> list[Float[Array, ""
         after = [_newton(c, bracket.zeros, *lane) for c, bracket, *lane in own]
         return (*map(list, zip(*after, strict=True)), count + 1)
 
-    start = [none] * 3, [none + 1] * 3, [b.guess for b in brackets], [b.crosses for b in brackets]
+    start = [none] * 3, [b.end for b in brackets], [b.guess for b in brackets], [b.crosses for b in brackets]
     _, _, roots, _, _ = jax.lax.while_loop(going, newton, (*start, jnp.zeros((), jnp.int32)))
     return roots
 

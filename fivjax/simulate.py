@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
-from .contact import Mechanics, State, Status
-from .energy import Books, Energy
+from .contact import Contact, Mechanics, State, Status
+from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding, rates
 from .verdict import ENDING, Ending
 
 
@@ -108,16 +108,49 @@ def simulate(
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
-    if not isinstance(energy, bool | np.bool_):
-        raise TypeError(f"Argument `energy` must be True or False, but is {arguments.describe(energy)}.")
+    arguments.truth("energy", energy)
     _refuse_painleve(scene)
-    y0 = _initial_state(scene, y0)
+    y0 = start_state(scene, y0)
     rows = math.ceil(t1 / dt_save - 1e-9)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    rows = _simulate(scene, method, y0, saved, most, bool(energy))
-    return Trajectory(**jax.tree.map(known_to_numpy, rows), scene=scene)
+    rows = jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most, bool(energy)))
+    return Trajectory(**rows, scene=scene, outcome=_ending(scene, method, rows, most))
+
+
+def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:
+    """How the rows end: an `Ending`. Under a transformation, where no one can look, every failure is not finite."""
+    finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
+    if not is_known(finite):
+        return jnp.where(jnp.all(finite), Ending.FINISHED, Ending.NOT_FINITE).astype(jnp.int8)
+    if np.all(finite):
+        return np.int8(Ending.FINISHED)
+    first = int(np.argmin(finite))
+    if first == 0:
+        return np.int8(Ending.NOT_FINITE)
+    start = jnp.concatenate([rows["displacement"][first - 1], rows["velocity"][first - 1]])
+    events, reached = _events_from(scene, method, real(rows["t"][first - 1]), start, most)
+    if not np.all(np.isfinite(reached)):
+        return np.int8(Ending.NOT_FINITE)
+    return np.int8(Ending.TOO_MANY_EVENTS if 2 * int(events) > most else Ending.STEP_FAILURE)
+
+
+@eqx.filter_jit
+def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: int):
+    """How many of the next `most` advances end in an event, and the state after them."""
+    mechanics = Mechanics(scene)
+
+    def body(_, carry):
+        y, contact, events = carry
+        after = method.advance(mechanics, contact, scene.load(t), y, jnp.asarray(method.dt, y.dtype))
+        # A rebound keeps its status; it ends on the belt all the same.
+        landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
+        return after.y, after.contact, events + (landed | (after.contact.status != contact.status))
+
+    contact = physics.status_from_forces(mechanics, scene.load(t), y)
+    y, _, events = jax.lax.fori_loop(0, most, body, (y, contact, jnp.zeros((), jnp.int32)))
+    return events, y
 
 
 @eqx.filter_jit
@@ -126,52 +159,7 @@ def _simulate(
 ) -> dict:
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
-    # Steps end on the load's jumps as well as on the saved instants.
-    jumps = jnp.clip(scene.load.jumps, saved[0], saved[-1])
-    ends = jnp.sort(jnp.concatenate([saved[1:], jumps]))
-
-    def to_next(carry, end):
-        t, y, contact, ledger, outcome = carry
-        load = scene.load(0.5 * (t + end))
-
-        def enter(total, contact, y, after):
-            ledger, events = total
-            # A rebound keeps its status; it ends on the belt all the same.
-            landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
-            events = events + (landed | (after.contact.status != contact.status))
-            if books is not None:
-                ledger = accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
-            return ledger, events
-
-        total = ledger, jnp.zeros((), jnp.int32)
-        y, contact, (ledger, events), reached = advance_adding(
-            method, mechanics, contact, load, y, end - t, most, total, enter
-        )
-        failure = jnp.where(
-            ~jnp.all(jnp.isfinite(y)),
-            Ending.NOT_FINITE,
-            jnp.where(
-                reached, Ending.FINISHED, jnp.where(2 * events > most, Ending.TOO_MANY_EVENTS, Ending.STEP_FAILURE)
-            ),
-        )
-        outcome = jnp.where(outcome == Ending.FINISHED, failure, outcome).astype(jnp.int8)
-        # A number that was not reached is no number; counts stay what they are.
-        y, ledger = jax.tree.map(
-            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
-        )
-        return (end, y, contact, ledger, outcome), (y, contact, ledger)
-
-    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (saved[0] + ends[0])), y0)
-    ledger0 = None if books is None else accounts.open_ledger(books, y0)
-    outcome0 = jnp.where(_solvable(mechanics), Ending.FINISHED, Ending.PAINLEVE).astype(jnp.int8)
-    carry, (ys, contacts, ledgers) = jax.lax.scan(to_next, (saved[0], y0, contact0, ledger0, outcome0), ends)
-    rows = jnp.searchsorted(ends, saved[1:], side="right") - 1
-
-    def with_start(first, rest):
-        return jnp.concatenate([first[None], rest[rows]])
-
-    y = with_start(y0, ys)
-    contacts, ledgers = jax.tree.map(with_start, (contact0, ledger0), (contacts, ledgers))
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books)
     load = jax.vmap(scene.load)(saved)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
@@ -186,18 +174,67 @@ def _simulate(
         "normal_force": normal_force,
         "friction_force": friction_force,
         "load": load,
-        "outcome": carry[-1],
         "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
     }
 
 
-def _solvable(mechanics: Mechanics):
-    """Whether the contact problem has one solution in either direction of slip; for parameters that are not known before."""
-    static = mechanics.friction.static
-    return jnp.all(jnp.stack([mechanics.normal_compliance(side, static) > 0 for side in (-1.0, 1.0)]))
+def states_at(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    instants: Float[Array, " T"],
+    most: int,
+    books: Books | None = None,
+) -> tuple[Float[Array, "T 2n"], Contact, Ledger | None]:
+    """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
+    where `most` advances between two of them were not enough.
+
+    Differentiable in both modes, in the instants and in the load's jumps too. In reverse mode only the states at the
+    instants are kept; what lies between is computed again.
+    """
+    mechanics = Mechanics(scene)
+    # Steps end on the load's jumps as well as on the instants.
+    jumps = scene.load.jumps
+    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
+    # A jump outside has no share in the derivative, one exactly on an end has its full one, which `clip` would halve.
+    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
+    ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
+
+    def to_next(carry, end):
+        t, y, contact, ledger = carry
+        h = end - t
+        load = scene.load(0.5 * (t + end))
+        # A jump that falls on an instant leaves no time between them, but either may move: what happens in between is
+        # the motion under the load just before the jump.
+        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
+        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+
+        def enter(ledger, contact, y, after):
+            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+
+        moved, following, ledger, reached = advance_adding(method, mechanics, contact, load, y, h, most, ledger, enter)
+        # A number that was not reached is no number; counts stay what they are.
+        moved, ledger = jax.tree.map(
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
+        )
+        y = jnp.where(h > 0, moved, y + drift)
+        return (end, y, following, ledger), (y, following, ledger)
+
+    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
+    ledger0 = None if books is None else accounts.open_ledger(books, y0)
+    # Inside a scan nothing can be merged across the checkpoint anyway.
+    step = jax.checkpoint(to_next, prevent_cse=False)
+    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
+    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    return jax.tree.map(with_start, (y0, contact0, ledger0), after)
 
 
-def _initial_state(scene: Scene, y0) -> State:
+def start_state(scene: Scene, y0) -> State:
+    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
     n, normal = scene.structure.size, scene.structure.normal
     if y0 is None:
         if is_known(scene.belt_speed):

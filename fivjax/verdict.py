@@ -23,7 +23,6 @@ class Ending(enum.IntEnum):
 
     FINISHED = 0
     NOT_FINITE = Verdict.NOT_FINITE
-    PAINLEVE = Verdict.PAINLEVE
     TOO_MANY_EVENTS = Verdict.TOO_MANY_EVENTS
     STEP_FAILURE = Verdict.STEP_FAILURE
 
@@ -48,7 +47,6 @@ ENDING = {
     Ending.FINISHED: "reached its end",
     Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
     "parameters",
-    Ending.PAINLEVE: MEANING[Verdict.PAINLEVE],
     Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
     "change the restitution or the belt speed a little",
     Ending.STEP_FAILURE: "the fastest vibration needs too many steps between two saved rows, and the rows from there on are "

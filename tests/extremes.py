@@ -1,10 +1,6 @@
 """Lanes drawn over the ranges that fivjax claims to handle, and what an independent solver says of one of them."""
 
-import json
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import oracle

@@ -70,13 +70,14 @@ def test_an_interrupt_inside_a_record_makes_no_lane_look_finished():
 
     class Unreadable:
         verdict = np.array([1])
+        account = None
 
         @property
         def orbit(self):
             raise KeyboardInterrupt
 
     outcome = lanes.Outcome(
-        np.full(1, fj.Verdict.NOT_RUN, np.int8), np.ones(1), np.ones(1), np.ones(1, np.int32), np.ones(1)
+        np.full(1, fj.Verdict.NOT_RUN, np.int8), np.ones(1), np.ones(1), np.ones(1, np.int32), np.ones(1), {}
     )
     with pytest.raises(KeyboardInterrupt):
         lanes._record(outcome, np.array([0]), Unreadable())

@@ -698,3 +698,36 @@ def test_the_command_line_writes_the_ledger(tmp_path, capsys):
         assert dataset["impact_loss"].attrs["units"] == "J"
     assert (tmp_path / "response_energy.png").read_bytes().startswith(b"\x89PNG")
     assert "response_energy.png" in capsys.readouterr().out
+
+
+def test_a_map_keeps_the_ledger_of_each_lane(paper_scene):
+    """Against the ledger of single runs, which are tested against the oracle; the residual is an error meter per lane."""
+    m = fj.bistability_map(paper_scene, p=[1.1, 1.3], energy=True, progress=False)
+    assert m["verdict"].values.tolist() == [0, 1]
+    assert (m["energy_residual"] <= 1e-12 * m["energy_exchanged"]).all()
+    for p in (1.1, 1.3):
+        scene, lane = paper_scene.replace(p=p), m.sel(p=p)
+        end = fj.simulate(scene, t1=float(scene.load.duration), dt_save=0.05, energy=True)
+        after = np.concatenate([end.displacement[-1], end.velocity[-1]])
+        vibration = accounts.vibration_energy(scene.structure, fj.sliding_equilibrium(scene), after)
+        np.testing.assert_allclose(lane["kick_energy"], vibration, rtol=1e-10)
+        np.testing.assert_allclose(lane["kick_work"], end.energy.work.kick[-1], rtol=1e-10)
+        assert m["kick_energy"].attrs["units"] == "J"
+    plain = fj.bistability_map(paper_scene, p=[1.1, 1.3], progress=False)
+    assert plain["verdict"].equals(m["verdict"]) and "energy_residual" not in plain
+
+
+def test_the_critical_energy_is_what_the_kick_leaves_at_p_crit(paper_scene):
+    """At the end of the critical kick: 36.08 mJ of vibration at 3 m/s, though the load has taken 0.55 mJ out."""
+    table = fj.critical_perturbation(
+        paper_scene, belt_speed=[3.0], p_range=(1.15, 1.25), p_step=0.05, tolerance=1e-4, energy=True, progress=False
+    )
+    p_crit = float(table["p_crit"][0])
+    end = fj.simulate(paper_scene.replace(p=p_crit), t1=0.1, dt_save=0.05, energy=True)
+    after = np.concatenate([end.displacement[-1], end.velocity[-1]])
+    rest = fj.sliding_equilibrium(paper_scene)
+    np.testing.assert_allclose(
+        table["critical_energy"][0], accounts.vibration_energy(paper_scene.structure, rest, after), rtol=1e-9
+    )
+    assert table["critical_energy"][0] == pytest.approx(36.08e-3, rel=1e-3)
+    assert table["kick_work"][0] == pytest.approx(-0.55e-3, rel=0.02)

@@ -1,0 +1,237 @@
+r"""Derivatives of what a scene does, with word of whether they exist.
+
+Through contact they are exact: event times are differentiated implicitly and the state jumps as it should (`EventExact`).
+They do not exist everywhere, though. Where the contact only just touches, lifts or slips, a parameter's next digit means
+another sequence of events; there the state has no derivative, or one that holds on one side alone. So `derivatives` also
+follows the trajectory's guards and says how close it comes to that.
+
+At an event a guard $g$ crosses zero with slope $\dot g$; it would turn back at a depth of $\dot g^2 / (2 |\ddot g|)$ (to
+second order). Between events it may come down to a smallest value and recover. Both, relative to the largest size of that
+guard on the trajectory, say how far the event is from vanishing, or a new one from appearing.
+"""
+
+from collections.abc import Callable, Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from . import arguments
+from . import contact as physics
+from .contact import Contact, Mechanics, Status
+from .event_exact import EventExact
+from .precision import in_double_precision, known_to_numpy
+from .scene import Scene
+from .simulate import Trajectory, simulate, start_state
+from .steppers import AbstractStepper, rates
+
+# Looks at the guards within one advance; between two of them a guard is told from its derivatives.
+LOOKS = 32
+GUARDS = {
+    (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
+    (Status.STICK, 1): "the friction force reaching the other edge of the friction cone",
+    (Status.SLIDE, 0): "the contact losing its normal force",
+    (Status.SLIDE, 1): "the slip running out",
+    (Status.DETACH, 0): "the gap closing",
+}
+
+
+class Derivatives(eqx.Module):
+    """A functional of a trajectory, its derivatives, and how far they are from not existing."""
+
+    value: Array
+    by_name: dict[str, Array]  # of the functional's shape, per unit of the parameter
+    events: int  # contact events on the trajectory
+    closest: float  # smallest distance from another sequence of events, relative; infinite without any
+    closest_at: float  # when, s
+    closest_event: str = eqx.field(static=True)
+    exist: bool = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Array:
+        return self.by_name[name]
+
+    @property
+    def reason(self) -> str:
+        """Why the derivatives exist or do not, as a sentence."""
+        if not np.isfinite(self.closest):
+            return "The derivatives exist: no contact event comes anywhere near."
+        where = (
+            f"{self.closest_event} at t = {self.closest_at:.6g} s, {self.closest:.1e} of its range away from changing"
+        )
+        if self.exist:
+            return f"The derivatives exist. The closest call is {where}."
+        return f"No derivative can be relied on: {where}, the sequence of events is about to be another."
+
+
+@in_double_precision
+def derivatives(
+    functional: Callable[[Trajectory], Array],
+    scene: Scene,
+    wrt: Iterable[str],
+    t1: float = 2.0,
+    dt_save: float = 1e-4,
+    *,
+    y0=None,
+    mode: str = "forward",
+    method: AbstractStepper | None = None,
+    margin: float = 1e-6,
+) -> Derivatives:
+    """Derivatives of a functional of a trajectory in parameters of the scene, and whether they exist.
+
+        d = fj.derivatives(lambda run: run.velocity[-1, 0], scene, ["mu", "k1"], t1=0.5)
+        d["mu"], d.exist, d.reason
+
+    **Arguments:**
+
+    - `functional`: a smooth function of a `Trajectory`, in `jax.numpy`. A peak, an energy or a line of the spectrum will do.
+      Sums of *accelerations* over saved instants have no derivative where these jump; use differences of velocities.
+    - `wrt`: names of parameters, any of `scene.parameters`. `start` at 0 has a derivative to later times only.
+    - `t1`, `dt_save`, `y0`, `method`: as in `simulate`. With `WhereSwitched` the derivatives are those of its steps, which
+      are wrong after contact events.
+    - `mode`: "forward" (best up to some ten parameters) or "reverse" (memory for the saved states only).
+    - `margin`: the smallest relative distance from another sequence of events at which a derivative is said to exist.
+
+    **Returns:** `Derivatives`.
+
+    **Raises:** `ValueError` or `TypeError`, as a sentence, for an unknown name, and whatever `simulate` refuses.
+    """
+    arguments.instance("scene", scene, Scene, "a Scene")
+    if not callable(functional):
+        raise TypeError(
+            f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."
+        )
+    if isinstance(wrt, str):
+        raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
+    names = tuple(wrt)
+    unknown = [name for name in names if name not in scene.parameters]
+    if unknown or not names:
+        raise ValueError(
+            f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
+            f"{', '.join(sorted(scene.parameters))}."
+        )
+    arguments.one_of("mode", mode, ("forward", "reverse"))
+    arguments.real_number("margin", margin, minimum=0)
+    arguments.real_number("t1", t1, above=0)
+    arguments.real_number("dt_save", dt_save, above=0)
+    method = EventExact() if method is None else method
+    arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    begin = start_state(scene, y0)
+    value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), y0, mode, method)
+    calls = _closest_call(scene, method, begin, float(t1))
+    return Derivatives(
+        value=jax.tree.map(known_to_numpy, value),
+        by_name={name: jax.tree.map(known_to_numpy, found) for name, found in by_name.items()},
+        events=calls.events,
+        closest=calls.closest,
+        closest_at=calls.at,
+        closest_event=calls.event,
+        exist=bool(calls.closest > margin),
+    )
+
+
+@eqx.filter_jit
+def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
+    def of(values):
+        value = functional(simulate(scene.replace(**values), t1, dt_save, method, y0=y0))
+        return value, value
+
+    jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
+    found, value = jacobian(of, has_aux=True)({name: scene.parameters[name] for name in names})
+    # A functional of several numbers has the parameters innermost.
+    return value, {name: _of_parameter(found, name) for name in names}
+
+
+def _of_parameter(found, name: str):
+    return jax.tree.map(lambda leaf: leaf[name], found, is_leaf=lambda node: isinstance(node, dict))
+
+
+class _Calls(eqx.Module):
+    """The closest call of a trajectory."""
+
+    events: int
+    closest: float
+    at: float
+    event: str
+
+
+def _closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> _Calls:
+    """Follow the trajectory advance by advance and look at the guards of each."""
+    mechanics = Mechanics(scene)
+    jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
+    ends = [*jumps, t1]
+    y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
+    largest: dict = {}
+    calls, events = [], 0
+    for end in ends:
+        load = scene.load(jnp.asarray(0.5 * (t + end)))
+        while t < end:
+            look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
+            status = int(contact.status)
+            normal = scene.structure.normal
+            # Detached before and after, but put on the belt in between: a rebound.
+            bounced = status == Status.DETACH == int(look.contact.status) and look.y[normal] == 0
+            fired = status != int(look.contact.status) or bool(look.turned) or bounced
+            relevant = range(1 if status == Status.DETACH else 2)
+            for which in relevant:
+                guard, key = look.guards[:, which], (status, which)
+                largest[key] = max(largest.get(key, 0.0), float(np.abs(guard).max()))
+                turns = np.flatnonzero(look.turns[:, which])
+                calls += [(key, float(look.lowest[i, which]), t + float(look.h) * i / LOOKS) for i in turns]
+            if fired:
+                # What ran out is the guard that is nearest to zero at the end, in units of its size.
+                which = min(relevant, key=lambda k: abs(look.guards[-1, k]) / max(largest[status, k], 1e-300))
+                depth = float(look.slope[which] ** 2 / (2 * max(abs(look.bend[which]), 1e-300)))
+                calls.append(((status, which), depth, t + float(look.h)))
+                events += 1
+            t = end if look.h >= end - t else t + float(look.h)
+            y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
+            if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not fired):
+                return _Calls(events, 0.0, t, "the motion stopping to be finite")
+    closest = [(value / max(largest[key], 1e-300), at, GUARDS[Status(key[0]), key[1]]) for key, value, at in calls]
+    return _Calls(events, *min(closest, default=(float("inf"), float("nan"), "none")))
+
+
+class _Look(eqx.Module):
+    """One advance, and its guards at even instants of it."""
+
+    y: Float[Array, " 2n"]
+    contact: Contact
+    h: Float[Array, ""]
+    turned: Array  # whether it slides the other way now
+    guards: Float[Array, "l 2"]
+    turns: Bool[Array, "l 2"]  # whether the guard has its smallest value about this look, and recovers
+    lowest: Float[Array, "l 2"]  # that value
+    slope: Float[Array, "2"]  # of the guards at the end, per s, and per s²
+    bend: Float[Array, "2"]
+
+
+@eqx.filter_jit
+def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
+    after = method.advance(mechanics, contact, load, y, h)
+    # Just short of the end the status is still the same.
+    shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
+    inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
+    states = jnp.concatenate([y[None], inside])
+
+    def along(function):
+        return lambda state: jax.jvp(function, (state,), (rates(mechanics, contact, load, state),))[1]
+
+    orders = [lambda state: physics.guards(mechanics, contact, load, state)]
+    for _ in range(3):
+        orders.append(along(orders[-1]))
+    value, slope, bend, third = (jax.vmap(order)(states) for order in orders)
+    # Where the slope comes to zero, by the parabola; half a look to either side, but not beyond the ends.
+    to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
+    spacing = after.h / LOOKS
+    near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
+    look = jnp.arange(LOOKS + 1)[:, None]
+    near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
+    # A guard that begins at zero, because the status has just begun there, does not turn at its own start.
+    begins = jnp.abs(value[0]) <= 1e-9 * jnp.max(jnp.abs(value), axis=0)
+    near = near & ~(begins & (look <= 1))
+    lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
+    turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
+    turned = turned & (after.contact.status == Status.SLIDE)
+    return _Look(after.y, after.contact, after.h, turned, value, near, lowest, slope[-1], bend[-1])

@@ -1,0 +1,386 @@
+r"""How far a scene is from a recording: residuals in units of the measuring noise, for each regime.
+
+| regime | far from the answer (`coarse`) | near it (`residual`) |
+|---|---|---|
+| sliding | poles and shapes in the characteristic equation | waveform, the initial state eliminated |
+| kick | the same, where the recording ends in a small motion | waveform of the whole response, through every event |
+| limit cycle | frequency and fundamentals | harmonics, fractions of time |
+
+The coarse residuals put measured poles into the scene's own characteristic equation. That equation is linear in springs
+and dampers, so there is no neighbouring period to fall into. The waveform is compared over windows that grow.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from . import features
+from .contact import Mechanics, Status
+from .load import ConstantLoad
+from .scene import Scene, steady_sliding
+from .signals import Averaged, Channel, Recording
+from .simulate import states_at
+from .sliding import linear_sliding
+from .steppers import MOST_ADVANCES, AbstractStepper
+
+# What stands for a motion that is not finite: bad enough never to be chosen, small enough to square.
+HOPELESS = 1e6
+# Errors that coarse residuals are measured in: shapes are known to some per cent, poles ten times better.
+COARSE_SHAPE = 0.03
+COARSE_POLE = 3e-3
+# A kick's time offset is moved in units of this, in s.
+OFFSET_UNIT = 1e-3
+# From its first, arbitrary state a limit cycle is followed for so many periods before it is looked at, and then for these.
+SETTLING_PERIODS = 80
+CYCLE_PERIODS = 30
+MOST_HARMONICS = 8
+
+
+class AbstractMisfit(eqx.Module):
+    """One recording beside the scene it is to be explained by. Times are s after the recording's first sample."""
+
+    # Standard deviations of the block means, by channel.
+    sigma: eqx.AbstractVar[Float[Array, " k"]]
+    known: eqx.AbstractVar[dict[str, Array]]
+    # Numbers that the residual fits on its own, beside the parameters.
+    fitted_by_elimination: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def coarse(self, scene: Scene) -> Float[Array, " c"]:
+        """Residuals that lead to the right period from afar; may be empty."""
+
+    @abc.abstractmethod
+    def residual(
+        self, scene: Scene, offset: Float[Array, ""], share: Float[Array, ""]
+    ) -> tuple[Float[Array, " r"], Float[Array, "B k"]]:
+        """Residuals over the first `share` of the recording, in standard deviations of the noise, and the block means that
+        the scene gives; NaN where it gives none."""
+
+
+class SlidingMisfit(AbstractMisfit):
+    """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
+    found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+
+    edges: Float[Array, " B+1"]
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    poles: Complex[Array, " j"]
+    shapes: Complex[Array, "j k"]
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    fitted_by_elimination: int = eqx.field(static=True)
+
+    def coarse(self, scene):
+        return _characteristic(scene.replace(**self.known), self.poles, self.shapes, self.channels)
+
+    def residual(self, scene, offset, share):
+        weight = _window(self.edges, share)[:, None] / self.sigma
+        waves, target = self._waves(scene), weight * self.means
+        q, r = jnp.linalg.qr((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
+        target = target.ravel()
+        amplitudes = jax.scipy.linalg.solve_triangular(r, q.T @ target)
+        return _finite(target - q @ (q.T @ target)), waves @ amplitudes
+
+    def _waves(self, scene) -> Float[Array, "B k m"]:
+        """Block means for each unit initial state, scaled alike."""
+        scene = scene.replace(**self.known)
+        matrix = linear_sliding(scene).matrix
+        m = matrix.shape[0] // 2
+        width = self.edges[1] - self.edges[0]
+        states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
+        keep = _sliding_coordinates(scene)
+        columns = []
+        for quantity, coordinate in self.channels:
+            row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
+            columns.append((states[1:, row] - states[:-1, row]) / width)
+        waves = jnp.stack(columns, axis=1)
+        # Displacements and velocities differ by the frequency, which least squares need not see.
+        return waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
+
+
+class KickMisfit(AbstractMisfit):
+    """The response to the scene's own load, from steady sliding, through every contact event."""
+
+    edges: Float[Array, " B+1"]
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    poles: Complex[Array, " j"]
+    shapes: Complex[Array, "j k"]
+    method: AbstractStepper
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    # Whether no contact event is taken to happen: then matrix exponentials do, a hundred times as fast.
+    uneventful: bool = eqx.field(static=True)
+    fitted_by_elimination: int = eqx.field(static=True, default=0)
+
+    def coarse(self, scene):
+        return _characteristic(scene.replace(**self.known), self.poles, self.shapes, self.channels)
+
+    def residual(self, scene, offset, share):
+        weight = _window(self.edges, share)[:, None] / self.sigma
+        model = jnp.diff(self.integrals(scene, self.edges + offset), axis=0) / (self.edges[1] - self.edges[0])
+        return _finite(weight * (self.means - model)).ravel(), model
+
+    def integrals(self, scene: Scene, instants: Float[Array, " i"], eventful: bool = False) -> Float[Array, "i k"]:
+        """What the channels are rates of, velocities and displacements, at evenly spaced instants of the simulation (s)."""
+        respond = _sliding_throughout if self.uneventful and not eventful else _through_events
+        y = respond(scene.replace(**self.known), self.method, instants)
+        return _integrals(y, self.channels)
+
+
+class CycleMisfit(AbstractMisfit):
+    """A limit cycle by its harmonics and, where they were measured, its fractions of time in the statuses."""
+
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    measured: Float[Array, " h"]
+    whitening: Float[Array, "h h"]
+    fractions: Float[
+        Array, "2 2"
+    ]  # sticking, detached; value and standard deviation, which is infinite if not measured
+    method: AbstractStepper
+    width: Float[Array, ""]  # of a block, s
+    frequency: Float[Array, ""]  # Hz, as measured
+    timed: bool = eqx.field(static=True)  # whether any fraction was measured
+    blocks: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    fitted_by_elimination: int = eqx.field(static=True, default=0)
+
+    def coarse(self, scene):
+        found = self._features(self._orbit(scene)[0]) / self.measured[1]
+        expected = self.measured / self.measured[1]
+        # Frequency to a per mille, lines to 5 % of the largest.
+        error = jnp.full(found.shape, 0.05).at[0].set(1e-3 * expected[0])
+        return _finite((expected - found) / error)
+
+    def residual(self, scene, offset, share):
+        means, fractions = self._orbit(scene)
+        lines = self.whitening @ (self.measured - self._features(means))
+        return _finite(jnp.concatenate([lines, (self.fractions[:, 0] - fractions) / self.fractions[:, 1]])), means
+
+    def _features(self, means):
+        return features.harmonics(means, self.width, self.count, 0.6 * self.frequency, 1.6 * self.frequency)
+
+    def _orbit(self, scene) -> tuple[Float[Array, "b k"], Float[Array, "2"]]:
+        scene = scene.replace(**self.known)
+        n, tangential = scene.structure.size, scene.structure.tangential
+        q, _ = steady_sliding(scene, scene.load.final)
+        # A kick almost as fast as the belt: outside everything that dies out.
+        y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + tangential].set(0.9 * scene.belt_speed)
+        scene = eqx.tree_at(lambda s: s.load, scene, ConstantLoad(scene.load.final))
+        begin = SETTLING_PERIODS / self.frequency
+        instants = jnp.concatenate([jnp.zeros(1), begin + self.width * jnp.arange(self.blocks + 1)])
+        y, contacts, _ = states_at(scene, self.method, y0, instants, MOST_ADVANCES)
+        means = jnp.diff(_integrals(y[1:], self.channels), axis=0) / self.width
+        if not self.timed:
+            return means, jnp.zeros(2)
+        return means, self._spent(scene, y[1], jax.tree.map(lambda leaf: leaf[1], contacts))
+
+    def _spent(self, scene, y, contact) -> Float[Array, "2"]:
+        """Fractions of time sticking and detached over the periods looked at."""
+        mechanics, load = Mechanics(scene), scene.load(jnp.zeros(()))
+        span = self.blocks * self.width
+        codes = jnp.array([Status.STICK, Status.DETACH])
+
+        def body(carry):
+            y, contact, left, spent = carry
+            after = self.method.advance(mechanics, contact, load, y, jnp.minimum(left, self.method.dt))
+            spent = spent + jnp.where(contact.status == codes, after.h, 0.0)
+            return after.y, after.contact, left - after.h, spent
+
+        def going(carry):
+            return carry[2] > 1e-12 * span
+
+        start = (y, contact, jnp.asarray(span), jnp.zeros(2))
+        return jax.lax.while_loop(going, body, start)[3] / span
+
+
+def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """States at instants of the simulation (s): the response from steady sliding, which it was in before, too."""
+    q, _ = steady_sliding(scene, scene.load.force)
+    y0 = jnp.concatenate([q, jnp.zeros_like(q)])
+    instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
+    y, *_ = states_at(scene, method, y0, instants, MOST_ADVANCES)
+    return y[1:]
+
+
+def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
+    matrix, keep = linear_sliding(scene).matrix, _sliding_coordinates(scene)
+    n = scene.structure.size
+    steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
+
+    def equilibrium(force):
+        q, _ = steady_sliding(scene, force)
+        return jnp.concatenate([q[jnp.array(keep)], jnp.zeros(len(keep))])
+
+    rest = equilibrium(scene.load.force)
+    begin, z = jnp.zeros(()), rest
+    found = jnp.broadcast_to(rest, (instants.shape[0], len(rest)))
+    jumps = scene.load.jumps
+    for k in range(jumps.shape[0]):
+        z = rest + jax.scipy.linalg.expm((jumps[k] - begin) * matrix) @ (z - rest)
+        begin = jumps[k]
+        until = jumps[k + 1] if k + 1 < jumps.shape[0] else jnp.inf
+        middle = begin + jnp.minimum(0.5 * (until - begin), 1.0)
+        rest = equilibrium(scene.load(middle))
+        moving = steps @ (jax.scipy.linalg.expm((instants[0] - begin) * matrix) @ (z - rest)) + rest
+        found = jnp.where((instants >= begin)[:, None], moving, found)
+    columns = jnp.array([*keep, *(n + i for i in keep)])
+    return jnp.zeros((instants.shape[0], 2 * n)).at[:, columns].set(found)
+
+
+def _integrals(y, channels: tuple[Channel, ...]):
+    n = y.shape[1] // 2
+    return y[:, jnp.array([coordinate + (n if quantity == "acceleration" else 0) for quantity, coordinate in channels])]
+
+
+def _characteristic(
+    scene: Scene, poles: Complex[Array, " j"], shapes: Complex[Array, "j k"], channels: tuple[Channel, ...]
+) -> Float[Array, " c"]:
+    r"""Measured poles and shapes in $(λ^2 - A_{22}λ - A_{21})\,φ = 0$, relative to $λ^2 φ$; and its determinant."""
+    matrix = linear_sliding(scene).matrix
+    m = matrix.shape[0] // 2
+    if poles.shape[0] == 0:
+        return jnp.zeros(0)
+    keep = _sliding_coordinates(scene)
+
+    def dynamic(pole):
+        return jnp.eye(m) * pole**2 - matrix[m:, m:] * pole - matrix[m:, :m]
+
+    def determinant(pole, others):
+        # How far the pole is from the scene's nearest one: others that were measured too are divided out.
+        apart = jnp.abs(pole - others)
+        apart = jnp.prod(jnp.where(apart == 0, 1.0, jnp.maximum(apart, 1e-3 * jnp.abs(pole))))
+        missing = m - others.shape[0]
+        distance = jnp.linalg.det(dynamic(pole)) / (apart * (2 * jnp.abs(pole)) ** m * jnp.abs(pole) ** missing)
+        return distance / (COARSE_POLE * jnp.abs(pole))
+
+    found = [jax.vmap(lambda pole: determinant(pole, poles))(poles)]
+    measured = {}
+    for k, (quantity, coordinate) in enumerate(channels):
+        measured.setdefault(coordinate, shapes[:, k] / (poles**2 if quantity == "acceleration" else poles))
+    if set(keep) <= set(measured):
+        shape = jnp.stack([measured[coordinate] for coordinate in keep], axis=1)
+        shape = shape / jnp.linalg.norm(shape, axis=1, keepdims=True)
+        unbalanced = jax.vmap(lambda pole, phi: dynamic(pole) @ phi / jnp.abs(pole) ** 2)(poles, shape)
+        found.append(unbalanced.ravel() / COARSE_SHAPE)
+    found = jnp.concatenate(found)
+    return _finite(jnp.concatenate([found.real, found.imag]))
+
+
+def _powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
+    """I, step, step², …: by doubling, so that a long recording is a few products of many matrices."""
+    powers, next_one = jnp.eye(step.shape[0])[None], step
+    while powers.shape[0] < count:
+        powers = jnp.concatenate([powers, powers @ next_one])
+        next_one = next_one @ next_one
+    return powers[:count]
+
+
+def _sliding_coordinates(scene: Scene) -> list[int]:
+    return [i for i in range(scene.structure.size) if i != scene.structure.normal]
+
+
+def _window(edges, share) -> Float[Array, " B"]:
+    # In whole blocks; the last of them carries the tolerance of a rounding.
+    return jnp.where(edges[1:] <= share * edges[-1] * (1 + 1e-9), 1.0, 0.0)
+
+
+def _finite(residual):
+    good: Bool[Array, " r"] = jnp.isfinite(residual)
+    return jnp.where(good, jnp.clip(jnp.where(good, residual, 0.0), -HOPELESS, HOPELESS), HOPELESS)
+
+
+def noise_of_means(recording: Recording, blocks: Averaged) -> np.ndarray:
+    """Standard deviations of block means, from those of single samples.
+
+    Where these are not stated, from third differences of the samples: what is left of a signal that is sampled many times
+    a period is the noise, and the median passes over its jumps. For sparse samples this is too large.
+    """
+    if recording.noise is not None:
+        return recording.noise / np.sqrt(blocks.per_block)
+    differences = np.abs(np.diff(recording.values, 3, axis=0))
+    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance; 0.6745 is the median of |normal|.
+    return np.median(differences, axis=0) / (0.6745 * np.sqrt(20.0) * np.sqrt(blocks.per_block))
+
+
+def misfit(
+    recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene, uneventful: bool
+) -> AbstractMisfit:
+    """A recording, averaged over blocks, ready to be compared."""
+    known = {name: jnp.asarray(value) for name, value in recording.known.items()}
+    size = np.sqrt(np.mean(blocks.means**2, axis=0))
+    # A recording without any noise would leave rounding to be fitted.
+    sigma = np.maximum(noise_of_means(recording, blocks), 1e-9 * size + 1e-300)
+    if recording.regime == "limit cycle":
+        return _cycle(recording, blocks, method, known, sigma, scene)
+    width = blocks.edges[1] - blocks.edges[0]
+    # A kick's response is a small motion again, if at all, towards its end.
+    tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
+    found = features.poles(tail, width, scene.structure.size - 1)
+    # Poles that leave much of the signal unexplained are not those of a small motion.
+    good = found.explained > 0.7
+    values, shapes = (found.values, found.shapes) if good else (found.values[:0], found.shapes[:0])
+    common: dict = {
+        "edges": jnp.asarray(blocks.edges),
+        "means": jnp.asarray(blocks.means),
+        "sigma": jnp.asarray(sigma),
+        "known": known,
+        "poles": jnp.asarray(values),
+        "shapes": jnp.asarray(shapes),
+        "channels": recording.channels,
+    }
+    if recording.regime == "sliding":
+        return SlidingMisfit(**common, fitted_by_elimination=2 * (scene.structure.size - 1))
+    return KickMisfit(**common, method=method, uneventful=uneventful)
+
+
+def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
+    width = float(blocks.edges[1] - blocks.edges[0])
+    # The fundamental lies about where the sliding modes do; a start 30 % off in a spring is 16 % off in frequency.
+    modes = np.linalg.eigvals(np.asarray(linear_sliding(scene.replace(**recording.known)).matrix))
+    modes = np.abs(modes.imag) / (2 * np.pi)
+    modes = modes[modes > 0]
+    means = jnp.asarray(blocks.means)
+    frequency = float(features.fundamental(means, width, 1, 0.6 * modes.min(), 1.6 * modes.max()))
+    count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
+    limits = (0.6 * frequency, 1.6 * frequency)
+    frequency = float(features.fundamental(means, width, count, *limits))
+    found = np.asarray(features.lines(means, width, frequency, count))
+    t = width * np.arange(len(blocks.means))
+    waves = np.exp(2j * np.pi * frequency * np.outer(t, np.arange(1, count + 1)))
+    left = blocks.means - blocks.means.mean(axis=0) - (waves @ found).real
+    if recording.noise is None:
+        # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
+        sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / (len(left) - 2 * count - 1)))
+
+    def measure(values):
+        return features.harmonics(values, width, count, *limits)
+
+    # How the noise of every sample reaches every feature, to first order.
+    jacobian = np.asarray(jax.jit(jax.jacrev(measure))(means)).reshape(-1, *means.shape)
+    covariance = np.einsum("abk,cbk,k->ac", jacobian, jacobian, sigma**2)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
+    return CycleMisfit(
+        means=means,
+        sigma=jnp.asarray(sigma),
+        known=known,
+        measured=measure(means),
+        whitening=jnp.asarray(whitening),
+        fractions=jnp.asarray(fractions),
+        timed=bool(np.any(np.isfinite(fractions[:, 1]))),
+        method=method,
+        width=jnp.asarray(width),
+        frequency=jnp.asarray(frequency),
+        blocks=int(min(len(blocks.means), np.ceil(CYCLE_PERIODS / (width * frequency)))),
+        count=count,
+        channels=recording.channels,
+    )

@@ -1,0 +1,180 @@
+"""Derivatives through contact, against differences and closed forms: `python tests/measure_gradients.py`.
+
+    python tests/measure_gradients.py [state] [closed] [where] [cost]
+
+Each word picks one study; without any, all run (some minutes on two cores). Errors are relative, of the worst component of
+the state, each component's derivative in proportion to its own size.
+"""
+
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gradient_reference import bouncing_height, point_mass, richardson, stick_slip
+
+import fivjax as fj
+
+# A kick a moment after the start, so that its instant can be moved both ways; times count from the kick.
+START = 0.01
+CASES = {
+    "v = 3, p = 1.3, 0.5 s": ({"belt_speed": 3.0, "p": 1.3}, 0.5 + START),
+    "v = 3, p = 2, 0.3 s": ({"belt_speed": 3.0, "p": 2.0}, 0.3 + START),
+    "v = 0.5, p = 1.1, 0.4 s": ({"belt_speed": 0.5, "p": 1.1}, 0.4 + START),
+}
+NAMES = ("mu", "belt_speed", "force", "p", "duration", "start", "m1", "m2", "c1", "c2", "k1", "k2", "theta")
+
+
+def paper(**changes) -> fj.Scene:
+    pulse = fj.Pulse(100.0, 1.2, start=START)
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, pulse).replace(**changes)
+
+
+def last_state(run):
+    return jnp.concatenate([run.displacement[-1], run.velocity[-1]])
+
+
+def jacobian(scene, t1, mode="forward", method=None, names=NAMES):
+    found = fj.derivatives(last_state, scene, names, t1, t1, mode=mode, method=method)
+    return found, np.stack([found[name] for name in names], axis=-1)
+
+
+def differences(scene, t1, names=NAMES):
+    """Extrapolated differences of the event-exact solver, and their own relative error."""
+    values, errors = [], []
+    with jax.enable_x64(True):
+        for name in names:
+            size = max(abs(float(scene.parameters[name])), 1e-2)
+            # Small enough that the sequence of events stays, large enough for rounding.
+            step = size * (2e-3 if name in ("c1", "c2") else 2e-4 if name in ("start", "theta") else 2e-5)
+            value, error = richardson(
+                lambda x, name=name: last_state(fj.simulate(scene.replace(**{name: x}), t1, t1)),
+                float(scene.parameters[name]),
+                step,
+            )
+            values.append(value)
+            errors.append(error)
+    return np.stack(values, axis=-1), np.stack(errors, axis=-1)
+
+
+def relative(found, expected):
+    size = np.abs(expected)
+    return np.abs(found - expected) / np.where(size > 0, size, 1.0)
+
+
+def state():
+    """The state at a time, in all parameters: forward against extrapolated differences, reverse against forward."""
+    for name, (changes, t1) in CASES.items():
+        scene = paper(**changes)
+        found, forward = jacobian(scene, t1)
+        expected, own = differences(scene, t1)
+        _, reverse = jacobian(scene, t1, "reverse")
+        error = relative(forward, expected)
+        worst = np.unravel_index(np.argmax(error), error.shape)
+        print(f"{name}: {found.events} events. {found.reason}")
+        print(
+            f"   against differences {error.max():.1e} (in {NAMES[worst[1]]}, where the differences' own error is "
+            f"{(own / np.where(expected == 0, 1.0, np.abs(expected)))[worst]:.0e}); reverse against forward {relative(reverse, forward).max():.1e}"
+        )
+
+
+def closed():
+    """The bouncing mass and the stick–slip block against the derivatives of their closed forms."""
+    for name, found, expected in closed_forms("forward"):
+        print(f"{name}: {relative(found, expected).max():.1e}")
+
+
+def closed_forms(mode):
+    force, restitution, t1 = 9.81, 0.5, 1.2
+    scene = fj.Scene(point_mass(0.0), fj.Coulomb(0.0), 0.0, fj.ConstantLoad(force), restitution=restitution)
+    d = fj.derivatives(
+        lambda run: jnp.stack([run.displacement[-1, 1], run.velocity[-1, 1]]),
+        scene,
+        ["force", "restitution"],
+        t1,
+        t1,
+        y0=([0.0, 1.0], [0.0, 0.0]),
+        mode=mode,
+    )
+    with jax.enable_x64(True):
+        # Flights end at 0.452, 0.903, 1.129 and 1.242 s.
+        expected = np.asarray(jax.jacfwd(lambda x: bouncing_height(t1, 3, *x))(jnp.array([force, restitution])))
+    yield "bouncing mass, 3 bounces, in force and restitution", np.stack([d["force"], d["restitution"]], -1), expected
+    values = {"mu": 0.5, "mu_static": 1.0, "force": 1.0, "belt_speed": 0.2, "stiffness": 1.0}
+    x0, t1 = 0.9, 20.0
+    scene = fj.Scene(
+        point_mass(values["stiffness"]),
+        fj.Coulomb(values["mu"], values["mu_static"]),
+        values["belt_speed"],
+        fj.ConstantLoad(values["force"]),
+    )
+    with jax.enable_x64(True):
+        place = jnp.array([x0, 0.0])
+
+        # The mass starts at rest on the belt, whatever the belt's speed is.
+        def run(x):
+            changed = scene.replace(**dict(zip(values, x, strict=True)))
+            y0 = jnp.concatenate([place, jnp.stack([changed.belt_speed, jnp.zeros(())])])
+            found = fj.simulate(changed, t1, t1, y0=y0)
+            return jnp.stack([found.displacement[-1, 0], found.velocity[-1, 0]])
+
+        x = jnp.array(list(values.values()))
+        found = jax.jit((jax.jacfwd if mode == "forward" else jax.jacrev)(run))(x)
+        # Periods of 8.9026 s: slips for the third time from 18.3 s on.
+        expected = jax.jacfwd(lambda x: stick_slip(t1, 2, x0, *x))(x)
+    yield "stick–slip block, 5 events, in " + ", ".join(values), np.asarray(found), np.asarray(expected)
+
+
+def where():
+    """The where-switched solver's gradients beside the exact ones, of the tangential velocity in all parameters."""
+    for name, (changes, t1) in CASES.items():
+        scene = paper(**changes)
+        _, exact = jacobian(scene, t1)
+        print(f"{name}")
+        for dt in (1e-4, 2.5e-5, 5e-6):
+            _, found = jacobian(scene, t1, method=fj.WhereSwitched(dt=dt))
+            size = np.linalg.norm(exact, axis=0)
+            error = np.linalg.norm(found - exact, axis=0) / np.where(size > 0, size, 1.0)
+            listed = ", ".join(
+                f"{n} {e:.0e}" for n, e in zip(NAMES, error, strict=True) if n in ("mu", "p", "c1", "k1")
+            )
+            print(f"   dt = {dt:g} s: worst {error.max():.1e}, median {np.median(error):.1e} ({listed})")
+
+
+def cost():
+    """One forward gradient in 5 parameters, and one reverse gradient, in units of one simulation of 1 s, compiled."""
+    names = ("mu", "c1", "c2", "k1", "k2")
+    scene = paper(p=1.3, start=0.0)
+    with jax.enable_x64(True):
+        x = jnp.array([scene.parameters[name] for name in names])
+
+        def peak(x):
+            run = fj.simulate(scene.replace(**dict(zip(names, x, strict=True))), 1.0, 1e-3)
+            return jnp.sum(run.velocity[:, 0] ** 2)
+
+        functions = {
+            "simulation": jax.jit(peak),
+            "forward": jax.jit(jax.jacfwd(peak)),
+            "reverse": jax.jit(jax.grad(peak)),
+        }
+        times = {}
+        for name, function in functions.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(function(x))
+            first = time.perf_counter() - begin
+            repeats = []
+            for _ in range(10):
+                begin = time.perf_counter()
+                jax.block_until_ready(function(x))
+                repeats.append(time.perf_counter() - begin)
+            times[name] = min(repeats)
+            ratio = times[name] / times["simulation"]
+            print(f"{name}: {1e3 * times[name]:.1f} ms, {ratio:.1f} simulations; with compilation {first:.1f} s")
+
+
+if __name__ == "__main__":
+    studies = {"state": state, "closed": closed, "where": where, "cost": cost}
+    for name in sys.argv[1:] or studies:
+        print(f"--- {name}: {studies[name].__doc__}", flush=True)
+        studies[name]()

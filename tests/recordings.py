@@ -1,0 +1,58 @@
+"""Synthetic recordings: what an accelerometer would give of a run of the paper's scene."""
+
+import numpy as np
+
+import fivjax as fj
+
+FREE = {
+    3: ["mu", "c1", "k1"],
+    5: ["mu", "c1", "c2", "k1", "k2"],
+    7: ["mu", "c1", "c2", "k1", "k2", "m1", "theta"],
+}
+# Scene, where the recording begins and ends (s), and its regime.
+CASES = {
+    "linear phase": (dict(mu=0.25, p=1.05), 0.12, 0.92, "sliding"),
+    "linear phase after a known kick": (dict(mu=0.25, p=1.05), 0.0371, 0.9371, "kick"),
+    "decaying response": (dict(mu=0.2, p=1.2), 0.0371, 1.0371, "kick"),
+    "limit cycle": (dict(mu=0.3, belt_speed=1.0), 2.0, 3.0, "limit cycle"),
+}
+RATE = 25_000.0
+
+
+def paper(**changes) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, fj.Pulse(100.0, 1.2)).replace(**changes)
+
+
+def clean(scene: fj.Scene, begin: float, end: float, y0=None, rate: float = RATE) -> np.ndarray:
+    """Accelerations of the two sliding coordinates: each sample a change of velocity, as a sensor with a filter gives it."""
+    run = fj.simulate(scene, end, 1 / rate, y0=y0)
+    first = round(begin * rate)
+    return np.diff(run.velocity[first:, :2], axis=0) * rate
+
+
+def noisy(accelerations: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """With white noise of `share` times each channel's own size."""
+    noise = np.random.default_rng(seed).normal(size=accelerations.shape)
+    return accelerations + share * accelerations.std(axis=0) * noise
+
+
+def case(name: str) -> tuple[fj.Scene, np.ndarray, str]:
+    changes, begin, end, regime = CASES[name]
+    scene = paper(**changes)
+    y0 = None
+    if regime == "limit cycle":
+        q = fj.sliding_equilibrium(scene)
+        y0 = (q, [-0.9 * float(scene.belt_speed), 0.0, 0.0])
+    return scene, clean(scene, begin, end, y0), regime
+
+
+def recording(accelerations: np.ndarray, regime: str, **about) -> fj.Recording:
+    return fj.Recording(
+        RATE, {"acceleration 0": accelerations[:, 0], "acceleration 1": accelerations[:, 1]}, regime, **about
+    )
+
+
+def off(scene: fj.Scene, names, seed: int, share: float = 0.3) -> fj.Scene:
+    """The scene with each of these parameters 30 % too high or too low."""
+    signs = np.random.default_rng(1000 + seed).choice([-1.0, 1.0], len(names))
+    return scene.replace(**{n: float(scene.parameters[n]) * (1 + share * s) for n, s in zip(names, signs, strict=True)})

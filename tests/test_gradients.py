@@ -1,0 +1,112 @@
+"""Derivatives through contact against differences and closed forms; where there is none, that the result says so.
+
+The whole table, reverse mode included, is in `measure_gradients.py`.
+"""
+
+import jax
+import jax.numpy as jnp
+import measure_gradients as measure
+import numpy as np
+import pytest
+from gradient_reference import point_mass
+
+import fivjax as fj
+
+
+def test_state_in_all_parameters_through_nine_events():
+    """Wrong if an event time, a jump of the load or a status is left out of the derivative."""
+    changes, t1 = measure.CASES["v = 3, p = 1.3, 0.5 s"]
+    found, forward = measure.jacobian(measure.paper(**changes), t1)
+    expected, _ = measure.differences(measure.paper(**changes), t1)
+    assert found.events == 9
+    assert found.exist
+    # What extrapolated differences of a state computed to 1e-13 are good for.
+    assert measure.relative(forward, expected).max() < 1e-6
+
+
+def test_bouncing_mass_and_stick_slip_block_forward():
+    """Rounding alone is allowed between the solver's derivative and that of the closed form."""
+    for _, found, expected in measure.closed_forms("forward"):
+        assert measure.relative(found, expected).max() < 1e-10
+
+
+@pytest.mark.slow
+def test_reverse_equals_forward_in_the_table():
+    """Both modes through up to 35 events, sticking included: one transposed wrong would differ in the first digits."""
+    for changes, t1 in measure.CASES.values():
+        scene = measure.paper(**changes)
+        found, forward = measure.jacobian(scene, t1)
+        assert found.exist
+        _, reverse = measure.jacobian(scene, t1, "reverse")
+        expected, _ = measure.differences(scene, t1)
+        assert measure.relative(reverse, forward).max() < 1e-10
+        assert measure.relative(forward, expected).max() < 1e-6
+    for _, found, expected in measure.closed_forms("reverse"):
+        assert measure.relative(found, expected).max() < 1e-10
+
+
+def test_the_end_of_a_kick_on_a_saved_instant():
+    """A step of no length between the saved instant and the jump of the load must pass the derivative on, not lose it."""
+    with jax.enable_x64(True):
+
+        def speed(duration, dt_save):
+            scene = measure.paper(p=1.05, start=0.0, duration=duration)
+            return fj.simulate(scene, 0.15, dt_save).velocity[-1, 0]
+
+        on_it, between = (jax.jvp(lambda x, dt=dt: speed(x, dt), (0.1,), (1.0,))[1] for dt in (0.05, 0.15))
+    assert float(on_it) == pytest.approx(float(between), rel=1e-9)
+
+
+def last_rate(run):
+    return run.velocity[-1, 1]
+
+
+@pytest.mark.parametrize(("touch", "exist"), [(1e-9, False), (-1e-9, False), (0.3, True), (-0.3, True)])
+def test_a_graze_is_said_to_have_no_derivative(touch, exist):
+    """A gap q = F + (h - F) cos t with a lifting load F comes down to 2F - h: just above or just below the belt, the
+    velocity after it turns by twice itself with the next digit of F."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.ConstantLoad(0.5 * (1.0 + touch)), restitution=1.0)
+    d = fj.derivatives(last_rate, scene, ["force"], 5.0, 5.0, y0=([0.0, 1.0], [0.0, 0.0]))
+    assert d.exist is exist
+    assert d.events == (1 if touch < 0 else 0)
+    assert "the gap closing" in d.reason
+    lift = 0.5 * (1.0 + touch)
+    assert d.closest_at == pytest.approx(np.arccos(max(-lift / (1.0 - lift), -1.0)), abs=0.05)
+
+
+def test_quiet_motion_has_derivatives_and_says_so():
+    d = fj.derivatives(lambda run: run.velocity[-1, 0], measure.paper(p=1.0), ["p"], 0.05, 0.05)
+    assert d.exist and d.events == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "fragments"),
+    [
+        (dict(functional=3), TypeError, ["`functional`", "3"]),
+        (dict(wrt="mu"), TypeError, ["`wrt`", "'mu'"]),
+        (dict(wrt=["muu"]), ValueError, ["`wrt`", "'muu'", "belt_speed"]),
+        (dict(wrt=[]), ValueError, ["`wrt`", "none"]),
+        (dict(mode="backward"), ValueError, ["`mode`", "forward", "reverse"]),
+        (dict(margin=-1.0), ValueError, ["`margin`", "-1"]),
+        (dict(t1=0.0), ValueError, ["`t1`", "positive"]),
+        (dict(method="exact"), TypeError, ["`method`", "EventExact()"]),
+    ],
+)
+def test_refusals(options, error, fragments):
+    """Refused before anything compiles, by name."""
+    given = {"functional": lambda run: run.velocity[-1, 0], "scene": measure.paper(), "wrt": ["mu"], **options}
+    with pytest.raises(error) as refusal:
+        fj.derivatives(**given)
+    for fragment in fragments:
+        assert fragment in str(refusal.value)
+
+
+def test_a_structure_of_ones_own_takes_part():
+    """Parameters of a builder that is not fivjax's are parameters like any other."""
+    scene = fj.Scene(point_mass(1.0, 0.1), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
+    d = fj.derivatives(
+        lambda run: run.displacement[-1, 0], scene, ["stiffness", "damping"], 1.0, 1.0, y0=([0.0, 0.0], [0.5, 0.0])
+    )
+    assert d.exist and all(np.isfinite(d[name]) for name in ("stiffness", "damping"))
+    assert jnp.shape(d["damping"]) == ()

@@ -1,0 +1,113 @@
+"""The batch stepper: the same motion as by the oracle and by the series stepper, through every kind of event."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracle
+import pytest
+from test_simulate import CASES, scene_of
+
+import fivjax as fj
+from fivjax.contact import Contact, Mechanics, Status, status_from_forces
+from fivjax.lanes import next_step_end
+from fivjax.propagators import Windowed, propagators
+from fivjax.scene import steady_sliding
+
+
+def marched(method, scene: fj.Scene, t1: float, y0=None):
+    """The state at `t1`, and (time, new status) of every status change on the way."""
+    with jax.enable_x64(True):
+        mechanics = Mechanics(scene)
+        prepared = method.prepare(mechanics)
+        if y0 is None:
+            q, _ = steady_sliding(scene, scene.load.force)
+            y0 = jnp.concatenate([q, jnp.zeros_like(q)])
+        y = jnp.asarray(y0, float)
+
+        @jax.jit
+        def advance(contact, y, t):
+            end = jnp.minimum(next_step_end(scene.load, t, method.dt), t1)
+            after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t)
+            return after, jnp.where(after.h >= end - t, end, t + after.h)
+
+        contact, t, seen = status_from_forces(mechanics, scene.load(0.0), y), jnp.zeros(()), []
+        for _ in range(5000):
+            after, t = advance(contact, y, t)
+            if int(after.contact.status) != int(contact.status):
+                seen.append((float(t), int(after.contact.status)))
+            y, contact = after.y, after.contact
+            if t >= t1:
+                return np.asarray(y), seen
+        raise AssertionError("it did not arrive")
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name != "falling friction"])
+def test_states_and_events_agree_with_the_oracle(name):
+    """SciPy's `solve_ivp` with events and restarts, written apart from the package."""
+    parameters, t1 = CASES[name]
+    reference = oracle.simulate(oracle.paper_model(**parameters), t1, np.array([0.0, t1]), rtol=1e-12)
+    y, seen = marched(Windowed(), scene_of(parameters), t1)
+    np.testing.assert_allclose(y[:3], reference.q[-1], atol=1e-9 * np.abs(reference.q).max())
+    np.testing.assert_allclose(y[3:], reference.v[-1], atol=1e-9 * np.abs(reference.v).max())
+    assert len(seen) >= 2
+
+
+def random_scene(rng: np.random.Generator, n: int) -> fj.Scene:
+    """Any symmetric structure of n coordinates, pressed on firmly enough to touch, on a belt that runs either way."""
+
+    def definite(scale):
+        root = rng.normal(size=(n, n))
+        return scale * (root @ root.T / n + np.eye(n))
+
+    mass = np.diag(rng.uniform(0.2, 2.0, n))
+    normal, tangential = rng.permutation(n)[:2]
+    direction = np.where(np.arange(n) == normal, -1.0, 0.3 * rng.normal(size=n))
+    mu = rng.uniform(0.05, 0.6)
+    return fj.Scene(
+        fj.Structure(mass, definite(0.3), definite(1e3), direction, tangential=int(tangential), normal=int(normal)),
+        fj.Coulomb(mu, mu * rng.uniform(1.0, 1.5)),
+        belt_speed=rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 1.0),
+        load=fj.Pulse(50.0, rng.uniform(0.0, 4.0), duration=0.3),
+        restitution=rng.choice([0.0, 0.4]),
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_structure_moves_as_by_the_series_stepper(seed):
+    """Two to five coordinates, static friction above dynamic, rebounds, belts both ways: the same events, the same end."""
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 4
+    scene = random_scene(rng, n)
+    y0 = np.zeros(2 * n)
+    y0[scene.structure.normal] = 0.05
+    y0[n:] = 3 * rng.normal(size=n)
+    fast, fast_events = marched(Windowed(), scene, 2.0, y0)
+    exact, exact_events = marched(fj.EventExact(), scene, 2.0, y0)
+    assert [status for _, status in fast_events] == [status for _, status in exact_events]
+    assert exact_events
+    np.testing.assert_allclose([t for t, _ in fast_events], [t for t, _ in exact_events], atol=1e-9)
+    np.testing.assert_allclose(fast, exact, atol=1e-9 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-9])
+def test_a_touch_between_two_samples_is_found_and_a_miss_is_none(depth):
+    """A detached mass whose lowest point lies between two samples, a little below the belt or a little above it."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.1), 1.0, fj.ConstantLoad(1.0))
+    with jax.enable_x64(True):
+        table = propagators(Mechanics(scene))
+        contact = Contact(jnp.asarray(Status.DETACH, jnp.int32), jnp.asarray(1.0))
+        lowest_at = 4.37 * float(table.interval)
+        for touches, amplitude in ((True, 1 + depth), (False, 1 - depth)):
+            # A load of -1 N holds the rest position 1 m above the belt: the height is 1 - amplitude cos(t - lowest_at).
+            gap, rate = 1 - amplitude * np.cos(lowest_at), -amplitude * np.sin(lowest_at)
+            y = jnp.array([0.0, gap, 0.0, rate])
+            after = Windowed().advance(table, contact, jnp.asarray(-1.0), y, 8 * table.interval)
+            if touches:
+                # Two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the root of their depth.
+                assert float(after.h) == pytest.approx(
+                    lowest_at - np.arccos(1 / amplitude), abs=1e-15 / depth**0.5 + 1e-14
+                )
+                assert float(after.y[1]) == 0.0
+            else:
+                assert float(after.h) > lowest_at and float(after.y[1]) > 0
