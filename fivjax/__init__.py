@@ -34,5 +34,6 @@ from .steppers import vector_field as vector_field
 from .structure import Structure as Structure
 from .structure import belt_oscillator as belt_oscillator
 from .tradeoff import tradeoff as tradeoff
+from .verdict import Ending as Ending
 from .verdict import Verdict as Verdict
 from .where_switched import WhereSwitched as WhereSwitched

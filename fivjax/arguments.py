@@ -37,6 +37,12 @@ def real_number(
         raise ValueError(f"Argument `{name}` must be at most {maximum:g}, but is {number:g}.")
 
 
+def whole_number(name: str, value, *, minimum: int) -> None:
+    """Refuse anything but one whole number of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ValueError(f"Argument `{name}` must be a whole number of at least {minimum}, but is {value!r}.")
+
+
 def numeric_array(name: str, value) -> np.ndarray:
     """`value` as a NumPy array of real numbers, or a sentence about what it is instead."""
     try:

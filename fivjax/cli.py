@@ -1,8 +1,12 @@
 """The command line, `fivjax …`: the public API with sensible defaults, data and a picture of each result."""
 
+import contextlib
 import dataclasses
 import os
+import signal
 import sys
+import threading
+import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -108,6 +112,8 @@ class Map:
     """time after which a lane without a verdict is called undecided (s)"""
     memory: float = 2e9
     """memory for lanes under way (bytes)"""
+    resume: bool = False
+    """go on with the map of the same name that was interrupted"""
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
     method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
 
@@ -117,9 +123,25 @@ class Map:
         axes = dict(map(_axis, (self.x, self.y)))
         if len(axes) != 2:
             raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
-        dataset = bistability_map(scene, method=method, t_max=self.t_max, memory=self.memory, **axes)
-        save(dataset, data)
-        save_figure(plot.bistability(dataset), picture)
+        unfinished = data.with_suffix(".unfinished")
+        if unfinished.exists() and not self.resume:
+            raise ValueError(
+                f"An interrupted map is kept in `{unfinished}`. Go on with it by `--resume`, or delete the file to begin anew."
+            )
+        try:
+            with warnings.catch_warnings():
+                # What is said of an interrupted map here is more.
+                warnings.filterwarnings("ignore", message="Interrupted:")
+                dataset = bistability_map(
+                    scene, method=method, t_max=self.t_max, memory=self.memory, resume=unfinished, **axes
+                )
+            if np.any(dataset["verdict"] == Verdict.NOT_RUN):
+                raise KeyboardInterrupt
+            save(dataset, data)
+            save_figure(plot.bistability(dataset), picture)
+        except KeyboardInterrupt:
+            raise Interrupted(_how_to_resume(unfinished)) from None
+        unfinished.unlink(missing_ok=True)
         _say(data, picture)
         for verdict in Verdict:
             count = int((dataset["verdict"] == verdict).sum())
@@ -260,7 +282,10 @@ class Tradeoff:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; sentences on standard error and exit code 2 for what is refused."""
+    """Run one command; sentences on standard error and an exit code that is not zero for what does not end well.
+
+    2: refused before any work; 1: the disk did not take a result; 130: interrupted.
+    """
     keep_compiled_code()
     command = tyro.extras.subcommand_cli_from_dict(
         {"map": Map, "simulate": Simulate, "cea": Cea, "calibrate": Calibrate, "tradeoff": Tradeoff},
@@ -269,11 +294,42 @@ def main(arguments: list[str] | None = None) -> int:
         args=arguments,
     )
     try:
-        command.run()
+        with _terminated_like_interrupted():
+            command.run()
     except (ValueError, TypeError) as error:
         print(f"fivjax: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
+        return 1
+    except Interrupted as interruption:
+        print(f"fivjax: {interruption}", file=sys.stderr)
+        return 130
+    except KeyboardInterrupt:
+        print("fivjax: Interrupted; nothing was written.", file=sys.stderr)
+        return 130
     return 0
+
+
+class Interrupted(Exception):
+    """A run that was stopped from outside and can be resumed."""
+
+
+@contextlib.contextmanager
+def _terminated_like_interrupted():
+    """SIGTERM, which a batch system sends before it kills, ends a run as Ctrl-C does: in order."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    # Only a program's main thread may say what a signal does.
+    mine = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, interrupt) if mine else None
+    try:
+        yield
+    finally:
+        if mine:
+            signal.signal(signal.SIGTERM, before)
 
 
 def keep_compiled_code() -> None:
@@ -325,6 +381,12 @@ def _outputs(stem: Path) -> tuple[Path, Path]:
     stem = stem.with_suffix("") if stem.suffix in (".nc", ".png") else stem
     data, picture = (stem.with_name(stem.name + suffix) for suffix in (".nc", ".png"))
     return check_writable(data), check_writable(picture)
+
+
+def _how_to_resume(unfinished: Path) -> str:
+    if not unfinished.exists():
+        return "Interrupted before any lane was finished; nothing was written."
+    return f"Interrupted; what is finished is kept in `{unfinished}`. Go on with the same command and `--resume`."
 
 
 def _say(*paths: Path) -> None:

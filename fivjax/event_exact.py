@@ -58,8 +58,7 @@ class EventExact(AbstractStepper):
     interpolation_cls: ClassVar = staticmethod(lambda **info: _Restepped(**info))
 
     def __init__(self, order: int = 16, tolerance: float = 1e-15, dt: float = math.inf):
-        if isinstance(order, bool) or not isinstance(order, int | np.integer) or order < 4:
-            raise ValueError(f"Argument `order` must be a whole number of at least 4, but is {order!r}.")
+        arguments.whole_number("order", order, minimum=4)
         arguments.real_number("tolerance", tolerance, above=0)
         if not (isinstance(dt, float) and dt == math.inf):
             arguments.real_number("dt", dt, above=0)

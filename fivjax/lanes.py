@@ -7,7 +7,9 @@ filled anew: work is spent only where the verdict is open.
 """
 
 import os
+import time
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -23,6 +25,7 @@ from . import orbit as orbits
 from .contact import Contact, Mechanics, State
 from .energy import Books, Ledger, enter, exchanged, open_ledger, vibration_energy
 from .event_exact import EventExact
+from .interrupts import noted
 from .load import AbstractLoad
 from .orbit import Orbit
 from .propagators import MATRIX_ROWS, Windowed
@@ -30,6 +33,7 @@ from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
 from .steppers import AbstractStepper, Advance
 from .verdict import Verdict
+from .wedging import Wedge, sticks_forever, wedge
 
 # Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
 TILE_ON_CPU = 128
@@ -60,6 +64,12 @@ ENERGIES = (
 )
 # Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
 SPAN_SHARE = 4
+# A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
+GROWTH = 1e9
+# Steps that a lane may take: 10⁵ cycles with their events, and some hours of work for a map of them.
+MOST_STEPS = 2**21
+# How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
+KEEP_EVERY = 2.0
 # Parameters that lanes of one group may differ in: the load's history, which leaves the mechanics alone.
 HISTORY = ("p", "duration", "start")
 
@@ -90,6 +100,7 @@ class Shared(eqx.Module):
     values: Float[Array, " k"]  # the parameters that are not history
     prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
     modes: SlidingModes
+    wedge: Wedge
 
 
 class Outcome(NamedTuple):
@@ -141,6 +152,7 @@ def follow(
     resolution: orbits.Resolution,
     prepared,
     modes: SlidingModes,
+    wedge: Wedge,
     lane: Lane,
     steps,
 ) -> Lane:
@@ -190,6 +202,9 @@ def follow(
         return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
     after = jax.lax.fori_loop(0, steps, step, lane)
+    deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
+    yardstick = jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    grown = jnp.max(jnp.abs(weights * deviation)) > GROWTH * yardstick
     quiet_load = jnp.all(scene.load.jumps <= after.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(after.y)),
@@ -200,7 +215,15 @@ def follow(
             jnp.where(
                 quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
                 Verdict.SLIDING,
-                jnp.where(quiet_load & after.orbit.returned, Verdict.LIMIT_CYCLE, Verdict.UNDECIDED),
+                jnp.where(
+                    quiet_load & after.orbit.returned,
+                    Verdict.LIMIT_CYCLE,
+                    jnp.where(
+                        quiet_load & (sticks_forever(wedge, mechanics, after.contact, after.y) | grown),
+                        Verdict.UNBOUNDED,
+                        Verdict.UNDECIDED,
+                    ),
+                ),
             ),
         ),
     )
@@ -214,15 +237,21 @@ def run_to_verdict(
     *,
     t_max: float,
     memory: float,
+    max_steps: int = MOST_STEPS,
     progress: bool | None,
     label: str,
     lingering: bool = False,
+    known: Outcome | None = None,
+    keep: Callable[[Outcome], None] | None = None,
     energy: bool = False,
 ) -> Outcome:
     """Follow one lane for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
     `lingering` says that the lanes were chosen to lie so close to a boundary that they stay with an unstable cycle for
     long: then an orbit has to return for longer before it counts. `energy` asks for the ledger of each lane at its end.
+
+    `known` is what an earlier run of the same lanes has finished; those are not run again. `keep` is handed everything that is
+    finished, every few seconds and at the end.
 
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
@@ -239,7 +268,24 @@ def run_to_verdict(
         last_event=np.full(total, np.nan),
         energy={name: np.full(total, np.nan) for name in ENERGIES} if energy else {},
     )
-    bar = tqdm(total=total, desc=label, unit="lane", disable=None if progress is None else not progress)
+    if known is not None:
+        outcome = jax.tree.map(np.array, known)
+    already = int(np.sum(outcome.verdict != Verdict.NOT_RUN))
+    bar = tqdm(
+        total=total, initial=already, desc=label, unit="lane", disable=None if progress is None else not progress
+    )
+    kept, new = time.monotonic(), 0
+
+    def finished(count: int) -> None:
+        nonlocal kept, new
+        bar.update(count)
+        new += count
+        if signals:
+            raise KeyboardInterrupt
+        if keep is not None and new > 0 and time.monotonic() - kept >= KEEP_EVERY:
+            keep(outcome)
+            kept, new = time.monotonic(), 0
+
     distinct, group = _groups(values)
     # The same in all rounds and blocks, because products of other shapes round differently.
     in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
@@ -247,18 +293,22 @@ def run_to_verdict(
     # Blocks that are filled group by group share the most.
     order = np.argsort(group, kind="stable")
     block = max(1, int(memory // bytes_per_lane(scene, sharing=total / len(distinct))))
-    try:
-        with bar:
+    with noted() as signals, bar:
+        try:
             for start in range(0, total, block):
                 chosen = order[start : start + block]
-                rows = {name: column[chosen] for name, column in values.items()}
-                _run_block(scene, rows, stepper, resolution, width, t_max, outcome, chosen, bar)
-    except KeyboardInterrupt:
-        open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
-        warnings.warn(
-            f"Interrupted: {open_lanes} of {total} lanes have no verdict and are labelled {Verdict.NOT_RUN.value}.",
-            stacklevel=2,
-        )
+                if np.any(outcome.verdict[chosen] == Verdict.NOT_RUN):
+                    rows = {name: column[chosen] for name, column in values.items()}
+                    _run_block(scene, rows, stepper, resolution, width, t_max, max_steps, outcome, chosen, finished)
+        except KeyboardInterrupt:
+            open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
+            warnings.warn(
+                f"Interrupted: {open_lanes} of {total} lanes have no verdict and are labelled {Verdict.NOT_RUN.value}.",
+                stacklevel=2,
+            )
+        finally:
+            if keep is not None:
+                keep(outcome)
     return outcome
 
 
@@ -287,8 +337,10 @@ def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return distinct, group.ravel()
 
 
-def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome, index: np.ndarray, bar) -> None:
-    """Lanes that fit in memory together; writes their outcomes at `index`."""
+def _run_block(
+    scene, values, method, resolution, width, t_max, max_steps, outcome: Outcome, index: np.ndarray, report
+) -> None:
+    """Lanes that fit in memory together; writes the outcomes of those not run yet at `index`."""
     names = tuple(name for name in values if name not in HISTORY)
     history = tuple(name for name in values if name in HISTORY)
     distinct, group = _groups(values)
@@ -296,20 +348,25 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in history)], axis=-1)[:, 1:]
     with ThreadPoolExecutor(max_workers=_workers()) as pool:
         start = lambda *a: _begin(scene, names, history, bool(outcome.energy), *a)  # noqa: E731
-        lanes = _in_tiles(start, shared, group, (columns,), width, pool)
-        pending = np.arange(len(index))
+        # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
+        pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
+        lanes = _in_tiles(start, shared, group[pending], (columns[pending],), width, pool)
         done = 0
         while True:
             verdict, t = lanes.verdict, lanes.t
+            if done >= max_steps:
+                out_of_steps = np.where(lanes.events > done // 2, Verdict.TOO_MANY_EVENTS, Verdict.STEP_FAILURE)
+                verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), out_of_steps, verdict)
+                lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
             finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
             _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
-            bar.update(int(finished.sum()))
+            report(int(finished.sum()))
             if finished.all():
                 return
             pending = pending[~finished]
             lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
             # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
-            steps = max(method.round, done // LOOKS)
+            steps = min(max(method.round, done // LOOKS), max(max_steps - done, 1))
             done += steps
             step = lambda *a, steps=steps: _follow(scene, method, resolution, names, history, np.int32(steps), *a)  # noqa: E731
             lanes = _in_tiles(step, shared, group[pending], (columns[pending], lanes), width, pool)
@@ -317,7 +374,6 @@ def _run_block(scene, values, method, resolution, width, t_max, outcome: Outcome
 
 def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     verdict = np.asarray(lanes.verdict)
-    outcome.verdict[index] = verdict
     amplitude = np.where(verdict == Verdict.LIMIT_CYCLE, lanes.orbit.amplitude, np.nan)
     outcome.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, amplitude)
     outcome.decided_at[index] = np.where(verdict >= 0, lanes.t, np.nan)
@@ -330,6 +386,8 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
         lines["kick_energy"] = lanes.account.vibration
         for name, line in outcome.energy.items():
             line[index] = lines[name]
+    # Last, and in one go: a lane with a verdict is complete, whenever an interrupt comes.
+    outcome.verdict[index] = verdict
 
 
 def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], distinct: np.ndarray) -> Shared:
@@ -340,15 +398,15 @@ def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, 
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(scene, method, names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    prepared, linear = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Shared(distinct, prepared, sliding_modes(linear))
+    prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return Shared(distinct, prepared, sliding_modes(linear), wedges)
 
 
 @eqx.filter_jit
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
-        return method.prepare(Mechanics(own)), linear_sliding(own)
+        return method.prepare(Mechanics(own)), linear_sliding(own), wedge(own)
 
     return jax.vmap(one)(values)
 
@@ -367,8 +425,10 @@ def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, s
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
+        known = shared.prepared, shared.modes, shared.wedge
+
         def one(row, lane):
-            return follow(_with(own, history, row), method, resolution, shared.prepared, shared.modes, lane, steps)
+            return follow(_with(own, history, row), method, resolution, *known, lane, steps)
 
         return jax.vmap(one)(columns, lanes)
 

@@ -3,17 +3,20 @@
 import functools
 import itertools
 import json
+from importlib import metadata
+from pathlib import Path
 
+import jax
 import numpy as np
 import xarray as xr
 
-from . import arguments
+from . import arguments, checkpoint
 from .critical import critical_friction
 from .event_exact import EventExact
-from .lanes import run_to_verdict
+from .lanes import MOST_STEPS, Outcome, run_to_verdict
 from .load import Pulse
 from .precision import in_double_precision
-from .results import labelled
+from .results import describe, labelled
 from .scene import Scene
 from .steppers import AbstractStepper
 from .verdict import MEANING, Verdict
@@ -27,7 +30,9 @@ def bistability_map(
     method: AbstractStepper | None = None,
     t_max: float = 20.0,
     memory: float = 2e9,
+    max_steps: int = MOST_STEPS,
     progress: bool | None = None,
+    resume: str | Path | None = None,
     energy: bool = False,
     **axes,
 ) -> xr.Dataset:
@@ -43,7 +48,11 @@ def bistability_map(
     - `method`: how to step, `EventExact()` unless given.
     - `t_max`: time after which a lane without a verdict is called undecided, in s.
     - `memory`: how much memory the lanes under way may take, in bytes.
+    - `max_steps`: steps after which a lane without a verdict is called a step failure.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
+    - `resume`: a file in which finished lanes are kept while the map runs, every few seconds. If it exists, the map goes on
+      from there: interrupted in whatever way and called again, the same call gives the same map, bit for bit. The file stays;
+      delete it when the map is saved.
     - `energy`: whether to keep each lane's energy ledger up to its verdict (see `fivjax.energy`): the works, the energy
       lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
       error of the balance on the way, with `energy_exchanged` to measure it against. It makes a map some ten times slower.
@@ -56,10 +65,11 @@ def bistability_map(
     friction of linear theory.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
-    not increasing, and values that the scene refuses.
+    not increasing, values that the scene refuses, and a `resume` file that belongs to another run.
     """
     method = EventExact() if method is None else method
     _check_run(scene, method, t_max, memory)
+    arguments.whole_number("max_steps", max_steps, minimum=1)
     arguments.truth("energy", energy)
     if not axes:
         raise ValueError(
@@ -69,14 +79,20 @@ def bistability_map(
     axes = _checked_axes(scene, axes)
     shape = tuple(len(values) for values in axes.values())
     grid = np.meshgrid(*axes.values(), indexing="ij")
+    known, keep = _kept(
+        resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}, axes
+    )
     outcome = run_to_verdict(
         scene,
         {name: values.ravel() for name, values in zip(axes, grid, strict=True)},
         method,
         t_max=t_max,
         memory=memory,
+        max_steps=max_steps,
         progress=progress,
         label="map",
+        known=known,
+        keep=keep,
         energy=bool(energy),
     )
     dataset = xr.Dataset(
@@ -283,6 +299,32 @@ def _narrowed(run, method, columns, brackets: np.ndarray, tolerance: float) -> n
 def _widened(brackets: np.ndarray, by: float) -> np.ndarray:
     width = np.where(np.diff(brackets) > 0, by, 0.0)
     return brackets + width * np.array([-1.0, 1.0])
+
+
+def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits: dict, axes: dict[str, np.ndarray]):
+    """What an earlier run has left in the file, and how to keep more there."""
+    if path is None:
+        return None, None
+    arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part"')
+    run = {
+        "fivjax": metadata.version("fivjax"),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "scene": describe(scene),
+        "method": repr(method),
+        **limits,
+        "axes": {name: values.tolist() for name, values in axes.items()},
+    }
+    found = checkpoint.recall(path, run)
+    if found is not None:
+        parts = {name: found.pop(name) for name in Outcome._fields if name != "energy"}
+        found = Outcome(**parts, energy=found)
+
+    def keep(outcome: Outcome) -> None:
+        parts = outcome._asdict()
+        checkpoint.keep(path, run, {**parts.pop("energy"), **parts})
+
+    return found, keep
 
 
 def _add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:

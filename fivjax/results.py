@@ -1,5 +1,6 @@
 """Results as labelled datasets: units, coordinates, provenance, and a file that is whole or absent."""
 
+import io
 import json
 import os
 import tempfile
@@ -164,28 +165,37 @@ def check_writable(path: str | Path) -> Path:
 def save(dataset: xr.Dataset, path: str | Path) -> Path:
     """Write a dataset as NetCDF; the file appears under its name only when it is whole.
 
-    **Raises:** `ValueError` for a path that cannot be written.
+    **Raises:** `ValueError` for a path that cannot be written, `OSError` where the disk is full.
     """
     arguments.instance("dataset", dataset, xr.Dataset, "an xarray Dataset, such as a map or `run.to_dataset()`")
-    return _replace_whole(check_writable(path), lambda part: dataset.to_netcdf(part, engine="h5netcdf"))
+    path = check_writable(path)
+    # Made in memory: HDF5 brings the whole process down where a disk is full.
+    content = io.BytesIO()
+    dataset.to_netcdf(content, engine="h5netcdf")
+    return _replace_whole(path, content.getvalue())
 
 
 def save_figure(figure, path: str | Path, **options) -> Path:
     """Write a matplotlib figure; the file appears under its name only when it is whole.
 
-    **Raises:** `ValueError` for a path that cannot be written.
+    **Raises:** `ValueError` for a path that cannot be written, `OSError` where the disk is full.
     """
     path = check_writable(path)
     options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}
-    return _replace_whole(path, lambda part: figure.savefig(part, **options))
+    content = io.BytesIO()
+    figure.savefig(content, **options)
+    return _replace_whole(path, content.getvalue())
 
 
-def _replace_whole(path: Path, write) -> Path:
+def _replace_whole(path: Path, content: bytes) -> Path:
     # Beside the target, so that the final rename stays within one file system and cannot be half done.
     handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
-    os.close(handle)
     try:
-        write(part)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            # On the disk before it has its name: a machine that loses power keeps the old file or the new one.
+            os.fsync(file.fileno())
         # `mkstemp` makes private files; a result has the permissions of any other new file.
         mask = os.umask(0)
         os.umask(mask)

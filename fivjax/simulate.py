@@ -12,13 +12,14 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
-from .contact import Contact, Mechanics, State
+from .contact import Contact, Mechanics, State, Status
 from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
 from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding, rates
+from .verdict import ENDING, Ending
 
 
 class Trajectory(eqx.Module):
@@ -34,6 +35,12 @@ class Trajectory(eqx.Module):
     load: Float[Array, " T"]  # N
     scene: Scene
     energy: Energy | None = None  # the ledger, when asked for
+    outcome: Int[Array, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
+
+    @property
+    def meaning(self) -> str:
+        """How the trajectory ended, in a sentence."""
+        return ENDING[Ending(int(self.outcome))]
 
     @property
     def slip_velocity(self) -> Float[Array, " T"]:
@@ -62,7 +69,9 @@ class Trajectory(eqx.Module):
         )
         if self.energy is not None:
             dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
-        return labelled(dataset, self.scene)
+        return labelled(dataset, self.scene).assign_attrs(
+            outcome=Ending(int(self.outcome)).name.lower(), meaning=self.meaning
+        )
 
 
 @in_double_precision
@@ -88,7 +97,8 @@ def simulate(
     - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
-    being finite, or contact events come without end, the rows from there on are NaN.
+    being finite, or contact events come without end, the rows from there on are NaN; `run.outcome` (an `Ending`) and
+    `run.meaning` (a sentence) say which.
 
     **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
     equilibrium to start from, or friction beyond Painlevé's limit.
@@ -105,8 +115,42 @@ def simulate(
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    rows = _simulate(scene, method, y0, saved, most, bool(energy))
-    return Trajectory(**jax.tree.map(known_to_numpy, rows), scene=scene)
+    rows = jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most, bool(energy)))
+    return Trajectory(**rows, scene=scene, outcome=_ending(scene, method, rows, most))
+
+
+def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:
+    """How the rows end: an `Ending`. Under a transformation, where no one can look, every failure is not finite."""
+    finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
+    if not is_known(finite):
+        return jnp.where(jnp.all(finite), Ending.FINISHED, Ending.NOT_FINITE).astype(jnp.int8)
+    if np.all(finite):
+        return np.int8(Ending.FINISHED)
+    first = int(np.argmin(finite))
+    if first == 0:
+        return np.int8(Ending.NOT_FINITE)
+    start = jnp.concatenate([rows["displacement"][first - 1], rows["velocity"][first - 1]])
+    events, reached = _events_from(scene, method, real(rows["t"][first - 1]), start, most)
+    if not np.all(np.isfinite(reached)):
+        return np.int8(Ending.NOT_FINITE)
+    return np.int8(Ending.TOO_MANY_EVENTS if 2 * int(events) > most else Ending.STEP_FAILURE)
+
+
+@eqx.filter_jit
+def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: int):
+    """How many of the next `most` advances end in an event, and the state after them."""
+    mechanics = Mechanics(scene)
+
+    def body(_, carry):
+        y, contact, events = carry
+        after = method.advance(mechanics, contact, scene.load(t), y, jnp.asarray(method.dt, y.dtype))
+        # A rebound keeps its status; it ends on the belt all the same.
+        landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
+        return after.y, after.contact, events + (landed | (after.contact.status != contact.status))
+
+    contact = physics.status_from_forces(mechanics, scene.load(t), y)
+    y, _, events = jax.lax.fori_loop(0, most, body, (y, contact, jnp.zeros((), jnp.int32)))
+    return events, y
 
 
 @eqx.filter_jit

@@ -14,6 +14,17 @@ class Verdict(enum.IntEnum):
     PAINLEVE = -4
     NOT_RUN = -5
     TOO_MANY_EVENTS = -6
+    UNBOUNDED = -7
+    STEP_FAILURE = -8
+
+
+class Ending(enum.IntEnum):
+    """How a single trajectory ended; the negative codes are those of `Verdict`, and `ENDING` has a sentence for each."""
+
+    FINISHED = 0
+    NOT_FINITE = Verdict.NOT_FINITE
+    TOO_MANY_EVENTS = Verdict.TOO_MANY_EVENTS
+    STEP_FAILURE = Verdict.STEP_FAILURE
 
 
 MEANING = {
@@ -23,6 +34,21 @@ MEANING = {
     Verdict.NOT_FINITE: "the state stopped being finite; take a smaller step or check the parameters",
     Verdict.NO_EQUILIBRIUM: "no steady sliding to start from; change the load or the friction",
     Verdict.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé); lower it",
-    Verdict.TOO_MANY_EVENTS: "contact events came without end at one instant; look at the lane with `simulate`",
+    Verdict.TOO_MANY_EVENTS: "contact events came without end at one instant; "
+    "change the restitution or the belt speed a little",
+    Verdict.UNBOUNDED: "grows without bound: it sticks for ever, pressed on ever harder, or has grown a billionfold; "
+    "lower the friction or the belt's inclination",
+    Verdict.STEP_FAILURE: "its fastest vibration needs more steps than `max_steps` to reach a verdict; raise that, "
+    "lower `t_max`, or soften what is stiffest",
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",
+}
+
+ENDING = {
+    Ending.FINISHED: "reached its end",
+    Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
+    "parameters",
+    Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
+    "change the restitution or the belt speed a little",
+    Ending.STEP_FAILURE: "the fastest vibration needs too many steps between two saved rows, and the rows from there on are "
+    "NaN; lower `dt_save`",
 }

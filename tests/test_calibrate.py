@@ -83,7 +83,7 @@ def test_limit_cycle_with_sticking_and_detachment():
     assert max(scores(fit, scene).values()) < 4
 
 
-@pytest.mark.parametrize("regime", ["sliding", "kick"])
+@pytest.mark.parametrize("regime", ["sliding", pytest.param("kick", marks=pytest.mark.slow)])
 def test_friction_from_a_quiet_run_is_not_identifiable(regime):
     """Noise alone has peaks to be fitted; were they taken for a vibration, friction would come out with small errors."""
     noise = np.random.default_rng(3).normal(size=(20_000, 2))

@@ -362,13 +362,10 @@ def breaks_midway(monkeypatch):
     """Datasets and figures whose writing fails after some bytes: a full disk, an interrupt."""
 
     def make(error):
-        def write(self, path, **_):
-            with open(path, "wb") as file:
-                file.write(b"half of it")
+        def sync(_):
             raise error
 
-        monkeypatch.setattr(xr.Dataset, "to_netcdf", write)
-        monkeypatch.setattr(Figure, "savefig", write)
+        monkeypatch.setattr(results.os, "fsync", sync)
         return {fj.save: DATASET, fj.save_figure: Figure()}
 
     return make

@@ -1,0 +1,179 @@
+"""Long runs: interrupted at any moment, resumed, and bit for bit what they would have been."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import killed_map
+import numpy as np
+import pytest
+import xarray as xr
+
+import fivjax as fj
+from fivjax import checkpoint, cli, lanes
+
+AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    monkeypatch.setattr(lanes, "KEEP_EVERY", 0.0)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, fj.Pulse(100.0, 1.2))
+    return fj.bistability_map(scene, progress=False, **AXES)
+
+
+def same(a: xr.Dataset, b: xr.Dataset) -> bool:
+    """Bit for bit: also the NaN of one are the NaN of the other."""
+    return set(a.data_vars) == set(b.data_vars) and all(
+        a[name].dtype == b[name].dtype and a[name].values.tobytes() == b[name].values.tobytes() for name in a.data_vars
+    )
+
+
+@pytest.mark.parametrize("calls", [1, 4, 9])
+def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
+    paper_scene, whole, tmp_path, monkeypatch, at_once, calls
+):
+    """Were a lane's result to depend on what runs beside it, or half a record kept, the maps would differ."""
+    real, made = lanes._follow, []
+
+    def interrupted(*args):
+        made.append(1)
+        if len(made) == calls:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    path = tmp_path / "map.part"
+    monkeypatch.setattr(lanes, "_follow", interrupted)
+    with pytest.warns(UserWarning, match="Interrupted"):
+        first = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    open_ = first["verdict"] == fj.Verdict.NOT_RUN
+    assert np.any(open_)
+    # What was finished when the interrupt came is on the disk, and only that.
+    with xr.open_dataset(path, engine="h5netcdf") as kept:
+        np.testing.assert_array_equal(kept["verdict"], first["verdict"].values.ravel())
+    resumed = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    assert same(resumed, whole)
+    # A finished map runs nothing again.
+    monkeypatch.setattr(lanes, "_run_block", None)
+    assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
+
+
+def test_an_interrupt_inside_a_record_makes_no_lane_look_finished():
+    """Were the verdict written first, an interrupt behind it would leave a lane with a verdict and no amplitude."""
+
+    class Unreadable:
+        verdict = np.array([1])
+        account = None
+
+        @property
+        def orbit(self):
+            raise KeyboardInterrupt
+
+    outcome = lanes.Outcome(
+        np.full(1, fj.Verdict.NOT_RUN, np.int8), np.ones(1), np.ones(1), np.ones(1, np.int32), np.ones(1), {}
+    )
+    with pytest.raises(KeyboardInterrupt):
+        lanes._record(outcome, np.array([0]), Unreadable())
+    assert outcome.verdict[0] == fj.Verdict.NOT_RUN
+
+
+@pytest.mark.parametrize(
+    ("change", "fragment"),
+    [
+        (dict(mu=[0.1, 0.2, 0.226]), "`mu`"),
+        (dict(t_max=19.0), "`t_max` is 20.0 and not 19.0"),
+        (dict(method=fj.WhereSwitched()), "`method`"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(paper_scene, whole, tmp_path, change, fragment):
+    """Were it taken, results of two different runs would stand in one map."""
+    path = tmp_path / "map.part"
+    fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=fragment):
+        fj.bistability_map(paper_scene, progress=False, resume=path, **{**AXES, **change})
+    with pytest.raises(ValueError, match=r"`force` is 100\.0 and not 90\.0"):
+        fj.bistability_map(paper_scene.replace(force=90.0), progress=False, resume=path, **AXES)
+    assert path.read_bytes() == before
+
+
+def test_a_full_disk_costs_nothing_that_was_finished(paper_scene, whole, tmp_path, monkeypatch, at_once):
+    """Were the run stopped or the older checkpoint broken by a failing write, a night would be lost."""
+    path, real, calls = tmp_path / "map.part", os.fsync, []
+
+    def full(handle):
+        calls.append(1)
+        if len(calls) % 2 == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr("fivjax.results.os.fsync", full)
+    with pytest.warns(UserWarning, match="No space left on device"):
+        m = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    assert same(m, whole)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
+    with xr.open_dataset(path, engine="h5netcdf") as kept:
+        assert kept.attrs["kind"] == checkpoint.KIND
+
+
+def test_a_disk_that_is_really_full_brings_nothing_down(tmp_path):
+    """Were HDF5 let near it, the process would end in a segmentation fault; here it ends in a sentence."""
+    program = (
+        "import resource, sys, numpy as np, xarray as xr, fivjax as fj\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try: fj.save(xr.Dataset({'a': ('x', np.random.default_rng(0).random(100_000))}), sys.argv[1])\n"
+        "except OSError as error: print(error.strerror)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "a.nc")], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout.strip(), list(tmp_path.iterdir())) == (0, "File too large", [])
+
+
+def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
+    """Were it overwritten, a mistyped path would cost a file."""
+    text, result = tmp_path / "notes.txt", tmp_path / "result.nc"
+    text.write_text("notes")
+    fj.save(xr.Dataset({"a": ("x", np.arange(3.0))}), result)
+    for path in (text, result):
+        before = path.read_bytes()
+        with pytest.raises(ValueError, match="is not a checkpoint of fivjax"):
+            fj.bistability_map(paper_scene, p=[1.1], resume=path)
+        assert path.read_bytes() == before
+
+
+def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, monkeypatch):
+    """Were it begun anew without a word, what the interrupted one had finished would be gone."""
+    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)
+    (tmp_path / "map.unfinished").write_bytes(b"hours of work")
+    assert cli.main(["map", "--out", str(tmp_path / "map")]) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert (tmp_path / "map.unfinished").read_bytes() == b"hours of work"
+
+
+def test_a_killed_command_is_resumed_bit_for_bit(tmp_path):
+    """kill -9 at an instant of its own choosing, then SIGTERM, then to the end: the same map as without."""
+    cache = tmp_path / "cache"
+    folders = {name: tmp_path / name for name in ("whole", "killed")}
+    for folder in folders.values():
+        folder.mkdir()
+    assert killed_map.run(folders["whole"], cache=cache).returncode == 0
+    assert {path.name for path in folders["whole"].iterdir()} == {"map.nc", "map.png"}
+    assert killed_map.run(folders["killed"], "SIGKILL", 0.05, cache).returncode == -9
+    assert not (folders["killed"] / "map.nc").exists()
+    ended = killed_map.run(folders["killed"], "SIGTERM", 0.05, cache)
+    assert ended.returncode == 130, ended.stderr
+    assert "--resume" in ended.stderr and "Traceback" not in ended.stderr
+    assert not (folders["killed"] / "map.nc").exists()
+    assert killed_map.run(folders["killed"], cache=cache).returncode == 0
+    maps = [xr.open_dataset(folder / "map.nc", engine="h5netcdf").load() for folder in folders.values()]
+    assert same(*maps)
+    assert json.loads(maps[0].attrs["counts"])["not_run"] == 0
+    assert not (folders["killed"] / "map.unfinished").exists()
