@@ -13,8 +13,10 @@ from fivjax.tradeoff import recommend, table
 @pytest.fixture(scope="module")
 def measured():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
-    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "fine": fj.WhereSwitched(dt=2e-5), "exact": fj.EventExact()}
-    return fj.tradeoff(scene, methods=methods, t1=0.15, lanes=4, boundary=False, progress=False)
+    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "exact": fj.EventExact()}
+    return fj.tradeoff(
+        scene, methods=methods, t1=0.15, lanes=4, precisions=("float64",), boundary=False, progress=False
+    )
 
 
 def test_state_errors_are_those_against_the_oracle(measured):
@@ -39,9 +41,6 @@ def test_state_errors_are_those_against_the_oracle(measured):
 
 def test_costs_are_costs_and_parts_are_named(measured):
     assert (measured["cost"] > 0).all() and measured["cost"].attrs["units"] == "s"
-    assert float(measured["cost"].sel(stepper="fine", precision="float64")) > float(
-        measured["cost"].sel(stepper="coarse", precision="float64")
-    )
     assert {"end state alone", "energy ledger", "stored output, 1000 rows"} <= set(measured["part"].values.tolist())
 
 
