@@ -217,6 +217,55 @@ def guards_under(
     )
 
 
+def magnitudes(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
+) -> tuple[Float[Array, "2"], State]:
+    """Sizes of the largest terms that the guards and the rates are sums of: their rounding is that share of these.
+
+    `y` holds sizes, too. Where a stiff structure presses hard, forces are small differences of huge terms; whether one
+    is zero is a question that only these sizes answer.
+    """
+    n = _n(y)
+    free = jnp.abs(mechanics.free_load) * jnp.abs(load)
+    for j in range(n):
+        free = free + jnp.abs(mechanics.free_position[:, j]) * y[j] + jnp.abs(mechanics.free_velocity[:, j]) * y[n + j]
+    g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
+    _, tn, _ = mechanics.compliance
+    free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
+    determinant = g_tt * g_nn - tn**2
+    static = mechanics.friction.static
+    compliance = jnp.abs(mechanics.normal_compliance(contact.direction, static))
+    sliding_n = free_n / jnp.where(compliance > 0, compliance, 1.0)
+    none = jnp.zeros_like(free_n)
+    tangential_force = _by_status(
+        contact, stick=(g_tn * free_n + g_nn * free_t) / determinant, slide=static * sliding_n, detach=none
+    )
+    normal_force = _by_status(
+        contact, stick=(g_tn * free_t + g_tt * free_n) / determinant, slide=sliding_n, detach=none
+    )
+    slip = y[n + mechanics.tangential] + jnp.abs(mechanics.belt_speed)
+    edge = static * normal_force + tangential_force
+    guards = _by_status(
+        contact,
+        stick=jnp.stack([edge, edge]),
+        slide=jnp.stack([normal_force, slip]),
+        detach=jnp.stack([y[mechanics.normal]] * 2),
+    )
+    acceleration = (
+        free + jnp.abs(mechanics.from_tangential) * tangential_force + jnp.abs(mechanics.from_normal) * normal_force
+    )
+    return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
+
+
+def on_constraint_rates(mechanics: Mechanics, contact: Contact, rates: State) -> State:
+    """Rates with what the status forbids set to exactly zero: those of the gap, and creep while sticking."""
+    n = _n(rates)
+    touching, sticking = contact.status != Status.DETACH, contact.status == Status.STICK
+    index = jnp.arange(2 * n)
+    held = touching & ((index == mechanics.normal) | (index == n + mechanics.normal))
+    return jnp.where(held | (sticking & (index == n + mechanics.tangential)), 0.0, rates)
+
+
 def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
     """The state with what the status forbids set to exactly zero: gap and its rate, and creep while sticking."""
     touching = contact.status != Status.DETACH

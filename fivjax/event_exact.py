@@ -30,6 +30,8 @@ ROUNDING = 1e-12
 ROUNDING_OF_SLOPES = 1e-9
 # Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
 RESTING = 1e-7
+# Or if it is this many roundings of the terms that it is a sum of.
+ROUNDINGS = 16
 MOST_ROOT_STEPS = 60
 
 
@@ -93,12 +95,15 @@ class EventExact(AbstractStepper):
         # The last row watches the tangential velocity rise through zero: not an event of the contact, but where orbits
         # are compared, see `orbit`.
         states, guards = _series(mechanics, contact, load, y, self.order_)
+        rounding = _rounding(mechanics, contact, load, y)
         reach = jnp.minimum(jnp.minimum(h, self.dt), _trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
             scaled.append(guard * power)
             power = power * reach
-        safe, fires = _march_to_roots([jax.lax.stop_gradient(c) for c in scaled])
+        safe, fires = _march_to_roots(
+            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)]
+        )
         watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
         safe, fires = jnp.where(watching, safe, 1.0), fires & watching
         first = jnp.min(safe)
@@ -164,6 +169,20 @@ def _series(
     return states[: order + 1], guards
 
 
+def _rounding(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> list[Float[Array, "3"]]:
+    """What rounding leaves of the first three coefficients of the guards where they are zero."""
+    eps = jnp.finfo(y.dtype).eps
+    mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
+    at_rest = eqx.tree_at(lambda m: m.belt_speed, mechanics, jnp.zeros_like(load))
+    sizes, found = jnp.abs(y), []
+    for k in range(3):
+        own, force = (mechanics, load) if k == 0 else (at_rest, jnp.zeros_like(load))
+        guards, rates = physics.magnitudes(own, contact, force, sizes)
+        found.append(ROUNDINGS * eps * jnp.concatenate([guards, jnp.zeros_like(guards[:1])]))
+        sizes = rates / (k + 1)
+    return found
+
+
 def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
     """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in s."""
     order, n = len(states) - 1, states[0].shape[0] // 2
@@ -180,7 +199,9 @@ def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
     return jnp.minimum(reach(order), reach(order - 1))
 
 
-def _march_to_roots(c: list[Float[Array, " g"]]) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
+def _march_to_roots(
+    c: list[Float[Array, " g"]], rounding: list[Float[Array, " g"]] | None = None
+) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
     March from zero by steps over which a root is impossible: a lower bound on the second derivative gives
@@ -193,7 +214,8 @@ def _march_to_roots(c: list[Float[Array, " g"]]) -> tuple[Float[Array, " g"], Bo
     eps = jnp.finfo(c[0].dtype).eps
     size = sum(jnp.abs(ck) for ck in c)
     shares = (ROUNDING, ROUNDING_OF_SLOPES, ROUNDING_OF_SLOPES)
-    zero = [jnp.abs(ck) <= size * share for ck, share in zip(c, shares, strict=False)]
+    rounding = [jnp.zeros_like(size)] * 3 if rounding is None else rounding
+    zero = [jnp.abs(ck) <= jnp.maximum(size * share, r) for ck, share, r in zip(c, shares, rounding, strict=False)]
     none = jnp.zeros_like(size)
     for starts_at_zero in reversed(_running_and(zero)):
         c = [jnp.where(starts_at_zero, following, own) for own, following in zip(c, [*c[1:], none], strict=True)]

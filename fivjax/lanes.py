@@ -355,8 +355,7 @@ def _run_block(
         while True:
             verdict, t = lanes.verdict, lanes.t
             if done >= max_steps:
-                out_of_steps = np.where(lanes.events > done // 2, Verdict.TOO_MANY_EVENTS, Verdict.STEP_FAILURE)
-                verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), out_of_steps, verdict)
+                verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), Verdict.STEP_FAILURE, verdict)
                 lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
             finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
             _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))

@@ -30,6 +30,8 @@ TURN = 0.35
 ORDER = 14
 # A guard whose first coefficients are this much smaller than all of them together starts at zero, but for rounding.
 ROUNDING = (1e-12, 1e-9, 1e-9)
+# Or if they are this many roundings of the terms that they are sums of.
+ROUNDINGS = 16
 # Rebounds shorter than this share of an interval are at rest.
 RESTING = 1e-7
 MOST_ROOT_STEPS = 60
@@ -44,6 +46,7 @@ class Propagators(eqx.Module):
     interval: Float[Array, ""]  # between two samples, s
     window: Float[Array, "r c"]  # samples of guards, samples of states, series of the guards at the start
     series: Float[Array, "q c"]  # series of the guards and of the displacements, in units of the interval
+    rounding: Float[Array, "6 c"]  # of the first three terms of the guards' series, on sizes of what the others act on
 
 
 class Windowed(eqx.Module):
@@ -65,12 +68,14 @@ class Windowed(eqx.Module):
         mechanics = prepared.mechanics
         n = y.shape[0] // 2
         steps = jnp.minimum(h / prepared.interval, INTERVALS)
-        samples = _Samples(prepared.window @ _stacked(mechanics, contact, load, list(y)), n, mechanics.tangential)
+        here = _stacked(mechanics, contact, load, list(y))
+        samples = _Samples(prepared.window @ here, prepared.rounding @ jnp.abs(here), n, mechanics.tangential)
         none = jnp.zeros_like(load)
 
         interval = _stage(lambda: _safe_intervals(samples, steps), none.astype(jnp.int32))
         there = _stage(lambda: samples.state_at(interval), [none] * 2 * n)
-        series = _Series(prepared.series @ _stacked(mechanics, contact, load, there), n, mechanics.tangential)
+        there = _stacked(mechanics, contact, load, there)
+        series = _Series(prepared.series @ there, prepared.rounding @ jnp.abs(there), n, mechanics.tangential)
         inside = interval < INTERVALS
         brackets = _dipped(series, _stage(lambda: series.brackets(inside), [_no_bracket(none)] * 3))
         roots = _polished(series, brackets)
@@ -114,8 +119,9 @@ def propagators(mechanics: Mechanics) -> Propagators:
     ways = [_affine(mechanics, way) for way in _ways(mechanics.free_load.dtype)]
     fastest = jnp.max(jnp.stack([_spectral_radius(generator) for generator, _ in ways]))
     interval = TURN / fastest
-    window, series = [], []
-    for (generator, guards), used in zip(ways, _columns(n, mechanics.normal), strict=True):
+    window, series, rounding = [], [], []
+    columns = zip(_ways(mechanics.free_load.dtype), ways, _columns(n, mechanics.normal), strict=True)
+    for contact, (generator, guards), used in columns:
         powers = [jnp.eye(2 * n + 2, dtype=generator.dtype)]
         for k in range(ORDER + 1):
             powers.append(powers[-1] @ generator * (interval / (k + 1)))
@@ -129,7 +135,10 @@ def propagators(mechanics: Mechanics) -> Propagators:
         paths = _rows([power[:n] for power in powers])
         window.append(jnp.concatenate([guard_samples, states, guard_series])[:, used])
         series.append(jnp.concatenate([guard_series, paths])[:, used])
-    return Propagators(mechanics, interval, jnp.concatenate(window, axis=1), jnp.concatenate(series, axis=1))
+        sizes, rates = _magnitudes(mechanics, contact)
+        terms = [sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)]
+        rounding.append(ROUNDINGS * jnp.finfo(sizes.dtype).eps * _rows(terms)[:, used])
+    return Propagators(mechanics, interval, *(jnp.concatenate(rows, axis=1) for rows in (window, series, rounding)))
 
 
 def _rows(matrices: list[Float[Array, "k c"]]) -> Float[Array, "r c"]:
@@ -187,6 +196,21 @@ def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"]
     return jnp.concatenate([matrix(rates), unchanging]), matrix(guards)
 
 
+def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2 m"], Float[Array, "m m"]]:
+    """`contact.magnitudes` as matrices on the sizes of (state, load, 1): of the guards, and of the rates."""
+    n = mechanics.free_load.shape[0]
+
+    def sizes(v):
+        guards, rates = physics.magnitudes(mechanics, contact, v[2 * n], v[: 2 * n])
+        return jnp.concatenate([guards, rates])
+
+    zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
+    # The load is a size like the others: the slope of its own size at zero is one.
+    matrix = jnp.concatenate([jax.jacfwd(sizes)(zero.at[2 * n].set(1.0)), sizes(zero)[:, None]], axis=1)
+    unchanging = jnp.zeros((2, 2 * n + 2), zero.dtype)
+    return matrix[:2], jnp.concatenate([matrix[2:], unchanging])
+
+
 def _spectral_radius(matrix: Float[Array, "m m"]) -> Float[Array, ""]:
     """By Gelfand's formula, the 64th root of the size of the 64th power: a little too large, never too small."""
     log_size = jnp.zeros((), matrix.dtype)
@@ -205,6 +229,7 @@ class _Samples(eqx.Module):
     """
 
     rows: Float[Array, " r"]
+    rounding: Float[Array, "6"]
     n: int = eqx.field(static=True)
     tangential: int = eqx.field(static=True)
 
@@ -247,6 +272,7 @@ class _Series(eqx.Module):
     """Taylor series of one lane from the beginning of an interval, in units of the interval."""
 
     rows: Float[Array, " q"]
+    rounding: Float[Array, "6"]
     n: int = eqx.field(static=True)
     tangential: int = eqx.field(static=True)
 
@@ -263,7 +289,13 @@ class _Series(eqx.Module):
     def brackets(self, inside: Bool[Array, ""]) -> list["_Bracket"]:
         """Of each watched polynomial; at the end of the window, not `inside` an interval, there is nothing to look for."""
         first, second, falling = self.watched
-        return [_bracket(first, inside), _bracket(second, inside), _bracket(falling, inside & (falling[0] > 0))]
+        rounding = _cut(self.rounding, 2, 3, 0)
+        none = [jnp.zeros_like(falling[0])] * 3
+        return [
+            _bracket(first, rounding[0], inside),
+            _bracket(second, rounding[1], inside),
+            _bracket(falling, none, inside & (falling[0] > 0)),
+        ]
 
     def state(self, x: Float[Array, ""]) -> list[Float[Array, ""]]:
         """Displacements, and velocities in m per interval."""
@@ -291,26 +323,27 @@ def _safe_intervals(samples: _Samples, steps: Float[Array, ""]) -> Int[Array, ""
             lowest_inside = (slope[k - 1] < 0.2 * b) & (slope[k] > -0.2 * b)
             unsafe[k] = unsafe[k] | (g[k + 1] <= 0) | (lowest_inside & (jnp.minimum(g[k], g[k + 1]) <= 0.25 * b))
     # In the first interval a guard may start at zero, because its status has just begun.
-    unsafe[0] = unsafe[0] | ~(_stays_positive(start[0]) & _stays_positive(start[1]))
+    rounding = _cut(samples.rounding, 2, 3, 0)
+    unsafe[0] = unsafe[0] | ~(_stays_positive(start[0], rounding[0]) & _stays_positive(start[1], rounding[1]))
     first = jnp.full_like(steps, INTERVALS)
     for k in reversed(range(INTERVALS)):
         first = jnp.where(unsafe[k], 1.0 * k, first)
     return jnp.minimum(first, jnp.floor(steps)).astype(jnp.int32)
 
 
-def _stays_positive(c: list[Float[Array, ""]]) -> Bool[Array, ""]:
+def _stays_positive(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]]) -> Bool[Array, ""]:
     """Whether the first coefficient that is not zero outweighs all the negative ones after it."""
-    zeros, lead = _start(c)
+    zeros, lead = _start(c, rounding)
     return lead + sum(jnp.where(zeros < k, jnp.minimum(ck, 0.0), 0.0) for k, ck in enumerate(c)) > 0
 
 
-def _start(c: list[Float[Array, ""]]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def _start(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]]) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
     size = sum(jnp.abs(ck) for ck in c)
-    zero = jnp.abs(c[0]) <= size * ROUNDING[0]
+    zero = jnp.abs(c[0]) <= jnp.maximum(size * ROUNDING[0], rounding[0])
     zeros, lead = zero.astype(jnp.int32), jnp.where(zero, c[1], c[0])
     for k in (1, 2):
-        zero = zero & (jnp.abs(c[k]) <= size * ROUNDING[k])
+        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(size * ROUNDING[k], rounding[k]))
         zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
     return zeros, lead
 
@@ -331,8 +364,8 @@ def _no_bracket(like: Float[Array, ""]) -> _Bracket:
     return _Bracket(like, jnp.zeros_like(like, jnp.int32), like, no, no, no)
 
 
-def _bracket(c: list[Float[Array, ""]], watch: Bool[Array, ""]) -> _Bracket:
-    zeros, lead = _start(c)
+def _bracket(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]], watch: Bool[Array, ""]) -> _Bracket:
+    zeros, lead = _start(c, rounding)
     end = sum((jnp.where(zeros > k, 0.0, c[k]) for k in range(3)), sum(c[3:]))
     spent = watch & (lead < 0)
     crosses = watch & (lead >= 0) & (end <= 0)
