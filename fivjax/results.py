@@ -175,6 +175,14 @@ def save_figure(figure, path: str | Path, **options) -> Path:
     return _replace_whole(path, lambda part: figure.savefig(part, **options))
 
 
+def save_text(text: str, path: str | Path) -> Path:
+    """Write a text in UTF-8; the file appears under its name only when it is whole.
+
+    **Raises:** `ValueError` for a path that cannot be written.
+    """
+    return _replace_whole(check_writable(path), lambda part: Path(part).write_text(text, encoding="utf-8"))
+
+
 def _replace_whole(path: Path, write) -> Path:
     # Beside the target, so that the final rename stays within one file system and cannot be half done.
     handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
