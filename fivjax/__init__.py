@@ -21,6 +21,7 @@ from .load import ConstantLoad as ConstantLoad
 from .load import Pulse as Pulse
 from .maps import bistability_map as bistability_map
 from .maps import critical_perturbation as critical_perturbation
+from .reproduce import reproduce as reproduce
 from .results import save as save
 from .results import save_figure as save_figure
 from .scene import Scene as Scene

@@ -187,6 +187,14 @@ def save_figure(figure, path: str | Path, **options) -> Path:
     return _replace_whole(path, content.getvalue())
 
 
+def save_text(text: str, path: str | Path) -> Path:
+    """Write a text in UTF-8; the file appears under its name only when it is whole.
+
+    **Raises:** `ValueError` for a path that cannot be written.
+    """
+    return _replace_whole(check_writable(path), text.encode())
+
+
 def _replace_whole(path: Path, content: bytes) -> Path:
     # Beside the target, so that the final rename stays within one file system and cannot be half done.
     handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
