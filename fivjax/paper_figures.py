@@ -868,7 +868,7 @@ def _until(run: Trajectory, t: float) -> Trajectory:
     """The first part of a run, for a picture that would otherwise be all limit cycle."""
     count = int(np.searchsorted(run.t, t, side="right"))
     rows = {name: value for name, value in vars(run).items() if name != "scene"}
-    return Trajectory(**jax.tree.map(lambda leaf: leaf[:count], rows), scene=run.scene)
+    return Trajectory(**jax.tree.map(lambda leaf: leaf[:count] if np.ndim(leaf) else leaf, rows), scene=run.scene)
 
 
 FIGURES: dict[str, Callable[[Runs], Made]] = {
