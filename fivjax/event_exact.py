@@ -31,7 +31,7 @@ ROUNDING_OF_SLOPES = 1e-9
 # Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
 RESTING = 1e-7
 # Or if it is this many roundings of the terms that it is a sum of.
-ROUNDINGS = 16
+ROUNDINGS = 64
 MOST_ROOT_STEPS = 60
 
 

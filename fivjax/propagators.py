@@ -31,7 +31,7 @@ ORDER = 14
 # A guard whose first coefficients are this much smaller than all of them together starts at zero, but for rounding.
 ROUNDING = (1e-12, 1e-9, 1e-9)
 # Or if they are this many roundings of the terms that they are sums of.
-ROUNDINGS = 16
+ROUNDINGS = 64
 # Rebounds shorter than this share of an interval are at rest.
 RESTING = 1e-7
 MOST_ROOT_STEPS = 60

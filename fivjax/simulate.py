@@ -161,6 +161,9 @@ def _simulate(
     books = Books(scene) if energy else None
     y, contacts, ledgers = states_at(scene, method, y0, saved, most, books)
     load = jax.vmap(scene.load)(saved)
+    # A row on a jump of the load shows what follows from it, as its load does.
+    on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
+    contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
         contacts, load, y
@@ -176,6 +179,13 @@ def _simulate(
         "load": load,
         "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
     }
+
+
+def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
+    """The contact after a jump of the load, if there is one `now`."""
+    ended = now & (physics.guards(mechanics, contact, load, y) < 0)
+    after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
+    return after
 
 
 def states_at(

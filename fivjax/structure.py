@@ -184,7 +184,8 @@ def _check_matrix(name: str, matrix, *, definite: bool) -> None:
     # Judged after scaling the diagonal to one, so that masses of very different size do not look indefinite.
     diagonal = np.diag(array)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    lowest = np.linalg.eigvalsh(array * np.outer(scale, scale))[0]
+    # One side after the other: of the smallest numbers there are, the product of two such scales is infinite.
+    lowest = np.linalg.eigvalsh(array * scale * scale[:, None])[0]
     if definite and lowest <= 0:
         raise ValueError(
             f"Argument `{name}` must be positive definite, but its smallest eigenvalue (diagonal scaled to one) is "

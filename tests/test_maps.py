@@ -169,6 +169,23 @@ def test_failures_are_verdicts_of_their_own(paper_scene):
     assert unloaded["verdict"].sel(belt_speed=3.0).item() == fj.Verdict.SLIDING
 
 
+def test_a_structure_that_wedges_itself_grows_without_bound():
+    """Leaning into the belt, with more friction at rest than sliding: the oracle sticks for ever, pressed on ever harder."""
+    scene = fj.Scene(fj.belt_oscillator(theta=-0.8, m2=0.5), fj.Coulomb(0.3, 1.3), 0.5, fj.Pulse(100.0, 3.0))
+    m = fj.bistability_map(scene, p=[1.5, 3.0, 10.0, 30.0], t_max=5.0, progress=False)
+    assert m["verdict"].values.tolist() == [fj.Verdict.SLIDING] + [fj.Verdict.UNBOUNDED] * 3
+    model = oracle.paper_model(theta=-0.8, m2=0.5, mu_dynamic=0.3, mu_static=1.3, belt_speed=0.5, p=3.0)
+    run = oracle.simulate(model, 4.0, np.linspace(1.0, 4.0, 7))
+    assert np.all(run.status == oracle.STICK) and np.all(np.diff(run.N) > 1e3)
+
+
+def test_lanes_that_run_out_of_steps_say_so(paper_scene):
+    """Were they called undecided, a longer `t_max` would be the wrong remedy."""
+    m = fj.bistability_map(paper_scene, p=[1.05, 1.193], max_steps=64, progress=False)
+    assert m["verdict"].sel(p=1.193).item() == fj.Verdict.STEP_FAILURE
+    assert "max_steps" in json.loads(m["verdict"].attrs["meaning"])[str(int(fj.Verdict.STEP_FAILURE))]
+
+
 def test_undecided_lanes_are_labelled_and_counted(paper_scene):
     """Given too little time, a lane says so instead of guessing."""
     m = fj.bistability_map(paper_scene, p=[1.05, 1.193], t_max=0.5, progress=False)

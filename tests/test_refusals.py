@@ -200,6 +200,23 @@ def test_bad_options(paper_scene, function, options, error, fragments):
         function(paper_scene, mu=[0.1, 0.2], **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "error", "fragments"),
+    [
+        (dict(max_steps=0), ValueError, ["`max_steps`", "at least 1", "0"]),
+        (dict(max_steps=1e6), ValueError, ["`max_steps`", "whole number", "1000000.0"]),
+        (dict(max_steps=True), ValueError, ["`max_steps`", "True"]),
+        (dict(resume=7), TypeError, ["`resume`", "path", "7"]),
+        (dict(resume="missing/map.part"), ValueError, ["`missing`", "does not exist"]),
+        (dict(resume="."), ValueError, ["`.`", "is a folder"]),
+    ],
+)
+def test_bad_options_of_a_long_map(paper_scene, options, error, fragments):
+    """Were one accepted, a map would do nothing, or lose at its end what it was to keep."""
+    with refused(error, *fragments):
+        fj.bistability_map(paper_scene, mu=[0.1, 0.2], **options)
+
+
 @pytest.mark.parametrize("function", [*BOTH, fj.simulate], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("scene", [None, "scene", fj.belt_oscillator()], ids=["None", "str", "Structure"])
 def test_what_is_no_scene(function, scene):

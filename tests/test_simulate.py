@@ -197,3 +197,12 @@ def test_the_dataset_of_a_run_says_what_it_is(paper_scene):
     assert all("units" in dataset[name].attrs for name in dataset)
     assert '"mu": 0.227' in dataset.attrs["scene"]
     assert dataset.attrs["fivjax"]
+
+
+def test_a_run_says_how_it_ended(paper_scene):
+    """Finished, or why not: too fast a vibration between two rows is no endless chatter, and is told apart from it."""
+    run = fj.simulate(paper_scene, 0.01, 1e-3)
+    assert run.outcome == fj.Ending.FINISHED and run.to_dataset().attrs["outcome"] == "finished"
+    fast = fj.simulate(paper_scene.replace(m2=0.53e-6, k2=1e11), 1.0, 0.5)
+    assert fast.outcome == fj.Ending.STEP_FAILURE and "dt_save" in fast.meaning
+    assert np.all(np.isnan(fast.velocity[-1]))

@@ -1,0 +1,289 @@
+"""What holds at the extremes: the README's table and figures.
+
+    python tests/measure_extremes.py [lanes] [confirm] [energy] [table] [resume]
+
+Each word picks one study; without any, all run. `EXTREMES_LANES` sets how many lanes are drawn (100,000 unless given).
+`confirm` and `energy` need no `lanes` before them. The reference is `tests/oracle.py`.
+"""
+
+import itertools
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import extremes
+import jax
+import killed_map
+import numpy as np
+import oracle
+import xarray as xr
+
+import fivjax as fj
+from fivjax import lanes as engine
+from fivjax.verdict import Verdict
+
+COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
+T_MAX, MAX_STEPS = 20.0, 2048
+PATIENCE = 10  # s that the oracle gets for one lane
+
+
+def decided(lanes: dict, method=None, energy: bool = False) -> engine.Outcome:
+    start = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
+    method = fj.EventExact() if method is None else method
+    with np.errstate(all="ignore"), jax.enable_x64(True):
+        return engine.run_to_verdict(
+            start,
+            lanes,
+            method,
+            t_max=T_MAX,
+            memory=2e9,
+            max_steps=MAX_STEPS,
+            progress=None,
+            label="extremes",
+            energy=energy,
+        )
+
+
+def counts(verdict: np.ndarray) -> str:
+    found = {Verdict(int(code)).name.lower(): int(np.sum(verdict == code)) for code in np.unique(verdict)}
+    return ", ".join(f"{count} {name}" for name, count in found.items())
+
+
+def lanes_() -> None:
+    """Lanes over all ranges at once: each has a status."""
+    begin = time.perf_counter()
+    outcome = decided(extremes.draw(COUNT, seed=1))
+    print(f"{COUNT} lanes: {counts(outcome.verdict)} ({time.perf_counter() - begin:.0f} s)")
+    print(f"without a status: {int(np.sum(outcome.verdict == Verdict.NOT_RUN))}")
+    proved = outcome.verdict >= 0
+    print(f"decided lanes with numbers that are not finite: {int(np.sum(proved & ~np.isfinite(outcome.amplitude)))}")
+
+
+class TooSlow(Exception):
+    pass
+
+
+def limited(function, *arguments):
+    """The function's value, or None where it takes too long or the oracle gives up."""
+
+    def stop(*_):
+        raise TooSlow
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(PATIENCE)
+    try:
+        return function(*arguments)
+    except (TooSlow, oracle.ZenoError, RuntimeError, ValueError, FloatingPointError, MemoryError):
+        return None
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def painleve(model: oracle.Model) -> bool:
+    """Whether either direction of slip has no unique contact force, from the matrices alone."""
+    inverse = np.linalg.inv(model.mass)
+    t, n = model.tangential, model.normal
+    return inverse[n, n] <= model.friction.static * abs(inverse[n, t])
+
+
+def judged(lane: dict, verdict: int) -> bool | None:
+    """Whether the independent solver confirms a lane's status or its reason; None where it cannot say."""
+    model = extremes.model(lane)
+    with np.errstate(all="ignore"):
+        if verdict == Verdict.PAINLEVE:
+            return painleve(model)
+        if verdict == Verdict.NO_EQUILIBRIUM:
+            try:
+                oracle.sliding_equilibrium(model)
+            except (oracle.ContactError, np.linalg.LinAlgError):
+                return True
+            return False
+        if verdict in (Verdict.SLIDING, Verdict.LIMIT_CYCLE):
+            found = limited(oracle.verdict, model, 2 * T_MAX)
+            if found is None or found.kind == "undecided":
+                return None
+            return found.kind == {0: "sliding", 1: "limit cycle"}[verdict]
+        if verdict == Verdict.UNBOUNDED:
+            run = limited(oracle.simulate, model, 2 * T_MAX, np.linspace(T_MAX, 2 * T_MAX, 20))
+            return None if run is None else bool(np.all(run.status == oracle.STICK) and np.all(np.diff(run.N) > 0))
+        if verdict == Verdict.STEP_FAILURE:
+            # An upper bound on the fastest rate: overdamped motion included.
+            inverse = np.linalg.inv(model.mass)
+            generator = np.block(
+                [[np.zeros((3, 3)), np.eye(3)], [-inverse @ model.stiffness, -inverse @ model.damping]]
+            )
+            fastest = np.max(np.abs(np.linalg.eigvals(generator)))
+            return bool(T_MAX * fastest / 0.35 > MAX_STEPS)
+        if verdict == Verdict.UNDECIDED:
+            t1 = min(T_MAX, 3 * extremes.slow_period(lane))
+            run = limited(oracle.simulate, model, t1, np.array([0.0, t1]))
+            if run is None or len(run.q) < 2:
+                return None
+            ours = fj.simulate(extremes.scene(lane), t1, t1)
+            mine = np.concatenate([ours.displacement[-1], ours.velocity[-1]])
+            theirs = np.concatenate([run.q[-1], run.v[-1]])
+            return bool(np.max(np.abs(mine - theirs)) <= 1e-6 * np.max(np.abs(theirs)))
+    return None
+
+
+def confirm(count: int = 300, pool: int = 4096) -> None:
+    """Lanes of every status and of the corners by the independent solver."""
+    lanes = extremes.draw(min(COUNT, pool), seed=2, corners=0.5)
+    outcome = decided(lanes)
+    print(f"drawn with corners: {counts(outcome.verdict)}")
+    codes = np.unique(outcome.verdict)
+    rng = np.random.default_rng(3)
+    wrong = []
+    for code in codes:
+        members = np.flatnonzero(outcome.verdict == code)
+        chosen = rng.permutation(members)[: 2 * count // len(codes)]
+        answers = []
+        for index in chosen:
+            answers.append(judged(extremes.row(lanes, index), int(code)))
+            if answers[-1] is False:
+                wrong.append((Verdict(int(code)).name, extremes.row(lanes, index)))
+            if sum(answer is not None for answer in answers) >= -(-count // len(codes)):
+                break
+        tally = {word: answers.count(word) for word in (True, False, None)}
+        print(
+            f"{Verdict(int(code)).name.lower():>16}: {tally[True]} confirmed, {tally[False]} contradicted, "
+            f"{tally[None]} on which the reference gave up",
+            flush=True,
+        )
+    for name, lane in wrong:
+        print("contradicted:", name, {key: float(f"{value:.6g}") for key, value in lane.items()})
+
+
+def energy(count: int = 8192) -> None:
+    """The residual of the balance in units of the energy exchanged, over every finished lane."""
+    lanes = extremes.draw(min(COUNT, count), seed=4)
+    outcome = decided(lanes, energy=True)
+    finished = (outcome.verdict >= 0) | (outcome.verdict == Verdict.UNDECIDED)
+    moved = finished & (outcome.energy["energy_exchanged"] > 0)
+    residual, through = outcome.energy["energy_residual"], outcome.energy["energy_exchanged"]
+    share = np.where(moved, residual / np.where(moved, through, 1.0), 0.0)
+    # What a state cannot hold: one rounding of the energy that the structure stores at rest.
+    stored = np.zeros(len(share))
+    for index in np.flatnonzero(moved):
+        model = extremes.model(extremes.row(lanes, index))
+        q, _ = oracle.sliding_equilibrium(model)
+        stored[index] = 0.5 * np.abs(q) @ np.abs(model.stiffness) @ np.abs(q)
+    floor = np.finfo(float).eps * stored
+    print(f"{int(finished.sum())} of {count} lanes finished, {int(moved.sum())} of them exchanged energy")
+    print(f"residual ≤ 1e-8 of the energy exchanged: {np.mean(share[moved] <= 1e-8):.3%}")
+    seen = moved & (through > 1e8 * floor)
+    print(
+        f"of the {int(seen.sum())} whose exchange is 1e8 roundings of the stored energy or more: "
+        f"{np.mean(share[seen] <= 1e-8):.3%}, median {np.median(share[seen]):.0e}, worst {share[seen].max():.0e}"
+    )
+    rest = moved & ~seen
+    print(
+        f"of the {int(rest.sum())} others: residual at most {np.max(residual[rest] / floor[rest]):.0f} roundings of the "
+        f"stored energy, {np.mean(residual[rest] <= 100 * floor[rest]):.3%} within 100"
+    )
+    for index in np.flatnonzero(seen & (share > 1e-8))[:20]:
+        lane = extremes.row(lanes, index)
+        print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in lane.items()})
+
+
+PAPER = dict(belt_speed=3.0, theta=0.01, mu=0.227, p=1.3, c1=1.0, c2=1.0, m1=0.53, m2=0.045, k1=1e5, k2=1.01e5,
+             force=100.0, duration=0.1, restitution=0.0)  # fmt: skip
+TABLE = {
+    "belt speed 1e-6, 1e-3, 1e2, 1e4 m/s": [dict(belt_speed=v) for v in (1e-6, 1e-3, 1e2, 1e4)],
+    "θ −1.2, −0.5, 0, 0.5, 1.2": [dict(theta=x, mu=0.2) for x in (-1.2, -0.5, 0.0, 0.5, 1.2)],
+    "μ 0, 0.5, 1, 3": [dict(mu=x) for x in (0.0, 0.5, 1.0, 3.0)],
+    "p 0, 10, 100, 1000": [dict(p=x) for x in (0.0, 10.0, 100.0, 1000.0)],
+    "damping 0, 100 × critical": [dict(c1=0.0, c2=0.0), dict(c1=4.6e4, c2=1.3e4)],
+    "mass ratio 1e-6, 1e-3, 1e3, 1e6": [dict(m2=0.53 * x) for x in (1e-6, 1e-3, 1e3, 1e6)],
+    "stiffness ratio 1e-6, 1e-3, 1e3, 1e6": [dict(k2=1e5 * x) for x in (1e-6, 1e-3, 1e3, 1e6)],
+    "load 1e-6, 1, 1e6, 1e9 N": [dict(force=x) for x in (1e-6, 1.0, 1e6, 1e9)],
+    "pulse 1e-9 s, 1e9 s": [dict(duration=1e-9), dict(duration=1e9)],
+    "restitution 0.5, 0.9, 1": [dict(restitution=x) for x in (0.5, 0.9, 1.0)],
+}
+
+
+def worst_error(cases: list[dict], method, single: bool) -> tuple[float, set[str]]:
+    """Of the states after 0.3 s (1 ms where a millionfold stiffness makes the reference slow), relative; and the endings."""
+    worst, endings = 0.0, set()
+    for change in cases:
+        lane = {**PAPER, **change}
+        if single:
+            lane = {name: float(np.float32(value)) for name, value in lane.items()}
+        stiff = math_ratio(lane) > 1e2
+        t1 = 2e-3 if stiff else 0.3
+        scene = extremes.scene(lane)
+        try:
+            run = fj.simulate(scene, t1, t1 / 8, method)
+        except ValueError:
+            endings.add("refused")
+            continue
+        endings.add(fj.Ending(int(run.outcome)).name.lower().replace("_", " "))
+        reference = limited(oracle.simulate, extremes.model({**PAPER, **change}), t1, run.t)
+        if reference is None or len(reference.q) < len(run.t):
+            endings.add("reference gave up")
+            continue
+        mine, theirs = np.hstack([run.displacement, run.velocity]), np.hstack([reference.q, reference.v])
+        scale = np.maximum(np.max(np.abs(theirs), axis=0), 1e-12 * np.max(np.abs(theirs)))
+        error = np.max(np.abs(mine - theirs) / scale)
+        worst = max(worst, float(error) if np.isfinite(error) else np.inf)
+    return worst, endings
+
+
+def math_ratio(lane: dict) -> float:
+    return np.sqrt(max(lane["k1"], lane["k2"]) / min(lane["m1"], lane["m2"])) / 1.5e3
+
+
+def table() -> None:
+    """The README's table: one row for each extreme, one column for each method and precision of the input."""
+    methods = {"EventExact": fj.EventExact(), "WhereSwitched": fj.WhereSwitched(dt=2e-5)}
+    print(
+        "| extreme | "
+        + " | ".join(f"{m}, {d}" for m, d in itertools.product(methods, ("float64", "float32")))
+        + " | ending |"
+    )
+    print("|---" * 6 + "|")
+    for name, cases in TABLE.items():
+        columns, endings = [], set()
+        for method, single in itertools.product(methods.values(), (False, True)):
+            error, seen = worst_error(cases, method, single)
+            columns.append(f"{error:.0e}")
+            endings |= seen
+        print(f"| {name} | " + " | ".join(columns) + f" | {', '.join(sorted(endings))} |", flush=True)
+
+
+def resume(times: int = 20) -> None:
+    """kill -9 at random instants, then the same command again: the maps, byte for byte."""
+    same = 0
+    with tempfile.TemporaryDirectory() as folder:
+        cache, whole = Path(folder) / "cache", Path(folder) / "whole"
+        whole.mkdir()
+        assert killed_map.run(whole, cache=cache).returncode == 0
+        expected = xr.load_dataset(whole / "map.nc", engine="h5netcdf")
+        rng = random.Random(5)
+        for k in range(times):
+            own = Path(folder) / f"killed{k}"
+            own.mkdir()
+            delay = rng.uniform(0.0, 0.6)
+            killed = killed_map.run(own, "SIGKILL", delay, cache)
+            left = sorted(path.name for path in own.iterdir() if not path.name.startswith("."))
+            finished = killed_map.run(own, cache=cache)
+            found = xr.load_dataset(own / "map.nc", engine="h5netcdf")
+            equal = all(found[name].values.tobytes() == expected[name].values.tobytes() for name in expected.data_vars)
+            same += equal
+            print(
+                f"{k}: killed after {delay:.2f} s ({killed.returncode}), left {left}, resumed {finished.returncode}, identical {equal}",
+                flush=True,
+            )
+    print(f"{same} of {times} identical")
+
+
+STUDIES = {"lanes": lanes_, "confirm": confirm, "energy": energy, "table": table, "resume": resume}
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or STUDIES:
+        STUDIES[name]()
