@@ -10,9 +10,12 @@ from . import plot_linear as plot_linear
 from .calibrate import Calibration as Calibration
 from .calibrate import calibrate as calibrate
 from .contact import Status as Status
+from .display import register as _register_displays
+from .display import show as show
 from .energy_cycles import energy_per_cycle as energy_per_cycle
 from .energy_cycles import energy_per_event as energy_per_event
 from .event_exact import EventExact as EventExact
+from .explorer import explorer as explorer
 from .friction import Coulomb as Coulomb
 from .friction import ExponentialDecay as ExponentialDecay
 from .gradients import Derivatives as Derivatives
@@ -38,3 +41,5 @@ from .tradeoff import tradeoff as tradeoff
 from .verdict import Ending as Ending
 from .verdict import Verdict as Verdict
 from .where_switched import WhereSwitched as WhereSwitched
+
+_register_displays()

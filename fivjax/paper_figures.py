@@ -53,16 +53,17 @@ class Runs:
         begun = np.flatnonzero(ledger.events > 0 if status is None else spent > 0)
         return float(run.t[begun[0]] - spent[begun[0]]) if len(begun) else np.inf
 
-    def data(self, *names: str, window: Window | None = None) -> xr.Dataset:
-        """What the pictures draw of some runs and their cycles, over `case`."""
+    def data(self, *names: str, cycles: bool = True) -> xr.Dataset:
+        """What the pictures draw of some runs and, unless not wanted, of their cycles, over `case`."""
         kept = ["displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load"]
         kept += ["mechanical_energy", "stick_power", "slide_power", "damping_power", "load_power", "energy_residual"]
-        cycles = ["contact_work", "energy_gain", "stick_time", "detach_time", "turning_point"]
+        of_cycles = ["contact_work", "energy_gain", "stick_time", "detach_time", "turning_point"]
         parts = []
         for name in names:
             rows = self(name).to_dataset()[kept]
-            rows = rows if window is None else rows.sel(t=slice(*window))
-            parts.append(rows.merge(self.cycles(name)[cycles].reset_coords(["cycle_start", "cycle_end"])))
+            if cycles:
+                rows = rows.merge(self.cycles(name)[of_cycles].reset_coords(["cycle_start", "cycle_end"]))
+            parts.append(rows)
         return _cases(dict(zip(names, parts, strict=True)))
 
 
@@ -495,7 +496,7 @@ def figure_8(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 8. The kick (Eq. 14) and the answer, p = 1.1, μ = 0.227, 3 m/s."
-    return Made(caption, plot.perturbation(run), runs.data("a kick"), findings)
+    return Made(caption, plot.perturbation(run), runs.data("a kick", cycles=False), findings)
 
 
 def figure_9(runs: Runs) -> Made:
@@ -517,7 +518,7 @@ def figure_9(runs: Runs) -> Made:
     )
     picture = plot_paper.overlaid({"p = 1.2": over, "p = 1.19": under})
     assert picture is not None
-    return Made(caption, picture, runs.data("p = 1.2", "p = 1.19"), findings)
+    return Made(caption, picture, runs.data("p = 1.2", "p = 1.19", cycles=False), findings)
 
 
 def figure_10(runs: Runs) -> Made:

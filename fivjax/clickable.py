@@ -1,0 +1,41 @@
+"""A picture in a notebook that says where it was clicked. Needs anywidget; `explorer` asks for it with a sentence."""
+
+from typing import final
+
+import anywidget
+import traitlets
+
+SCRIPT = """
+function render({ model, el }) {
+  const image = document.createElement("img");
+  image.className = "fivjax-" + model.get("name");
+  image.style.maxWidth = "100%";
+  if (model.get("clickable")) image.style.cursor = "crosshair";
+  const draw = () => {
+    const old = image.src;
+    image.src = URL.createObjectURL(new Blob([model.get("png")], { type: "image/png" }));
+    if (old) URL.revokeObjectURL(old);
+  };
+  image.addEventListener("click", (event) => {
+    if (!model.get("clickable")) return;
+    const box = image.getBoundingClientRect();
+    model.set("clicked", [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]);
+    model.save_changes();
+  });
+  model.on("change:png", draw);
+  draw();
+  el.appendChild(image);
+}
+export default { render };
+"""
+
+
+@final
+class Picture(anywidget.AnyWidget):
+    """A PNG; `clicked` is where it was last clicked, as shares of its width and height from the upper left corner."""
+
+    _esm = SCRIPT
+    name = traitlets.Unicode().tag(sync=True)
+    png = traitlets.Bytes().tag(sync=True)
+    clickable = traitlets.Bool(False).tag(sync=True)
+    clicked = traitlets.List().tag(sync=True)
