@@ -1,3 +1,4 @@
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 """An explorer for notebooks: sliders for a scene's parameters, and its answer at once, from code compiled once."""
 
 import io

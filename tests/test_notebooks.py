@@ -42,6 +42,7 @@ MUST_SHOW = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, compiled, monkeypatch):
     monkeypatch.setenv("FIVJAX_SMALL", "1")
