@@ -160,6 +160,9 @@ def _simulate(
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
     y, contacts, ledgers = states_at(scene, method, y0, saved, most, books)
+    # What follows a number that was not reached is none either, also where the contact would hold it at zero.
+    reached = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
+    y = jnp.where(reached[:, None], y, jnp.nan)
     load = jax.vmap(scene.load)(saved)
     # A row on a jump of the load shows what follows from it, as its load does.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
