@@ -19,8 +19,8 @@ from .precision import in_double_precision
 from .scene import Scene
 from .simulate import Trajectory, simulate
 
-# Rows a second: 29 a cycle at 68 Hz draw a round phase plane, and few enough to answer at once.
-RATE = 2000
+# Rows a second: 22 a cycle at 68 Hz draw a round phase plane, and few enough to answer at once.
+RATE = 1500
 FIRST = ("mu", "mu_static", "mu_dynamic", "p", "belt_speed")
 RANGES = {
     "mu": (0.0, 0.6),
@@ -87,6 +87,8 @@ class Explorer:
             self.map = picture(name="map", clickable=True)
             self.map.observe(lambda change: self.open_lane(*change["new"]), "clicked")
         self._quiet = False
+        self._lane: dict[str, float] = {}
+        self._axes = axes
         for slider in self.sliders.values():
             slider.observe(lambda change: self.update(), "value")
         self.update()
@@ -103,7 +105,7 @@ class Explorer:
         if self._quiet:
             return
         try:
-            scene = self.scene.replace(**{name: slider.value for name, slider in self.sliders.items()})
+            scene = self.scene.replace(**{name: self._value(name) for name in self.sliders})
             run = simulate(scene, self.t1, 1 / RATE, energy=True)
         except ValueError as error:
             self.said.value = f"<i>{error}</i>"
@@ -111,19 +113,22 @@ class Explorer:
         self.picture.png = self._panels(run)
         self.said.value = _said(run)
         if self.map is not None:
-            at = [float(self.sliders[str(name)].value) for name in self.dataset["verdict"].dims]
-            self.map.png = self._marked(*at)
+            self.map.png = self._marked(*(self._value(name) for name in self._axes))
+
+    def _value(self, name: str) -> float:
+        # A browser rounds what it is given to the slider's steps; the lane of a map is meant exactly.
+        value, exact = self.sliders[name].value, self._lane.get(name, np.inf)
+        return exact if abs(value - exact) <= 0.5001 * self.sliders[name].step else value
 
     def open_lane(self, right: float, down: float) -> None:
         """Move the sliders to the lane of the map nearest to a place, given as shares of the picture's width and height."""
         width, height = self._map_axes.figure.canvas.get_width_height()
         at = self._map_axes.transData.inverted().transform((right * width, (1 - down) * height))
-        names = [str(name) for name in self.dataset["verdict"].dims]
         self._quiet = True
         try:
-            for name, value in zip(names, at, strict=True):
-                values = self.dataset[name].values
-                self.sliders[name].value = float(values[np.argmin(np.abs(values - value))])
+            for (name, values), value in zip(self._axes.items(), at, strict=True):
+                self._lane[name] = float(values[np.argmin(np.abs(values - value))])
+                self.sliders[name].value = self._lane[name]
         finally:
             self._quiet = False
         self.update()
@@ -153,18 +158,15 @@ def _slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:
         high = low + 1.0
-    return widgets.FloatSlider(
-        value,
-        min=low,
-        max=high,
-        step=(high - low) / 500,
-        description=name,
-        readout_format=".4g",
-        continuous_update=True,
-    )
+    # Steps of 1, 2 or 5 times a power of ten, at least five hundred of them: a value that was typed lies on one.
+    finest = (high - low) / 500
+    power = 10.0 ** np.floor(np.log10(finest))
+    step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
+    return widgets.FloatSlider(value, min=low, max=high, step=step, description=name, readout_format=".5g")
 
 
 def _said(run: Trajectory) -> str:
+    assert run.energy is not None
     ledger = run.energy.ledger
     limit = float(critical_friction(run.scene.structure, direction=1 if run.scene.belt_speed > 0 else -1))
     lines = [
@@ -212,6 +214,7 @@ def _panels(t1: float):
     def draw(run: Trajectory) -> bytes:
         tangential = run.scene.structure.tangential
         late = np.asarray(run.t) > 0.7 * t1
+        assert run.energy is not None
         work = run.energy.work
         wave.set_data(run.t, run.acceleration[:, tangential])
         steps.set_data(run.t, run.status)
