@@ -1,15 +1,18 @@
 """Exact motion through many contact events, fast in large batches; for constant friction.
 
 Within one status the motion is then linear: states a little later, two littles later, … are matrices times the state
-now. One product of a small matrix with all lanes that share their mechanics samples a whole *window* of their future.
-The samples of the guards show the interval in which the status may end, and only there its Taylor series, again a matrix
-times the state, is searched for the instant. What ends a status and what follows is read from `contact`, as everywhere.
+now. One product of a small matrix with all lanes that share their mechanics samples a whole *window* of their future,
+and the control points of the guards between the samples. They show the interval in which the status may end, and only
+there its Taylor series, again a matrix times the state, is searched for the instant. What ends a status and what follows
+is read from `contact`, as everywhere.
 
-Under `jax.vmap` over lanes with common mechanics these products are matrix-matrix products, which is what a processor
-does best. Between them stand a few stages of plain arithmetic, see `_stage`.
+Lanes stand side by side along the last axis: these products are then matrix-matrix products, which is what a processor
+does best, and everything else is plain arithmetic on rows of lanes. `jax.vmap` over lanes with common mechanics leads
+here, too.
 """
 
-import itertools
+import functools
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -22,13 +25,13 @@ from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
 from .steppers import Advance
 
-# Intervals in a window: long windows waste work after an event, short ones pay for their stages more often.
+# Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
 INTERVALS = 16
 # The fastest vibration turns by this much between two samples, rad: guards look like cubics there.
 TURN = 0.35
 # Order of the Taylor series within an interval: TURN^15 / 15! is below rounding.
 ORDER = 14
-# A guard whose first coefficients are this much smaller than all of them together starts at zero, but for rounding.
+# A guard whose first coefficients are this much smaller than those after them starts at zero, but for rounding.
 ROUNDING = (1e-12, 1e-9, 1e-9)
 # Or if they are this many roundings of the terms that they are sums of.
 ROUNDINGS = 64
@@ -44,9 +47,9 @@ class Propagators(eqx.Module):
 
     mechanics: Mechanics
     interval: Float[Array, ""]  # between two samples, s
-    window: Float[Array, "r c"]  # samples of guards, samples of states, series of the guards at the start
-    series: Float[Array, "q c"]  # series of the guards and of the displacements, in units of the interval
-    rounding: Float[Array, "6 c"]  # of the first three terms of the guards' series, on sizes of what the others act on
+    window: Float[Array, "r c"]  # see `_Window`
+    series: Float[Array, "q c"]  # see `_Series`
+    sizes: Float[Array, "8 c"]  # rounding of the guards' first three coefficients, and how far they are from cubics
 
 
 class Windowed(eqx.Module):
@@ -65,37 +68,70 @@ class Windowed(eqx.Module):
     def advance(
         self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Advance:
-        mechanics = prepared.mechanics
-        n = y.shape[0] // 2
-        steps = jnp.minimum(h / prepared.interval, INTERVALS)
-        here = _stacked(mechanics, contact, load, list(y))
-        samples = _Samples(prepared.window @ here, prepared.rounding @ jnp.abs(here), n, mechanics.tangential)
-        none = jnp.zeros_like(load)
+        return _advance_one(prepared, contact, load, y, h)
 
-        interval = _stage(lambda: _safe_intervals(samples, steps), none.astype(jnp.int32))
-        there = _stage(lambda: samples.state_at(interval), [none] * 2 * n)
-        there = _stacked(mechanics, contact, load, there)
-        series = _Series(prepared.series @ there, prepared.rounding @ jnp.abs(there), n, mechanics.tangential)
-        inside = interval < INTERVALS
-        brackets = _dipped(series, _stage(lambda: series.brackets(inside), [_no_bracket(none)] * 3))
-        roots = _polished(series, brackets)
-        no = none > 0
-        share, fires = _stage(lambda: _first_root(brackets, roots, steps, interval), (none, [no] * 3))
-        reached = _stage(lambda: series.state(share), [none] * 2 * n)
-        peak = _stage(lambda: samples.peak(interval), none)
 
-        velocity = n + mechanics.tangential
-        reached = [v / prepared.interval if i >= n else v for i, v in enumerate(reached)]
-        reached[velocity] = jnp.where(fires[2], 0.0, reached[velocity])
-        state = physics.on_constraint(mechanics, contact, jnp.stack(reached))
-        ended = jnp.stack(fires[:2])
+@jax.custom_batching.custom_vmap
+def _advance_one(prepared: Propagators, contact: Contact, load, y: State, h) -> Advance:
+    lane = jax.tree.map(lambda leaf: leaf[..., None], (contact, load, y, h))
+    return jax.tree.map(lambda leaf: leaf[..., 0], _advance(prepared, *lane))
 
-        def transition():
-            return physics.transition(mechanics, contact, load, state, ended, RESTING * prepared.interval)
 
-        next_contact, y_next = _stage(transition, (contact, jnp.zeros_like(y)))
-        used = (interval + share) * prepared.interval
-        return Advance(y_next, next_contact, used, jnp.maximum(peak, jnp.abs(reached[velocity])))
+@_advance_one.def_vmap
+def _advance_many(size: int, batched, prepared: Propagators, *lanes):
+    """Lanes with common mechanics go side by side along the last axis; others have nothing to share."""
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+    if any(jax.tree.leaves(batched[0])):
+        after = jax.vmap(_advance_one.fun, in_axes=axes)(prepared, *lanes)
+    else:
+
+        def side_by_side(leaf, axis):
+            return jnp.broadcast_to(leaf[..., None], (*leaf.shape, size)) if axis is None else jnp.moveaxis(leaf, 0, -1)
+
+        lanes = [jax.tree.map(side_by_side, leaf, axis) for leaf, axis in zip(lanes, axes[1:], strict=True)]
+        after = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), _advance(prepared, *lanes))
+    return after, jax.tree.map(lambda _: True, after)
+
+
+def _advance(
+    prepared: Propagators, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"], h: Float[Array, " l"]
+) -> Advance:
+    """One advance of lanes side by side: to the next event, the next rise of the tangential velocity through zero, the
+    end of the step or that of the window, whichever comes first.
+    """
+    mechanics, n = prepared.mechanics, y.shape[0] // 2
+    steps = jnp.minimum(h / prepared.interval, INTERVALS)
+    here = _stacked(mechanics, contact, load, y)
+    window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), n)
+    none = jnp.zeros_like(load)
+
+    interval = _stage(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
+    state, peak = _stage(lambda: (window.state_at(interval), window.peak(interval)), (jnp.zeros_like(y), none))
+    there = _stacked(mechanics, contact, load, state)
+    series = _Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), n)
+    no = jnp.zeros((3, *none.shape), bool)
+    guess = jnp.zeros((3, *none.shape), none.dtype)
+    like = _Bracket(guess, no.astype(jnp.int32), guess, no, no, no)
+    brackets = _dipped(series, _stage(lambda: series.brackets(interval < INTERVALS), like))
+    end = jnp.where(interval == INTERVALS, 0.0, jnp.minimum(steps - interval, 1.0))
+    share, fires = _first_root(series, brackets, end)
+
+    velocity = n + mechanics.tangential
+
+    def follow() -> tuple[Contact, Float[Array, "2n l"], Float[Array, " l"]]:
+        reached = series.state(share)
+        rows = jnp.arange(2 * n)[:, None]
+        reached = jnp.where(rows >= n, reached / prepared.interval, reached)
+        reached = jnp.where((rows == velocity) & fires[2], 0.0, reached)
+        return jnp.maximum(peak, jnp.abs(reached[velocity])), over_lanes(reached, contact, load, fires)
+
+    @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
+    def over_lanes(reached, contact, load, fires):
+        state = physics.on_constraint(mechanics, contact, reached)
+        return physics.transition(mechanics, contact, load, state, fires[:2], RESTING * prepared.interval)
+
+    peak, (next_contact, y_next) = _stage(follow, (none, (contact, jnp.zeros_like(y))))
+    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak)
 
 
 def _stage(function, like):
@@ -116,84 +152,91 @@ def _stage(function, like):
 def propagators(mechanics: Mechanics) -> Propagators:
     """The matrices for one scene with constant friction."""
     n = mechanics.free_load.shape[0]
-    ways = [_affine(mechanics, way) for way in _ways(mechanics.free_load.dtype)]
-    fastest = jnp.max(jnp.stack([_spectral_radius(generator) for generator, _ in ways]))
-    interval = TURN / fastest
-    window, series, rounding = [], [], []
-    columns = zip(_ways(mechanics.free_load.dtype), ways, _columns(n, mechanics.normal), strict=True)
-    for contact, (generator, guards), used in columns:
-        powers = [jnp.eye(2 * n + 2, dtype=generator.dtype)]
-        for k in range(ORDER + 1):
-            powers.append(powers[-1] @ generator * (interval / (k + 1)))
-        step = sum(powers[1:], powers[0])
-        samples = [powers[0]]
-        for _ in range(INTERVALS + 1):
-            samples.append(step @ samples[-1])
-        guard_series = _rows([guards @ power for power in powers[: ORDER + 1]])
-        guard_samples = _rows([guards @ sample for sample in samples])
-        states = _rows([sample[: 2 * n] for sample in samples[: INTERVALS + 1]])
-        paths = _rows([power[:n] for power in powers])
-        window.append(jnp.concatenate([guard_samples, states, guard_series])[:, used])
-        series.append(jnp.concatenate([guard_series, paths])[:, used])
-        sizes, rates = _magnitudes(mechanics, contact)
-        terms = [sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)]
-        rounding.append(ROUNDINGS * jnp.finfo(sizes.dtype).eps * _rows(terms)[:, used])
-    return Propagators(mechanics, interval, *(jnp.concatenate(rows, axis=1) for rows in (window, series, rounding)))
+    ways = _ways(mechanics.free_load.dtype)
+    generators, guards = jax.vmap(lambda way: _affine(mechanics, way))(ways)
+    interval = TURN / jnp.max(jax.vmap(_spectral_radius)(generators))
+    identity = jnp.broadcast_to(jnp.eye(2 * n + 2, dtype=generators.dtype), generators.shape)
+
+    def next_power(power, k):
+        power = power @ generators * (interval / k)
+        return power, power
+
+    orders = jnp.arange(1.0, ORDER + 2, dtype=generators.dtype)
+    _, powers = jax.lax.scan(next_power, identity, orders)
+    powers = jnp.concatenate([identity[None], powers])
+    step = jnp.sum(powers, axis=0)
+    _, samples = jax.lax.scan(lambda sample, _: (step @ sample, step @ sample), identity, length=INTERVALS)
+    samples = jnp.concatenate([identity[None], samples])
+
+    coefficients = guards @ powers[: ORDER + 1]  # [order, way, guard, column]
+    hulls = jnp.einsum("jk,kwgc->jwgc", _bernstein(ORDER), coefficients)[1:]
+    values, slopes = guards @ samples, coefficients[1] @ samples
+    control = jnp.stack([values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3])
+    velocity = n + mechanics.tangential
+    window = [coefficients[:4], hulls, control, samples[:, :, velocity : velocity + 1], samples[:, :, : 2 * n]]
+    falling = -orders[:, None, None] * powers[1:, :, mechanics.tangential]
+    watched = jnp.concatenate([coefficients, falling[:, :, None]], axis=2)
+    series = [watched, jnp.sum(watched, axis=0), powers[:, :, :n]]
+
+    sizes, rates = jax.vmap(lambda way: _magnitudes(mechanics, way))(ways)
+    terms = jnp.stack([sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)])
+    # A cubic with the values and slopes of both ends is off by at most a 384th of the fourth derivative; twice that is
+    # what the derivative may grow to between samples.
+    uncubic = jnp.max(jnp.abs(coefficients[4] @ samples), axis=0) * (2 * math.factorial(4) / 384)
+    rounding = [ROUNDINGS * jnp.finfo(sizes.dtype).eps * terms, uncubic]
+
+    def table(parts: list[Float[Array, "*k 4 x c"]]) -> Float[Array, "r c"]:
+        flat = [jnp.moveaxis(part, -3, 0).reshape(4, -1, 2 * n + 2) for part in parts]
+        rows = jnp.concatenate(flat, axis=1)
+        closed, everything = _columns(n, mechanics.normal)
+        return jnp.concatenate([*(rows[way][:, closed] for way in range(3)), rows[3][:, everything]], axis=1)
+
+    return Propagators(mechanics, interval, table(window), table(series), table(rounding))
 
 
-def _rows(matrices: list[Float[Array, "k c"]]) -> Float[Array, "r c"]:
-    """All first rows, then all second rows, …"""
-    stacked = jnp.stack(matrices, axis=1)
-    return stacked.reshape(-1, stacked.shape[-1])
+def _bernstein(order: int) -> np.ndarray:
+    """From a polynomial's coefficients to its control points on [0, 1]: it lies in their convex hull."""
+    return np.array([[math.comb(j, k) / math.comb(order, k) for k in range(order + 1)] for j in range(order + 1)])
 
 
-def _ways(dtype) -> list[Contact]:
+def _ways(dtype) -> Contact:
     """Sticking, sliding in either direction, detached."""
-
-    def way(status: Status, direction: float) -> Contact:
-        return Contact(jnp.asarray(status, jnp.int32), jnp.asarray(direction, dtype))
-
-    return [way(Status.STICK, 1.0), way(Status.SLIDE, 1.0), way(Status.SLIDE, -1.0), way(Status.DETACH, 1.0)]
+    status = jnp.array([Status.STICK, Status.SLIDE, Status.SLIDE, Status.DETACH], jnp.int32)
+    return Contact(status, jnp.array([1.0, 1.0, -1.0, 1.0], dtype))
 
 
-def _columns(n: int, normal: int) -> list[np.ndarray]:
-    """For each way, what of (state, load, 1) is not zero there: a closed contact has neither gap nor gap rate."""
+def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
+    """What of (state, load, 1) is not zero: in contact, when there is neither gap nor gap rate, and detached."""
     everything = np.arange(2 * n + 2)
-    closed = everything[(everything != normal) & (everything != n + normal)]
-    return [closed, closed, closed, everything]
+    return everything[(everything != normal) & (everything != n + normal)], everything
 
 
-def _stacked(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: list) -> Float[Array, " c"]:
+def _stacked(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"]
+) -> Float[Array, "c l"]:
     """(state, load, 1) in the columns of the way the contact is in, zero in the others."""
-    n = len(y) // 2
-    everything = [*y, load, jnp.ones_like(load)]
+    n, normal = y.shape[0] // 2, mechanics.normal
+    rest = jnp.stack([load, jnp.ones_like(load)])
+    closed = jnp.concatenate([y[:normal], y[normal + 1 : n + normal], y[n + normal + 1 :], rest])
     sliding = contact.status == Status.SLIDE
-    ways = [
-        contact.status == Status.STICK,
-        sliding & (contact.direction > 0),
-        sliding & (contact.direction < 0),
-        contact.status == Status.DETACH,
-    ]
-    columns = zip(ways, _columns(n, mechanics.normal), strict=True)
-    return jnp.stack([jnp.where(way, everything[i], 0.0) for way, used in columns for i in used])
+    ways = [contact.status == Status.STICK, sliding & (contact.direction > 0), sliding & (contact.direction < 0)]
+    columns = [jnp.where(way, closed, 0.0) for way in ways]
+    return jnp.concatenate([*columns, jnp.where(contact.status == Status.DETACH, jnp.concatenate([y, rest]), 0.0)])
 
 
 def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"], Float[Array, "2 m"]]:
     """Rates and guards in one way of contact, as matrices on (state, load, 1)."""
     n = mechanics.free_load.shape[0]
 
-    def rates(v):
-        return jnp.concatenate([v[n : 2 * n], physics.acceleration(mechanics, contact, v[2 * n], v[: 2 * n])])
+    def rates_and_guards(v):
+        y, load = v[: 2 * n], v[2 * n]
+        rates = physics.acceleration(mechanics, contact, load, y)
+        return jnp.concatenate([v[n : 2 * n], rates, physics.guards(mechanics, contact, load, y)])
 
-    def guards(v):
-        return physics.guards(mechanics, contact, v[2 * n], v[: 2 * n])
-
-    def matrix(f):
-        zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
-        return jnp.concatenate([jax.jacfwd(f)(zero), f(zero)[:, None]], axis=1)
-
-    unchanging = jnp.zeros((2, 2 * n + 2), mechanics.free_load.dtype)
-    return jnp.concatenate([matrix(rates), unchanging]), matrix(guards)
+    zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
+    matrix = jnp.concatenate([jax.jacfwd(rates_and_guards)(zero), rates_and_guards(zero)[:, None]], axis=1)
+    unchanging = jnp.zeros((2, 2 * n + 2), zero.dtype)
+    return jnp.concatenate([matrix[: 2 * n], unchanging]), matrix[2 * n :]
 
 
 def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2 m"], Float[Array, "m m"]]:
@@ -213,258 +256,262 @@ def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2
 
 def _spectral_radius(matrix: Float[Array, "m m"]) -> Float[Array, ""]:
     """By Gelfand's formula, the 64th root of the size of the 64th power: a little too large, never too small."""
-    log_size = jnp.zeros((), matrix.dtype)
-    for _ in range(6):
+
+    def squared(carry, _):
+        log_size, matrix = carry
         size = jnp.max(jnp.abs(matrix))
         size = jnp.where(size > 0, size, 1.0)
-        log_size = 2 * (log_size + jnp.log(size))
-        matrix = (matrix / size) @ (matrix / size)
+        return (2 * (log_size + jnp.log(size)), (matrix / size) @ (matrix / size)), None
+
+    (log_size, matrix), _ = jax.lax.scan(squared, (jnp.zeros((), matrix.dtype), matrix), length=6)
     return jnp.exp((log_size + jnp.log(jnp.linalg.norm(matrix) + jnp.finfo(matrix.dtype).tiny)) / 64)
 
 
-class _Samples(eqx.Module):
-    """The future of one lane at the ends of the intervals, and the guards' series at its start.
+class _Window(eqx.Module):
+    """The future of lanes side by side, at the ends of the intervals and between them."""
 
-    Rows are taken apart where they are used: what a `_stage` is given should be one array, not hundreds.
-    """
-
-    rows: Float[Array, " r"]
-    rounding: Float[Array, "6"]
+    rows: Float[Array, "r l"]
+    sizes: Float[Array, "8 l"]
     n: int = eqx.field(static=True)
-    tangential: int = eqx.field(static=True)
 
     @property
-    def guards(self) -> list[list[Float[Array, ""]]]:
-        """One sample more than there are ends, for second differences."""
-        return _cut(self.rows, 2, INTERVALS + 2, 0)
+    def parts(self) -> list[Array]:
+        """First coefficients of the guards at the start; control points of their series there; their control points as
+        cubics in each interval; samples of the tangential velocity; samples of the state.
+        """
+        n_states = (INTERVALS + 1, 2 * self.n)
+        return _parts(self.rows, (4, 2), (ORDER, 2), (3, INTERVALS, 2), (INTERVALS + 1, 1), n_states)
 
-    @property
-    def states(self) -> list[list[Float[Array, ""]]]:
-        return _cut(self.rows, 2 * self.n, INTERVALS + 1, 2 * (INTERVALS + 2))
+    def safe_intervals(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
+        """How many intervals from the start on are certain to hold no event and no end of the step (`steps` intervals
+        off): a polynomial stays positive where its control points are.
+        """
+        start, hull, control, speed, _ = self.parts
+        limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
+        safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, lane]
+        # In the first interval a guard may start at zero, because its status has just begun.
+        zeros, lead = _start(start, limits)
+        first_safe = (lead > 0) & (_least(hull[2:]) > 0)
+        first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
+        index = jnp.arange(INTERVALS)[:, None]
+        safe = safe[:, 0] & safe[:, 1] | (index == 0)
+        speed = speed[:, 0]
+        rises = (speed[:-1] < 0) & (speed[1:] >= 0)
+        first = _least(jnp.where(safe & ~rises, INTERVALS, index).astype(jnp.int32))
+        first = jnp.where(first_safe[0] & first_safe[1], first, 0)
+        return jnp.minimum(first, jnp.floor(steps).astype(jnp.int32))
 
-    @property
-    def start(self) -> list[list[Float[Array, ""]]]:
-        return _cut(self.rows, 2, ORDER + 1, 2 * (INTERVALS + 2) + 2 * self.n * (INTERVALS + 1))
-
-    @property
-    def speed(self) -> list[Float[Array, ""]]:
-        return self.states[self.n + self.tangential]
-
-    def state_at(self, interval: Int[Array, ""]) -> list[Float[Array, ""]]:
+    def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "2n l"]:
         """The state where an interval begins."""
-        found = []
-        for samples in self.states:
-            value = samples[0]
-            for k, sample in enumerate(samples[1:], start=1):
-                value = jnp.where(interval == k, sample, value)
-            found.append(value)
-        return found
+        samples = self.parts[-1]
+        found, size = samples[:INTERVALS], INTERVALS
+        while size > 1:
+            size //= 2
+            found = jnp.where((interval & size) > 0, found[size:], found[:size])
+        return jnp.where(interval == INTERVALS, samples[INTERVALS], found[0])
 
-    def peak(self, interval: Int[Array, ""]) -> Float[Array, ""]:
+    def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
         """The largest tangential speed up to the beginning of an interval."""
-        largest = jnp.abs(self.speed[0])
-        for k, speed in enumerate(self.speed[1:], start=1):
-            largest = jnp.where(interval >= k, jnp.maximum(largest, jnp.abs(speed)), largest)
-        return largest
+        speed = jnp.abs(self.parts[3][:, 0])
+        return -_least(jnp.where(jnp.arange(INTERVALS + 1)[:, None] <= interval, -speed, 0.0))
 
 
 class _Series(eqx.Module):
-    """Taylor series of one lane from the beginning of an interval, in units of the interval."""
+    """Taylor series of lanes side by side from the beginning of an interval, in units of the interval."""
 
-    rows: Float[Array, " q"]
-    rounding: Float[Array, "6"]
+    rows: Float[Array, "q l"]
+    sizes: Float[Array, "8 l"]
     n: int = eqx.field(static=True)
-    tangential: int = eqx.field(static=True)
 
     @property
-    def paths(self) -> list[list[Float[Array, ""]]]:
-        return _cut(self.rows, self.n, ORDER + 2, 2 * (ORDER + 1))
+    def parts(self) -> list[Array]:
+        """Coefficients of what is watched: the guards, and the negative tangential velocity, because orbits are compared
+        where it rises through zero; their values at the end of the interval; coefficients of the displacements.
+        """
+        return _parts(self.rows, (ORDER + 1, 3), (3,), (ORDER + 2, self.n))
 
-    @property
-    def watched(self) -> list[list[Float[Array, ""]]]:
-        """The guards, and the negative tangential velocity: where it rises through zero orbits are compared."""
-        path = self.paths[self.tangential]
-        return [*_cut(self.rows, 2, ORDER + 1, 0), [-(k + 1) * path[k + 1] for k in range(ORDER + 1)]]
-
-    def brackets(self, inside: Bool[Array, ""]) -> list["_Bracket"]:
+    def brackets(self, inside: Bool[Array, " l"]) -> "_Bracket":
         """Of each watched polynomial; at the end of the window, not `inside` an interval, there is nothing to look for."""
-        first, second, falling = self.watched
-        rounding = _cut(self.rounding, 2, 3, 0)
-        none = [jnp.zeros_like(falling[0])] * 3
-        return [
-            _bracket(first, rounding[0], inside),
-            _bracket(second, rounding[1], inside),
-            _bracket(falling, none, inside & (falling[0] > 0)),
-        ]
+        c, end, _ = self.parts
+        limits = self.sizes[:6].reshape(3, 2, -1)
+        limits = jnp.concatenate([limits, jnp.zeros_like(limits[:, :1])], axis=1)
+        watch = inside & ((jnp.arange(3)[:, None] < 2) | (c[0] > 0))
+        zeros, lead = _start(c, limits)
+        spent = watch & (lead < 0)
+        crosses = watch & (lead >= 0) & (end <= 0)
+        # The first root of the parabola with this start, slope and end, in the form that does not cancel.
+        slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
+        bend = end - lead - slope
+        root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
+        rises = slope > 0
+        half = 0.5 * jnp.where(rises, slope + root, root - slope)
+        below = jnp.where(rises, bend, half)
+        guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
+        guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
+        lowest = lead - slope**2 / (4 * jnp.where(bend > 0, bend, 1.0))
+        # With allowance for what is not parabolic.
+        dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0) & (lowest <= 0.1 * bend)
+        return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips & (jnp.arange(3)[:, None] < 2))
 
-    def state(self, x: Float[Array, ""]) -> list[Float[Array, ""]]:
+    def without_zeros(self, zeros: Int[Array, "3 l"]) -> Float[Array, "k 3 l"]:
+        """What is watched, its coefficients that are zero but for rounding exactly so."""
+        c = self.parts[0]
+        return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
+
+    def state(self, x: Float[Array, " l"]) -> Float[Array, "2n l"]:
         """Displacements, and velocities in m per interval."""
-        values, slopes = zip(*(_value_and_slope(path, x) for path in self.paths), strict=True)
-        return [*values, *slopes]
+        return jnp.concatenate(_value_and_slope(self.parts[2], x))
 
 
-def _cut(rows, parts: int, length: int, start: int):
-    return [[rows[start + p * length + k] for k in range(length)] for p in range(parts)]
+def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
+    """Rows cut into pieces of these shapes, lanes last."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    return [
+        rows[end - math.prod(shape) : end].reshape(*shape, -1) for shape, end in zip(shapes, ends.tolist(), strict=True)
+    ]
 
 
-def _safe_intervals(samples: _Samples, steps: Float[Array, ""]) -> Int[Array, ""]:
-    """How many intervals from the start on are certain to hold no event and no end of the step (`steps` intervals off).
-
-    A guard may run out where a sample is not positive, and where samples that are all positive look like a parabola that
-    has its lowest point between two of them, with allowance for what is not parabolic.
-    """
-    speed, start = samples.speed, samples.start
-    unsafe = [(before < 0) & (after >= 0) for before, after in itertools.pairwise(speed)]
-    for g in samples.guards:
-        bend = [g[k + 1] - 2 * g[k] + g[k - 1] for k in range(1, INTERVALS + 1)]
-        slope = [0.5 * (g[k + 1] - g[k - 1]) for k in range(1, INTERVALS + 1)]
-        for k in range(1, INTERVALS):
-            b = jnp.maximum(jnp.abs(bend[k - 1]), jnp.abs(bend[k]))
-            lowest_inside = (slope[k - 1] < 0.2 * b) & (slope[k] > -0.2 * b)
-            unsafe[k] = unsafe[k] | (g[k + 1] <= 0) | (lowest_inside & (jnp.minimum(g[k], g[k + 1]) <= 0.25 * b))
-    # In the first interval a guard may start at zero, because its status has just begun.
-    rounding = _cut(samples.rounding, 2, 3, 0)
-    unsafe[0] = unsafe[0] | ~(_stays_positive(start[0], rounding[0]) & _stays_positive(start[1], rounding[1]))
-    first = jnp.full_like(steps, INTERVALS)
-    for k in reversed(range(INTERVALS)):
-        first = jnp.where(unsafe[k], 1.0 * k, first)
-    return jnp.minimum(first, jnp.floor(steps)).astype(jnp.int32)
+def _least(rows: Array) -> Array:
+    """The least along the first axis, by halves: XLA turns that, unlike a reduction, into plain arithmetic on lanes."""
+    while rows.shape[0] > 1:
+        half = rows.shape[0] // 2
+        rest = rows[2 * half :]
+        rows = jnp.minimum(rows[:half], rows[half : 2 * half])
+        rows = jnp.concatenate([jnp.minimum(rows[:1], rest), rows[1:]]) if rest.shape[0] else rows
+    return rows[0]
 
 
-def _stays_positive(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]]) -> Bool[Array, ""]:
-    """Whether the first coefficient that is not zero outweighs all the negative ones after it."""
-    zeros, lead = _start(c, rounding)
-    return lead + sum(jnp.where(zeros < k, jnp.minimum(ck, 0.0), 0.0) for k, ck in enumerate(c)) > 0
-
-
-def _start(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def _start(
+    c: Float[Array, "k g l"], limits: Float[Array, "3 g l"]
+) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
-    size = sum(jnp.abs(ck) for ck in c)
-    zero = jnp.abs(c[0]) <= jnp.maximum(size * ROUNDING[0], rounding[0])
-    zeros, lead = zero.astype(jnp.int32), jnp.where(zero, c[1], c[0])
-    for k in (1, 2):
-        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(size * ROUNDING[k], rounding[k]))
+    size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
+    zero = jnp.ones_like(size, bool)
+    zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
+    for k in range(3):
+        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(size * ROUNDING[k], limits[k]))
         zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
     return zeros, lead
 
 
 class _Bracket(eqx.Module):
-    """What is known of a polynomial's first root in [0, 1] from its start and its end."""
+    """What is known of the first roots of the watched polynomials in [0, 1] from their starts and ends."""
 
-    guess: Float[Array, ""]
-    zeros: Int[Array, ""]  # roots at the very start, not meant
-    end: Float[Array, ""]  # where it is no longer positive, if it crosses
-    crosses: Bool[Array, ""]
-    spent: Bool[Array, ""]  # negative from the start
-    dips: Bool[Array, ""]  # positive at both ends, perhaps not in between
-
-
-def _no_bracket(like: Float[Array, ""]) -> _Bracket:
-    no = like > like
-    return _Bracket(like, jnp.zeros_like(like, jnp.int32), like, no, no, no)
+    guess: Float[Array, "3 l"]
+    zeros: Int[Array, "3 l"]  # roots at the very start, not meant
+    end: Float[Array, "3 l"]  # where it is no longer positive, if it crosses
+    crosses: Bool[Array, "3 l"]
+    spent: Bool[Array, "3 l"]  # negative from the start
+    dips: Bool[Array, "3 l"]  # positive at both ends, perhaps not in between
 
 
-def _bracket(c: list[Float[Array, ""]], rounding: list[Float[Array, ""]], watch: Bool[Array, ""]) -> _Bracket:
-    zeros, lead = _start(c, rounding)
-    end = sum((jnp.where(zeros > k, 0.0, c[k]) for k in range(3)), sum(c[3:]))
-    spent = watch & (lead < 0)
-    crosses = watch & (lead >= 0) & (end <= 0)
-    # The first root of the parabola with this start, slope and end, in the form that does not cancel.
-    slope = sum(jnp.where(zeros == k, c[k + 1], 0.0) for k in range(4))
-    bend = end - lead - slope
-    root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
-    rises = slope > 0
-    half = 0.5 * jnp.where(rises, slope + root, root - slope)
-    below = jnp.where(rises, bend, half)
-    guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
-    guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
-    lowest = lead - slope**2 / (4 * jnp.where(bend > 0, bend, 1.0))
-    # With allowance for what is not parabolic.
-    dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0) & (lowest <= 0.1 * bend)
-    return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
-
-
-def _dipped(series: _Series, brackets: list[_Bracket]) -> list[_Bracket]:
+def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
     """The brackets of polynomials that seemed to dip below zero, decided at their lowest points; seldom run at all."""
 
-    def decided(brackets: list[_Bracket]) -> list[_Bracket]:
-        return [_decided(c, b) for c, b in zip(series.watched, brackets, strict=True)]
+    def decided(bracket: _Bracket) -> _Bracket:
+        c = series.parts[0]
+        slopes = c[1:] * jnp.arange(1.0, ORDER + 1, dtype=c.dtype)[:, None, None]
 
-    def any_dips(brackets: list[_Bracket]) -> Bool[Array, ""]:
-        return brackets[0].dips | brackets[1].dips
+        def nearer(_, x):
+            slope, bend = _value_and_slope(slopes, x)
+            return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
 
-    return jax.lax.while_loop(any_dips, decided, brackets)
+        # Newton's method: within an interval a slope is all but a straight line.
+        lowest = jax.lax.fori_loop(0, 6, nearer, jnp.full_like(bracket.end, 0.5))
+        below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
+        return _Bracket(
+            guess=jnp.where(below, 0.5 * lowest, bracket.guess),
+            zeros=bracket.zeros,
+            end=jnp.where(below, lowest, bracket.end),
+            crosses=bracket.crosses | below,
+            spent=bracket.spent,
+            dips=jnp.zeros_like(bracket.dips),
+        )
 
-
-def _decided(c: list[Float[Array, ""]], bracket: _Bracket) -> _Bracket:
-    slopes = [k * ck for k, ck in enumerate(c)][1:]
-
-    def nearer(_, x):
-        slope, bend = _value_and_slope(slopes, x)
-        return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
-
-    # Newton's method: within an interval a slope is all but a straight line.
-    lowest = jax.lax.fori_loop(0, 6, nearer, jnp.full_like(bracket.end, 0.5))
-    below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
-    return _Bracket(
-        guess=jnp.where(below, 0.5 * lowest, bracket.guess),
-        zeros=bracket.zeros,
-        end=jnp.where(below, lowest, bracket.end),
-        crosses=bracket.crosses | below,
-        spent=bracket.spent,
-        dips=jnp.zeros_like(bracket.dips),
-    )
-
-
-def _polished(series: _Series, brackets: list[_Bracket]) -> list[Float[Array, ""]]:
-    """The roots of the watched polynomials that cross zero, by Newton's method within brackets."""
-    none = jnp.zeros_like(brackets[0].guess)
-
-    def going(carry):
-        *_, open_, count = carry
-        return (open_[0] | open_[1] | open_[2]) & (count < MOST_ROOT_STEPS)
-
-    def newton(carry):
-        *state, count = carry
-        own = zip(series.watched, brackets, *state, strict=True)
-        after = [_newton(c, bracket.zeros, *lane) for c, bracket, *lane in own]
-        return (*map(list, zip(*after, strict=True)), count + 1)
-
-    start = [none] * 3, [b.end for b in brackets], [b.guess for b in brackets], [b.crosses for b in brackets]
-    _, _, roots, _, _ = jax.lax.while_loop(going, newton, (*start, jnp.zeros((), jnp.int32)))
-    return roots
-
-
-def _newton(c, zeros, low, high, x, open_):
-    """One step on the polynomial without its roots at zero, which are divided out of value and slope alike."""
-    c = [jnp.where(zeros > k, 0.0, ck) if k < 3 else ck for k, ck in enumerate(c)]
-    value, slope = _value_and_slope(c, x)
-    slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
-    low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
-    nearer = x - value / jnp.where(slope == 0, 1.0, slope)
-    # The next error is the square of this one.
-    done = (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
-    nearer = jnp.where(done | ((nearer > low) & (nearer < high)), nearer, 0.5 * (low + high))
-    return low, high, jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), open_ & ~done
+    return jax.lax.while_loop(lambda bracket: jnp.any(bracket.dips), decided, brackets)
 
 
 def _first_root(
-    brackets: list[_Bracket], roots: list[Float[Array, ""]], steps: Float[Array, ""], interval: Int[Array, ""]
-) -> tuple[Float[Array, ""], list[Bool[Array, ""]]]:
-    """Where in its interval the advance ends, as a share of it, and which of the watched end it there."""
-    end = jnp.where(interval == INTERVALS, 0.0, jnp.minimum(steps - interval, 1.0))
-    roots = [jnp.where(b.spent, 0.0, root) for b, root in zip(brackets, roots, strict=True)]
-    fires = [(b.crosses | b.spent) & (root <= end) for b, root in zip(brackets, roots, strict=True)]
-    for root, fired in zip(roots, fires, strict=True):
-        end = jnp.where(fired, jnp.minimum(end, root), end)
-    # Guards that run out at the same instant, but for rounding, do so together.
-    together = end * (1 + 4 * jnp.finfo(end.dtype).eps)
-    return end, [fired & (root <= together) for root, fired in zip(roots, fires, strict=True)]
+    series: _Series, brackets: _Bracket, end: Float[Array, " l"]
+) -> tuple[Float[Array, " l"], Bool[Array, "3 l"]]:
+    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the watched end it there.
+
+    The polynomial whose root is expected first is solved; only where another turns out to be negative by then, that one is.
+    """
+    index = jnp.arange(3)[:, None]
+    eps = jnp.finfo(end.dtype).eps
+
+    def expected_first(among: Bool[Array, "3 l"]) -> Int[Array, " l"]:
+        return jnp.argmin(jnp.where(among, brackets.guess, jnp.inf), axis=0).astype(jnp.int32)
+
+    def solve(carry):
+        open_, which, root, _, tries = carry
+        mine = index == which
+        guess, high = _chosen(brackets.guess, which), jnp.minimum(_chosen(brackets.end, which), root)
+        solved = _stage(lambda: _chosen_polynomial(series, brackets, which), (zeros_like_c, which))
+        root = _polished(*solved, jnp.minimum(guess, high), high, root, open_)
+
+        def compare():
+            # A dip is over where its bracket ends.
+            at = jnp.minimum(root, brackets.end)
+            c = series.without_zeros(brackets.zeros)
+            # Roots that differ by rounding are the same: the two guards of an open gap always are.
+            same = 8 * eps * sum(jnp.abs(c[k]) for k in range(4))
+            values = _value_and_slope(c, at)[0]
+            earlier = brackets.crosses & ~mine & (values < -same)
+            fires = brackets.crosses & (mine | ((values <= same) & (at == root)))
+            again = open_ & (earlier[0] | earlier[1] | earlier[2])
+            return again, jnp.where(again, expected_first(earlier), which), root, jnp.where(open_, fires, carry[3])
+
+        return (*_stage(compare, carry[:4]), tries + 1)
+
+    zeros_like_c = jnp.zeros((ORDER + 1, *end.shape), end.dtype)
+    crosses = brackets.crosses
+    none = jnp.zeros_like(crosses)
+    any_crosses = crosses[0] | crosses[1] | crosses[2]
+    begin = any_crosses, expected_first(crosses), jnp.ones_like(end), none, jnp.zeros((), jnp.int32)
+    _, _, root, fires, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[0]) & (carry[-1] < 3), solve, begin)
+    spent = brackets.spent
+    any_spent = spent[0] | spent[1] | spent[2]
+    root, fires = jnp.where(any_spent, 0.0, root), jnp.where(any_spent, spent, fires)
+    fires = fires & (root <= end)
+    return jnp.where(fires[0] | fires[1] | fires[2], root, end), fires
 
 
-def _value_and_slope(c: list[Float[Array, ""]], x: Float[Array, ""]):
+def _chosen(rows: Array, which: Int[Array, " l"]) -> Array:
+    return jnp.where(which == 0, rows[..., 0, :], jnp.where(which == 1, rows[..., 1, :], rows[..., 2, :]))
+
+
+def _chosen_polynomial(series: _Series, brackets: _Bracket, which: Int[Array, " l"]):
+    return _chosen(series.without_zeros(brackets.zeros), which), _chosen(brackets.zeros, which)
+
+
+def _polished(c: Float[Array, "k l"], zeros, x, high, kept, open_) -> Float[Array, " l"]:
+    """The first root of each `open_` lane's polynomial in (0, high], by Newton's method within a bracket; else `kept`."""
+
+    def going(carry):
+        *_, open_, count = carry
+        return jnp.any(open_) & (count < MOST_ROOT_STEPS)
+
+    def newton(carry):
+        low, high, x, open_, count = carry
+        value, slope = _value_and_slope(c, x)
+        # Without the roots at zero, which are divided out of value and slope alike.
+        slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
+        low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
+        nearer = x - value / jnp.where(slope == 0, 1.0, slope)
+        # The next error is the square of this one.
+        done = (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
+        nearer = jnp.where(done | ((nearer > low) & (nearer < high)), nearer, 0.5 * (low + high))
+        return low, high, jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), open_ & ~done, count + 1
+
+    begin = jnp.zeros_like(x), high, jnp.where(open_, x, kept), open_, jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(going, newton, begin)[2]
+
+
+def _value_and_slope(c: Float[Array, "k *x l"], x: Array) -> tuple[Array, Array]:
     value, slope = c[-1], jnp.zeros_like(c[-1])
-    for ck in reversed(c[:-1]):
+    for k in reversed(range(c.shape[0] - 1)):
         slope = slope * x + value
-        value = value * x + ck
+        value = value * x + c[k]
     return value, slope
