@@ -98,6 +98,7 @@ class Shared(eqx.Module):
     """What the lanes of a group have in common, worked out once."""
 
     values: Float[Array, " k"]  # the parameters that are not history
+    mechanics: Mechanics
     prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
     modes: SlidingModes
     wedge: Wedge
@@ -114,9 +115,8 @@ class Outcome(NamedTuple):
     energy: dict[str, np.ndarray]  # lines of the ledger by name, J; empty where not asked for
 
 
-def begin(scene: Scene, modes: SlidingModes, energy: bool) -> Lane:
+def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
     """A lane at the sliding equilibrium of its scene, just before anything happens."""
-    mechanics = Mechanics(scene)
     q, _ = steady_sliding(scene, scene.load.force)
     y = jnp.concatenate([q, jnp.zeros_like(q)])
     verdict = jnp.where(
@@ -150,6 +150,7 @@ def follow(
     scene: Scene,
     method: AbstractStepper | Windowed,
     resolution: orbits.Resolution,
+    mechanics: Mechanics,
     prepared,
     modes: SlidingModes,
     wedge: Wedge,
@@ -157,7 +158,6 @@ def follow(
     steps,
 ) -> Lane:
     """One lane, `steps` steps further, with the verdict if it can be proved by then."""
-    mechanics = Mechanics(scene)
     structure = scene.structure
     # The square roots of the diagonals make squares of displacements and velocities comparable energies.
     weights = jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
@@ -397,15 +397,16 @@ def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, 
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(scene, method, names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Shared(distinct, prepared, sliding_modes(linear), wedges)
+    mechanics, prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return Shared(distinct, mechanics, prepared, sliding_modes(linear), wedges)
 
 
 @eqx.filter_jit
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
-        return method.prepare(Mechanics(own)), linear_sliding(own), wedge(own)
+        mechanics = Mechanics(own)
+        return mechanics, method.prepare(mechanics), linear_sliding(own), wedge(own)
 
     return jax.vmap(one)(values)
 
@@ -414,7 +415,7 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
 def _begin(scene: Scene, names: tuple[str, ...], history: tuple[str, ...], energy: bool, shared: Shared, columns):
     def group(shared, columns):
         own = _with(scene, names, shared.values)
-        return jax.vmap(lambda row: begin(_with(own, history, row), shared.modes, energy))(columns)
+        return jax.vmap(lambda row: begin(_with(own, history, row), shared.mechanics, shared.modes, energy))(columns)
 
     return jax.vmap(group)(shared, columns)
 
@@ -424,7 +425,7 @@ def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, s
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
-        known = shared.prepared, shared.modes, shared.wedge
+        known = shared.mechanics, shared.prepared, shared.modes, shared.wedge
 
         def one(row, lane):
             return follow(_with(own, history, row), method, resolution, *known, lane, steps)

@@ -29,8 +29,8 @@ from .steppers import Advance
 INTERVALS = 16
 # The fastest vibration turns by this much between two samples, rad: guards look like cubics there.
 TURN = 0.35
-# Order of the Taylor series within an interval: TURN^15 / 15! is below rounding.
-ORDER = 14
+# Order of the Taylor series within an interval: TURN^14 / 14! is below rounding.
+ORDER = 13
 # A guard whose first coefficients are this much smaller than those after them starts at zero, but for rounding.
 ROUNDING = (1e-12, 1e-9, 1e-9)
 # Or if they are this many roundings of the terms that they are sums of.
@@ -381,9 +381,7 @@ def _least(rows: Array) -> Array:
     return rows[0]
 
 
-def _start(
-    c: Float[Array, "k g l"], limits: Float[Array, "3 g l"]
-) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
+def _start(c: Float[Array, "k g l"], limits: Float[Array, "3 g l"]) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
     zero = jnp.ones_like(size, bool)

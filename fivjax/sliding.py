@@ -103,8 +103,19 @@ class SlidingModes(eqx.Module):
     pressing: Complex[Array, " k"]  # shares of the modes in the two signals
     slip: Complex[Array, " k"]
     remainder: Complex[Array, " k"]
-    clusters: Float[Array, "c k"]  # which of them are so close that they are bounded together
+    envelope: "Envelope"
     stable: Bool[Array, ""]
+
+
+class Envelope(eqx.Module):
+    """What `envelope_peak` wants to know of the modes, at some instants; clusters are modes that are bounded together."""
+
+    growth: Complex[Array, "c i k"]  # of each mode relative to the mean of its cluster
+    bending: Float[Array, "c i k"]  # bounds on the second derivatives of that, 1/s²
+    decay: Float[Array, "c i-1"]  # of the cluster
+    chord: Float[Array, "c i-1"]  # how far a unit of bending departs from the chord, s²
+    last: Float[Array, "c k"]  # sizes of the modes at the last instant
+    members: Float[Array, "c k"]  # one for the modes of a cluster, else zero
 
 
 def sliding_modes(linear: LinearSliding) -> SlidingModes:
@@ -135,7 +146,7 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         pressing=count * np.einsum("li,lik->lk", linear.pressing, vectors),
         slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
         remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
-        clusters=_clusters(eigenvalues),
+        envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
 
@@ -152,19 +163,55 @@ def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, 
     linear = modes.linear
     z = (y - linear.equilibrium)[_sliding_coordinates(y.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
-    if mechanics.friction.constant:
-        proved = (envelope_peak(modes.pressing * modal, modes.eigenvalues, modes.clusters) < linear.pressing_margin) & (
-            envelope_peak(modes.slip * modal, modes.eigenvalues, modes.clusters) < linear.slip_margin
-        )
-    else:
-        proved = decays_nonlinearly(modes, modal)
     sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
-    return sliding & proved & modes.stable & linear.exists
+    sliding = sliding & modes.stable & linear.exists
+    if not mechanics.friction.constant:
+        return sliding & decays_nonlinearly(modes, modal)
+    members = modes.envelope.members
+    signals = [modes.pressing * modal, modes.slip * modal]
+    margins = [linear.pressing_margin, linear.slip_margin]
+    # The bound is dear. In a batch a loop runs only if one of the lanes wants it: where both signals, each cluster of
+    # modes at its largest, are within their margins now.
+    for shares, margin in zip(signals, margins, strict=True):
+        sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
+
+    def prove(carry):
+        _, _, signals = carry
+        peaks = [envelope_peak(shares, modes.envelope) for shares in signals]
+        proved = (peaks[0] < margins[0]) & (peaks[1] < margins[1])
+        # The signals change, so that XLA cannot take what depends on them out of the loop and compute it every time.
+        return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
+
+    begin = sliding, jnp.zeros_like(sliding), signals
+    return jax.lax.while_loop(lambda carry: carry[0], prove, begin)[1]
 
 
-def envelope_peak(
-    shares: Complex[Array, " k"], eigenvalues: Complex[Array, " k"], clusters: Float[Array, "c k"]
-) -> Float[Array, ""]:
+def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
+    """Tables for `envelope_peak`, of a batch of sets of decaying modes (leading axis), by NumPy.
+
+    Clusters are rows of ones and zeros.
+    """
+    members = clusters[:, :, None, :]  # [set, cluster, instant, mode]
+    own = np.where(np.isfinite(eigenvalues), eigenvalues, -1.0)[:, None, None, :]
+    mean = np.sum(members * own, axis=-1, keepdims=True) / np.maximum(np.sum(members, axis=-1, keepdims=True), 1.0)
+    offsets = members * (own - mean)
+    # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
+    slowest = 1e-6 * np.max(np.abs(own), axis=-1, keepdims=True) + 1e-300
+    horizon = ENVELOPE_DECADES / np.maximum(-mean.real, slowest)
+    t = horizon * np.linspace(0.0, 1.0, ENVELOPE_INSTANTS)[:, None] ** 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        growth = members * np.exp(offsets * t)
+        return Envelope(
+            growth=growth,
+            bending=np.abs(growth) * np.abs(offsets) ** 2,
+            decay=np.exp(mean.real * t[..., :-1, :])[..., 0],
+            chord=np.diff(t, axis=-2)[..., 0] ** 2 / 8,
+            last=(members * np.exp(own.real * horizon))[..., 0, :],
+            members=clusters,
+        )
+
+
+def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Array, ""]:
     r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes,
     tight also for near-parallel ones.
 
@@ -172,30 +219,17 @@ def envelope_peak(
     exponent $\bar λ$ of such a cluster of modes taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two
     instants a distance $h$ apart it lies within $h^2 \max|u''| / 8$ of the chord, and
     $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past the last instant the sum of sizes has decayed and is bound
-    enough. Clusters (rows of ones and zeros) are bounded one by one.
+    enough. Clusters are bounded one by one.
     """
     sizes = jnp.abs(shares)
-    bounds = []
-    for members in clusters:
-        # Nothing of this depends on the shares: lanes with the same modes share it.
-        mean = jnp.sum(members * eigenvalues) / jnp.maximum(jnp.sum(members), 1.0)
-        offsets = members * (eigenvalues - mean)
-        # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
-        horizon = ENVELOPE_DECADES / jnp.maximum(-mean.real, 1e-6 * jnp.max(jnp.abs(eigenvalues)) + 1e-300)
-        t = horizon * jnp.linspace(0.0, 1.0, ENVELOPE_INSTANTS, dtype=sizes.dtype) ** 2
-        growth = members * jnp.exp(offsets * t[:, None])
-        bending = jnp.abs(growth) * jnp.abs(offsets) ** 2
-        decay = jnp.exp(mean.real * t[:-1])
-        last = members * jnp.exp(eigenvalues.real * horizon)
-        # From here on it is one product of a matrix with the shares, and a maximum.
-        slow = jnp.hypot(
-            growth.real @ shares.real - growth.imag @ shares.imag, growth.real @ shares.imag + growth.imag @ shares.real
-        )
-        bend = bending @ sizes
-        chord = jnp.maximum(slow[1:], slow[:-1]) + jnp.diff(t) ** 2 / 8 * jnp.maximum(bend[1:], bend[:-1])
-        peak = jnp.maximum(jnp.max(decay * chord), last @ sizes)
-        bounds.append(jnp.minimum(peak, members @ sizes))
-    bound = sum(bounds)
+    growth = envelope.growth
+    slow = jnp.hypot(
+        growth.real @ shares.real - growth.imag @ shares.imag, growth.real @ shares.imag + growth.imag @ shares.real
+    )
+    bend = envelope.bending @ sizes  # [cluster, instant]
+    chord = jnp.maximum(slow[:, 1:], slow[:, :-1]) + envelope.chord * jnp.maximum(bend[:, 1:], bend[:, :-1])
+    peaks = jnp.maximum(jnp.max(envelope.decay * chord, axis=-1), envelope.last @ sizes)
+    bound = jnp.sum(jnp.minimum(peaks, envelope.members @ sizes))
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 

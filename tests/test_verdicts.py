@@ -8,7 +8,7 @@ import pytest
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.orbit import Resolution, new_orbit, observe
-from fivjax.sliding import envelope_peak, linear_sliding, slides_forever, sliding_modes
+from fivjax.sliding import envelope, envelope_peak, linear_sliding, slides_forever, sliding_modes
 
 
 def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):
@@ -29,7 +29,8 @@ def test_the_envelope_is_a_bound_and_a_tight_one(apart):
         # Near-parallel modes: huge shares that cancel to a sum of size one.
         shares = rng.normal() / apart * np.array([1, -1]) + rng.normal(size=2) + 1j * rng.normal(size=2)
         with jax.enable_x64(True):
-            bound = float(envelope_peak(jnp.asarray(shares), jnp.asarray(eigenvalues), jnp.ones((1, 2))))
+            table = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), envelope(eigenvalues[None], np.ones((1, 1, 2))))
+            bound = float(envelope_peak(jnp.asarray(shares), table))
         true = brute_force_peak(shares, eigenvalues)
         assert bound >= true * (1 - 1e-9)
         # What is lost: chords between instants, and the sum of sizes at the end of the horizon.
