@@ -102,13 +102,16 @@ def _advance(
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
     here = _stacked(mechanics, contact, load, y)
-    window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), n)
+    # Slip and gap are put at zero exactly where their status begins. If they are small, they are small.
+    sliding, open_ = contact.status == Status.SLIDE, contact.status == Status.DETACH
+    exact = jnp.stack([open_, sliding | open_])
+    window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n)
     none = jnp.zeros_like(load)
 
     interval = _stage(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
     state, peak = _stage(lambda: (window.state_at(interval), window.peak(interval)), (jnp.zeros_like(y), none))
     there = _stacked(mechanics, contact, load, state)
-    series = _Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), n)
+    series = _Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), exact, n)
     no = jnp.zeros((3, *none.shape), bool)
     guess = jnp.zeros((3, *none.shape), none.dtype)
     like = _Bracket(guess, no.astype(jnp.int32), guess, no, no, no)
@@ -272,6 +275,7 @@ class _Window(eqx.Module):
 
     rows: Float[Array, "r l"]
     sizes: Float[Array, "8 l"]
+    exact: Bool[Array, "2 l"]  # guards that are exactly zero where they are meant to be
     n: int = eqx.field(static=True)
 
     @property
@@ -290,7 +294,7 @@ class _Window(eqx.Module):
         limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
         safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, lane]
         # In the first interval a guard may start at zero, because its status has just begun.
-        zeros, lead = _start(start, limits)
+        zeros, lead = _start(start, limits, self.exact)
         first_safe = (lead > 0) & (_least(hull[2:]) > 0)
         first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
         index = jnp.arange(INTERVALS)[:, None]
@@ -321,6 +325,7 @@ class _Series(eqx.Module):
 
     rows: Float[Array, "q l"]
     sizes: Float[Array, "8 l"]
+    exact: Bool[Array, "2 l"]  # guards that are exactly zero where they are meant to be
     n: int = eqx.field(static=True)
 
     @property
@@ -335,8 +340,9 @@ class _Series(eqx.Module):
         c, end, _ = self.parts
         limits = self.sizes[:6].reshape(3, 2, -1)
         limits = jnp.concatenate([limits, jnp.zeros_like(limits[:, :1])], axis=1)
+        exact = jnp.concatenate([self.exact, jnp.zeros_like(self.exact[:1])])
         watch = inside & ((jnp.arange(3)[:, None] < 2) | (c[0] > 0))
-        zeros, lead = _start(c, limits)
+        zeros, lead = _start(c, limits, exact)
         spent = watch & (lead < 0)
         crosses = watch & (lead >= 0) & (end <= 0)
         # The first root of the parabola with this start, slope and end, in the form that does not cancel.
@@ -381,13 +387,16 @@ def _least(rows: Array) -> Array:
     return rows[0]
 
 
-def _start(c: Float[Array, "k g l"], limits: Float[Array, "3 g l"]) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
+def _start(
+    c: Float[Array, "k g l"], limits: Float[Array, "3 g l"], exact: Bool[Array, "g l"]
+) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
     zero = jnp.ones_like(size, bool)
     zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
     for k in range(3):
-        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(size * ROUNDING[k], limits[k]))
+        share = jnp.where(exact, 0.0, size * ROUNDING[k]) if k == 0 else size * ROUNDING[k]
+        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(share, limits[k]))
         zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
     return zeros, lead
 

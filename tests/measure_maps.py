@@ -1,13 +1,19 @@
 """Figures of trajectories, maps and critical perturbations, as the README states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed]
+    python tests/measure_maps.py [errors] [table2] [map] [speed] [start] [memory]
 
 Each word picks one study; without any, all run (some minutes on two cores). The reference is `tests/oracle.py`.
 """
 
+import itertools
 import json
+import os
+import resource
+import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import oracle
@@ -72,14 +78,51 @@ def map_() -> None:
 
 
 def speed() -> None:
-    """Wall time and lane-cycles (one trajectory over 1/68 s) per second, first call and warm."""
-    for points in (32, 64):
-        for call in ("first call", "warm"):
-            begin = time.perf_counter()
+    """Maps of two sizes: wall time, that of all cores, and lane-cycles (one trajectory over 1/68 s) per second."""
+    for points, calls in ((64, ("first call", "warm", "warm", "warm")), (256, ("warm", "warm"))):
+        for call in calls:
+            begin, cores = time.perf_counter(), time.process_time()
             m = paper_map(points)
-            wall = time.perf_counter() - begin
-            lasted = np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"])
-            print(f"{points} × {points}, {call}: {wall:.1f} s, {68 * lasted.sum() / wall:.3g} lane-cycles/s")
+            wall, cores = time.perf_counter() - begin, time.process_time() - cores
+            undecided = np.asarray(m["verdict"] < 0)
+            cycles = 68 * np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"]).sum()
+            print(
+                f"{points} × {points}, {call}: {wall:.1f} s ({cores:.1f} s of cores), {cycles / wall:.2g} lane-cycles/s, "
+                f"{cycles / cores:.2g} per core; undecided {undecided.mean():.2%}, "
+                f"farthest from a boundary in p: {_farthest(m, undecided):.1g}",
+                flush=True,
+            )
+
+
+def _farthest(m, undecided: np.ndarray) -> float:
+    """How far in p an undecided lane is from the nearest change between sliding and limit cycle at its μ, at most."""
+    p, verdict, worst = np.asarray(m["p"]), np.asarray(m["verdict"].transpose("mu", "p")), 0.0
+    for row, open_ in zip(verdict, np.asarray(undecided), strict=True):
+        known = np.flatnonzero(row >= 0)
+        changes = [0.5 * (p[a] + p[b]) for a, b in itertools.pairwise(known) if row[a] != row[b]]
+        for lane in np.flatnonzero(open_):
+            worst = max(worst, min((abs(p[lane] - change) for change in changes), default=np.inf))
+    return worst
+
+
+def start() -> None:
+    """From the start of `fivjax map` to its end, 64 × 64: nothing compiled before, and with the compilation cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "XDG_CACHE_HOME": folder}
+        command = [Path(sys.executable).with_name("fivjax"), "map", "--out", f"{folder}/map"]
+        for name in ("cold", "cached", "cached"):
+            begin = time.perf_counter()
+            subprocess.run(command, env=environment, check=True, capture_output=True)
+            print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
+
+
+def memory() -> None:
+    """What a map adds to the memory of the process at its highest, per lane."""
+    paper_map(16)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    paper_map(256)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(f"{(after - before) / 256**2:.2f} kB per lane, 65,536 lanes")
 
 
 def paper_map(points: int):
@@ -88,7 +131,7 @@ def paper_map(points: int):
 
 
 if __name__ == "__main__":
-    studies = {"errors": errors, "table2": table2, "map": map_, "speed": speed}
+    studies = {"errors": errors, "table2": table2, "map": map_, "speed": speed, "start": start, "memory": memory}
     for name in sys.argv[1:] or studies:
         print(f"--- {name}: {studies[name].__doc__}")
         studies[name]()
