@@ -29,16 +29,16 @@ from fivjax.verdict import Verdict
 COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
 T_MAX, MAX_STEPS = 20.0, 2048
 PATIENCE = 10  # s that the oracle gets for one lane
+TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest step of its own
 
 
-def decided(lanes: dict, method=None, energy: bool = False) -> engine.Outcome:
-    start = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
-    method = fj.EventExact() if method is None else method
+def decided(lanes: dict, energy: bool = False) -> engine.Outcome:
+    start = extremes.FALLING if "decay" in lanes else extremes.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
         return engine.run_to_verdict(
             start,
             lanes,
-            method,
+            fj.EventExact(),
             t_max=T_MAX,
             memory=2e9,
             max_steps=MAX_STEPS,
@@ -46,6 +46,23 @@ def decided(lanes: dict, method=None, energy: bool = False) -> engine.Outcome:
             label="extremes",
             energy=energy,
         )
+
+
+def drawn() -> list[tuple[dict, np.ndarray, np.ndarray]]:
+    """All lanes, those with falling friction apart, with their verdicts and last events: run once, then kept in a file."""
+    falling = COUNT // 25
+    draws = [extremes.draw(COUNT - falling, seed=1), extremes.draw_falling(falling, seed=6)]
+    kept = Path(tempfile.gettempdir()) / f"fivjax-extremes-{COUNT}.npz"
+    if not kept.exists():
+        outcomes = [decided(lanes) for lanes in draws]
+        columns = {f"verdict{k}": outcome.verdict for k, outcome in enumerate(outcomes)}
+        columns |= {f"last{k}": outcome.last_event for k, outcome in enumerate(outcomes)}
+        columns |= {f"amplitude{k}": outcome.amplitude for k, outcome in enumerate(outcomes)}
+        np.savez(kept, **columns)
+    with np.load(kept) as columns:
+        unfit = [np.sum((columns[f"verdict{k}"] >= 0) & ~np.isfinite(columns[f"amplitude{k}"])) for k in (0, 1)]
+        print(f"decided lanes with numbers that are not finite: {sum(unfit)}")
+        return [(lanes, columns[f"verdict{k}"], columns[f"last{k}"]) for k, lanes in enumerate(draws)]
 
 
 def counts(verdict: np.ndarray) -> str:
@@ -56,11 +73,9 @@ def counts(verdict: np.ndarray) -> str:
 def lanes_() -> None:
     """Lanes over all ranges at once: each has a status."""
     begin = time.perf_counter()
-    outcome = decided(extremes.draw(COUNT, seed=1))
-    print(f"{COUNT} lanes: {counts(outcome.verdict)} ({time.perf_counter() - begin:.0f} s)")
-    print(f"without a status: {int(np.sum(outcome.verdict == Verdict.NOT_RUN))}")
-    proved = outcome.verdict >= 0
-    print(f"decided lanes with numbers that are not finite: {int(np.sum(proved & ~np.isfinite(outcome.amplitude)))}")
+    for name, (_, verdict, _) in zip(("friction that does not fall", "falling friction"), drawn(), strict=True):
+        print(f"{name}, {len(verdict)} lanes: {counts(verdict)}; none: {int(np.sum(verdict == Verdict.NOT_RUN))}")
+    print(f"{time.perf_counter() - begin:.0f} s")
 
 
 class TooSlow(Exception):
@@ -91,7 +106,7 @@ def painleve(model: oracle.Model) -> bool:
     return inverse[n, n] <= model.friction.static * abs(inverse[n, t])
 
 
-def judged(lane: dict, verdict: int) -> bool | None:
+def judged(lane: dict, verdict: int, last_event: float) -> bool | None:
     """Whether the independent solver confirms a lane's status or its reason; None where it cannot say."""
     model = extremes.model(lane)
     with np.errstate(all="ignore"):
@@ -111,50 +126,81 @@ def judged(lane: dict, verdict: int) -> bool | None:
         if verdict == Verdict.UNBOUNDED:
             run = limited(oracle.simulate, model, 2 * T_MAX, np.linspace(T_MAX, 2 * T_MAX, 20))
             return None if run is None else bool(np.all(run.status == oracle.STICK) and np.all(np.diff(run.N) > 0))
-        if verdict == Verdict.STEP_FAILURE:
-            # An upper bound on the fastest rate: overdamped motion included.
-            inverse = np.linalg.inv(model.mass)
-            generator = np.block(
-                [[np.zeros((3, 3)), np.eye(3)], [-inverse @ model.stiffness, -inverse @ model.damping]]
-            )
-            fastest = np.max(np.abs(np.linalg.eigvals(generator)))
-            return bool(T_MAX * fastest / 0.35 > MAX_STEPS)
-        if verdict == Verdict.UNDECIDED:
-            t1 = min(T_MAX, 3 * extremes.slow_period(lane))
-            run = limited(oracle.simulate, model, t1, np.array([0.0, t1]))
-            if run is None or len(run.q) < 2:
-                return None
-            ours = fj.simulate(extremes.scene(lane), t1, t1)
-            mine = np.concatenate([ours.displacement[-1], ours.velocity[-1]])
-            theirs = np.concatenate([run.q[-1], run.v[-1]])
-            return bool(np.max(np.abs(mine - theirs)) <= 1e-6 * np.max(np.abs(theirs)))
-    return None
+        if verdict == Verdict.TOO_MANY_EVENTS:
+            return endless(model, last_event)
+        if verdict == Verdict.STEP_FAILURE and T_MAX * extremes.fastest_rate(lane) / TURN_OF_A_STEP <= MAX_STEPS:
+            return False
+        # Neither status says where the lane ends; the state on the way there is the same.
+        return same_state(lane, model)
 
 
-def confirm(count: int = 300, pool: int = 4096) -> None:
-    """Lanes of every status and of the corners by the independent solver."""
-    lanes = extremes.draw(min(COUNT, pool), seed=2, corners=0.5)
-    outcome = decided(lanes)
-    print(f"drawn with corners: {counts(outcome.verdict)}")
-    codes = np.unique(outcome.verdict)
-    rng = np.random.default_rng(3)
-    wrong = []
-    for code in codes:
-        members = np.flatnonzero(outcome.verdict == code)
-        chosen = rng.permutation(members)[: 2 * count // len(codes)]
+def endless(model: oracle.Model, last_event: float) -> bool | None:
+    """Whether events accumulate for the independent solver too, at the instant at which they did for the lane."""
+
+    def stop(*_):
+        raise TooSlow
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(PATIENCE)
+    try:
+        oracle.simulate(model, 1.01 * last_event + 1e-9, np.array([0.0]))
+    except oracle.ZenoError:
+        return True
+    except (TooSlow, RuntimeError, ValueError, FloatingPointError, MemoryError):
+        return None
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    return False
+
+
+def same_state(lane: dict, model: oracle.Model) -> bool | None:
+    """Whether both solvers are in the same state after three slow periods, or sixty of the fastest if that is less."""
+    t1 = min(T_MAX, 3 * extremes.slow_period(lane), 60 * 2 * np.pi / extremes.fastest_rate(lane))
+    run = limited(oracle.simulate, model, t1, np.array([0.0, t1]))
+    if run is None or len(run.q) < 2:
+        return None
+    ours = fj.simulate(extremes.scene(lane), t1, t1)
+    length = np.max(np.abs(run.q))
+    speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / extremes.slow_period(lane))
+    apart = np.max(np.abs(ours.displacement[-1] - run.q[-1])) / length
+    apart = max(apart, np.max(np.abs(ours.velocity[-1] - run.v[-1])) / speed)
+    return bool(apart <= 1e-6)
+
+
+def at_corners(lanes: dict) -> np.ndarray:
+    """How many of a lane's parameters lie on a corner of the ranges."""
+    return sum(np.isin(lanes[name], extremes.CORNERS[name]).astype(int) for name in extremes.CORNERS if name in lanes)
+
+
+def confirm(count: int = 300) -> None:
+    """Lanes of every status, half of each from the corners, by the independent solver."""
+    (lanes, verdict, last), (falling, falling_verdict, falling_last) = drawn()
+    groups = [(lanes, verdict, last, code) for code in np.unique(verdict)]
+    groups += [(falling, falling_verdict, falling_last, code) for code in np.unique(falling_verdict)]
+    rng, each, wrong = np.random.default_rng(3), -(-count // len(groups)), []
+    total = 0
+    for lanes, verdict, last, code in groups:
+        members = rng.permutation(np.flatnonzero(verdict == code))
+        # From the corners inwards, and any, in turn.
+        cornered = members[np.argsort(-at_corners(lanes)[members], kind="stable")]
+        chosen = list(dict.fromkeys(np.stack([cornered, members], axis=1).ravel()))[: 2 * each]
         answers = []
         for index in chosen:
-            answers.append(judged(extremes.row(lanes, index), int(code)))
+            lane = extremes.row(lanes, index)
+            answers.append(judged(lane, int(code), float(last[index])))
             if answers[-1] is False:
-                wrong.append((Verdict(int(code)).name, extremes.row(lanes, index)))
-            if sum(answer is not None for answer in answers) >= -(-count // len(codes)):
+                wrong.append((Verdict(int(code)).name, lane))
+            if sum(answer is not None for answer in answers) >= each:
                 break
         tally = {word: answers.count(word) for word in (True, False, None)}
+        total += tally[True]
         print(
-            f"{Verdict(int(code)).name.lower():>16}: {tally[True]} confirmed, {tally[False]} contradicted, "
-            f"{tally[None]} on which the reference gave up",
+            f"{Verdict(int(code)).name.lower():>16}{' (falling)' if 'decay' in lanes else '':10}: {tally[True]} confirmed, "
+            f"{tally[False]} contradicted, {tally[None]} on which the reference gave up",
             flush=True,
         )
+    print(f"{total} confirmed")
     for name, lane in wrong:
         print("contradicted:", name, {key: float(f"{value:.6g}") for key, value in lane.items()})
 
