@@ -1,9 +1,9 @@
 """What holds at the extremes: the README's table and figures.
 
-    python tests/measure_extremes.py [lanes] [confirm] [energy] [table] [resume]
+    python tests/measure_extremes.py [lanes] [confirm] [energy] [table] [resume] [refusals]
 
 Each word picks one study; without any, all run. `EXTREMES_LANES` sets how many lanes are drawn (100,000 unless given).
-`confirm` and `energy` need no `lanes` before them. The reference is `tests/oracle.py`.
+`confirm` needs no `lanes` before it; both keep what they ran in the temporary folder. The reference is `tests/oracle.py`.
 """
 
 import itertools
@@ -15,15 +15,21 @@ import tempfile
 import time
 from pathlib import Path
 
+import equinox as eqx
 import extremes
 import jax
+import jax.numpy as jnp
 import killed_map
 import numpy as np
 import oracle
+import pytest
+import refusing
 import xarray as xr
 
 import fivjax as fj
 from fivjax import lanes as engine
+from fivjax.simulate import start_state, states_at
+from fivjax.steppers import MOST_ADVANCES
 from fivjax.verdict import Verdict
 
 COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
@@ -239,6 +245,7 @@ def energy(count: int = 8192) -> None:
 
 PAPER = dict(belt_speed=3.0, theta=0.01, mu=0.227, p=1.3, c1=1.0, c2=1.0, m1=0.53, m2=0.045, k1=1e5, k2=1.01e5,
              force=100.0, duration=0.1, restitution=0.0)  # fmt: skip
+FALLING = dict(mu_static=0.25, mu_dynamic=0.2)
 TABLE = {
     "belt speed 1e-6, 1e-3, 1e2, 1e4 m/s": [dict(belt_speed=v) for v in (1e-6, 1e-3, 1e2, 1e4)],
     "θ −1.2, −0.5, 0, 0.5, 1.2": [dict(theta=x, mu=0.2) for x in (-1.2, -0.5, 0.0, 0.5, 1.2)],
@@ -249,61 +256,99 @@ TABLE = {
     "stiffness ratio 1e-6, 1e-3, 1e3, 1e6": [dict(k2=1e5 * x) for x in (1e-6, 1e-3, 1e3, 1e6)],
     "load 1e-6, 1, 1e6, 1e9 N": [dict(force=x) for x in (1e-6, 1.0, 1e6, 1e9)],
     "pulse 1e-9 s, 1e9 s": [dict(duration=1e-9), dict(duration=1e9)],
+    "decay of friction 0, 1, 1e6 s/m": [dict(**FALLING, decay=x) for x in (0.0, 1.0, 1e6)],
     "restitution 0.5, 0.9, 1": [dict(restitution=x) for x in (0.5, 0.9, 1.0)],
+    "10⁴ cycles without friction and damping": [dict(c1=0.0, c2=0.0, mu=0.0, p=1.05, t1=150.0)],
 }
+ROWS = 8
+
+
+def touches(p: float) -> bool:
+    """Whether any contact event happens in the first 0.3 s."""
+    return bool(oracle.propagate(extremes.model({**PAPER, "p": p}), 0.3, np.array([0.0])).events)
+
+
+def grazing() -> list[dict]:
+    low, high = 1.0, 1.3
+    while high - low > 4e-15:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if touches(middle) else (middle, high)
+    return [dict(p=low * (1 - 1e-9)), dict(p=high * (1 + 1e-9))]
 
 
 references: dict[tuple, oracle.Run | None] = {}
 
 
+def reference(case: dict, t1: float) -> oracle.Run | None:
+    """By matrix exponentials where friction is constant, by SciPy where it falls; None where that takes too long."""
+    key = (t1, tuple(sorted(case.items())))
+    if key not in references:
+        solver = oracle.simulate if "decay" in case else oracle.propagate
+        references[key] = limited(solver, extremes.model(case), t1, np.linspace(0.0, t1, ROWS + 1))
+    return references[key]
+
+
+def states(scene: fj.Scene, t1: float, method, single: bool) -> tuple[np.ndarray, str]:
+    """States along the rows, and how the run ended; `single` computes in float32 all through."""
+    if not single:
+        run = fj.simulate(scene, t1, t1 / ROWS, method)
+        return np.hstack([run.displacement, run.velocity]), fj.Ending(int(run.outcome)).name.lower().replace("_", " ")
+    with jax.enable_x64(True):
+        scene = jax.tree.map(lambda leaf: leaf.astype(np.float32), scene)
+        y0 = start_state(scene, None).astype(np.float32)
+        most = MOST_ADVANCES + int(np.ceil(t1 / ROWS / method.dt))
+        found = np.asarray(_in_single(scene, method, y0, jnp.linspace(0.0, t1, ROWS + 1, dtype=np.float32), most))
+    return found.astype(float), "finished" if np.all(np.isfinite(found)) else "NaN in float32"
+
+
+@eqx.filter_jit
+def _in_single(scene, method, y0, instants, most):
+    found = states_at(scene, method, y0, instants, most)[0]
+    assert found.dtype == jnp.float32
+    return found
+
+
 def worst_error(cases: list[dict], method, single: bool) -> tuple[float, set[str]]:
-    """Of the states after 0.3 s (1 ms where a millionfold stiffness makes the reference slow), relative; and the endings."""
+    """Of the states after 0.3 s (2 ms where stiffness makes the reference slow), relative; and the endings."""
     worst, endings = 0.0, set()
     for change in cases:
-        lane = {**PAPER, **change}
-        if single:
-            lane = {name: float(np.float32(value)) for name, value in lane.items()}
-        stiff = math_ratio(lane) > 1e2
-        t1 = 2e-3 if stiff else 0.3
-        scene = extremes.scene(lane)
+        case = {**PAPER, **change}
+        t1 = case.pop("t1", 2e-3 if fastness(case) > 1e2 else 0.3)
+        if "decay" in case:
+            del case["mu"]
         try:
-            run = fj.simulate(scene, t1, t1 / 8, method)
+            mine, ending = states(extremes.scene(case), t1, method, single)
         except ValueError:
             endings.add("refused")
             continue
-        endings.add(fj.Ending(int(run.outcome)).name.lower().replace("_", " "))
-        key = (t1, tuple(sorted({**PAPER, **change}.items())))
-        if key not in references:
-            references[key] = limited(oracle.simulate, extremes.model({**PAPER, **change}), t1, run.t)
-        reference = references[key]
-        if reference is None or len(reference.q) < len(run.t):
+        endings.add(ending)
+        right = reference(case, t1)
+        if right is None or len(right.q) < len(mine):
             endings.add("reference gave up")
             continue
-        mine, theirs = np.hstack([run.displacement, run.velocity]), np.hstack([reference.q, reference.v])
+        theirs = np.hstack([right.q, right.v])
         scale = np.maximum(np.max(np.abs(theirs), axis=0), 1e-12 * np.max(np.abs(theirs)))
         error = np.max(np.abs(mine - theirs) / scale)
         worst = max(worst, float(error) if np.isfinite(error) else np.inf)
+        print(f"    {change} {type(method).__name__} {single}: {error:.1e} {ending}", file=sys.stderr, flush=True)
     return worst, endings
 
 
-def math_ratio(lane: dict) -> float:
-    return np.sqrt(max(lane["k1"], lane["k2"]) / min(lane["m1"], lane["m2"])) / 1.5e3
+def fastness(case: dict) -> float:
+    return np.sqrt(max(case["k1"], case["k2"]) / min(case["m1"], case["m2"])) / 1.5e3
 
 
 def table() -> None:
-    """The README's table: one row for each extreme, one column for each method and precision of the input."""
+    """The README's table: one row for each extreme, one column for each method and precision; cases on standard error."""
     methods = {"EventExact": fj.EventExact(), "WhereSwitched": fj.WhereSwitched(dt=2e-5)}
-    print(
-        "| extreme | "
-        + " | ".join(f"{m}, {d}" for m, d in itertools.product(methods, ("float64", "float32")))
-        + " | ending |"
-    )
+    pairs = list(itertools.product(methods.items(), ("float64", "float32")))
+    print("| extreme | " + " | ".join(f"{name}, {kind}" for (name, _), kind in pairs) + " | ending |")
     print("|---" * 6 + "|")
-    for name, cases in TABLE.items():
+    for name, cases in {**TABLE, "grazing: p where N first touches zero, ∓ 1e-9": grazing()}.items():
         columns, endings = [], set()
-        for method, single in itertools.product(methods.values(), (False, True)):
-            error, seen = worst_error(cases, method, single)
-            columns.append(f"{error:.0e}")
+        for (_, method), kind in pairs:
+            error, seen = worst_error(cases, method, kind == "float32")
+            columns.append(f"{error:.0e}" if np.isfinite(error) else "fails")
             endings |= seen
         print(f"| {name} | " + " | ".join(columns) + f" | {', '.join(sorted(endings))} |", flush=True)
 
@@ -334,7 +379,21 @@ def resume(times: int = 20) -> None:
     print(f"{same} of {times} identical")
 
 
-STUDIES = {"lanes": lanes_, "confirm": confirm, "energy": energy, "table": table, "resume": resume}
+def refusals() -> None:
+    """Kinds of bad input whose refusals the tests check: sentences that differ in more than their values."""
+    here = Path(__file__).parent
+    pytest.main(["-q", str(here / "test_refusals.py"), str(here / "test_refusals_of_commands.py")])
+    print(f"{len(refusing.SEEN)} kinds of bad input, each refused with a sentence of its own")
+
+
+STUDIES = {
+    "lanes": lanes_,
+    "confirm": confirm,
+    "energy": energy,
+    "table": table,
+    "resume": resume,
+    "refusals": refusals,
+}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or STUDIES:
