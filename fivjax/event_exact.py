@@ -206,11 +206,15 @@ def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
     def size(k):
         return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
 
+    tiny = float(jnp.finfo(states[0].dtype).tiny)
+    moves = (size(0) > 0) | (size(1) > 0)
+
     def reach(last):
-        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish.
-        end = size(last)
-        steps = [(tolerance * size(j) / jnp.where(end > 0, end, 1.0)) ** (1.0 / (last - j)) for j in (0, 1)]
-        return jnp.where(end > 0, jnp.maximum(*steps), jnp.inf)
+        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
+        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
+        end = jnp.maximum(size(last), tiny)
+        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1)]
+        return jnp.where(moves, jnp.maximum(*steps), jnp.inf)
 
     return jnp.minimum(reach(order), reach(order - 1))
 

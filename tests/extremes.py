@@ -82,7 +82,9 @@ def row(lanes: dict[str, np.ndarray], index: int) -> dict[str, float]:
 
 
 def scene(lane: dict[str, float]) -> fj.Scene:
-    return (FALLING if "decay" in lane else CONSTANT).replace(**lane)
+    if "decay" in lane:
+        return FALLING.replace(**lane)
+    return CONSTANT.replace(**{"mu_static": lane["mu"], **lane})
 
 
 CONSTANT = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.2), 3.0, fj.Pulse(100.0, 1.2))

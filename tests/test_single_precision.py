@@ -36,6 +36,7 @@ def state(scene: fj.Scene, dtype) -> np.ndarray:
         dict(belt_speed=0.1),  # stick and slip
         dict(force=1e9, belt_speed=3e7),  # large numbers
         dict(force=1e-6, belt_speed=3e-8),  # small ones
+        dict(m2=5.3e-4, p=1.1),  # slow motion of a structure whose fastest vibration is thirty times as fast
         dict(k1=1e7, k2=1.01e7, c1=10.0, c2=10.0, mu=0.1),  # ten times as fast: 200 periods
     ],
     ids=str,
