@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import arguments
 from . import contact as physics
-from .contact import Contact, Mechanics, State
+from .contact import Contact, Mechanics, State, Status
 from .orbit import Resolution
 from .scene import Scene
 from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
@@ -101,8 +101,12 @@ class EventExact(AbstractStepper):
         for guard in guards:
             scaled.append(guard * power)
             power = power * reach
+        # Slip and gap are put at zero exactly where their status begins. If they are small, they are small: a slow belt
+        # under a high load has a slip that the motion outgrows a billionfold before it is used up.
+        sliding, open_ = contact.status == Status.SLIDE, contact.status == Status.DETACH
+        exact = jnp.stack([open_, sliding | open_, jnp.zeros_like(open_)])
         safe, fires = _march_to_roots(
-            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)]
+            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )
         watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
         safe, fires = jnp.where(watching, safe, 1.0), fires & watching
@@ -220,7 +224,9 @@ def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
 
 
 def _march_to_roots(
-    c: list[Float[Array, " g"]], rounding: list[Float[Array, " g"]] | None = None
+    c: list[Float[Array, " g"]],
+    rounding: list[Float[Array, " g"]] | None = None,
+    exact: Bool[Array, " g"] | None = None,
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
@@ -229,11 +235,13 @@ def _march_to_roots(
     $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is what gets away from the flat start after a lift-off. On [0, 1] negative
     coefficients alone make the bounds. So no root is skipped, a dip below zero inside the interval is found at its first
     crossing, and near a simple root the march converges quadratically. Zeros at the very start are divided out: the
-    root at which the status began. A march that runs out of steps has still shown how far the way is clear.
+    root at which the status began; with an `exact` start, little is not nothing. A march that runs out of steps has still
+    shown how far the way is clear.
     """
     eps = jnp.finfo(c[0].dtype).eps
     size = sum(jnp.abs(ck) for ck in c)
     shares = ROUNDING[c[0].dtype.name]
+    shares = shares if exact is None else (jnp.where(exact, 0.0, shares[0]), *shares[1:])
     rounding = [jnp.zeros_like(size)] * 3 if rounding is None else rounding
     zero = [jnp.abs(ck) <= jnp.maximum(size * share, r) for ck, share, r in zip(c, shares, rounding, strict=False)]
     none = jnp.zeros_like(size)
