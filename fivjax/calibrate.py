@@ -217,6 +217,11 @@ def calibrate(
         rate = BLOCKS_PER_PERIOD * float(frequencies.max())
     arguments.real_number("rate", rate, above=0)
 
+    for k, recording in enumerate(recordings):
+        if round(recording.rate / rate) > len(recording.t):
+            raise ValueError(
+                f"Recording {k} is too short: not one block at {rate:g} per second. Raise `rate`, or record for longer."
+            )
     blocks = [averaged(recording, rate) for recording in recordings]
     for k, block in enumerate(blocks):
         if len(block.means) < 2 * len(parameters.names) + 8:

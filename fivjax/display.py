@@ -67,7 +67,7 @@ def _picture(result) -> Figure | None:
 
 def _of_trajectory(run: Trajectory) -> Figure:
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(5, 3)))
+    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(5, 3)))  # pyright: ignore[reportCallIssue]
     # A part of a figure has all that a picture function asks of a figure.
     plot.response(run, figure=left)  # pyright: ignore[reportArgumentType]
     plot.phase_plane(run, last=0.25 * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]

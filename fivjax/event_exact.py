@@ -19,17 +19,16 @@ from jaxtyping import Array, Bool, Float
 
 from . import arguments
 from . import contact as physics
-from .contact import Contact, Mechanics, State
+from .contact import Contact, Mechanics, State, Status
 from .orbit import Resolution
 from .scene import Scene
 from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
 
 # A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
-ROUNDING = 1e-12
 # If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
-ROUNDING_OF_SLOPES = 1e-9
+ROUNDING = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
 # Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
-RESTING = 1e-7
+RESTING = {"float64": 1e-7, "float32": 1e-4}
 # Or if it is this many roundings of the terms that it is a sum of.
 ROUNDINGS = 64
 MOST_ROOT_STEPS = 60
@@ -94,15 +93,20 @@ class EventExact(AbstractStepper):
     ) -> Advance:
         # The last row watches the tangential velocity rise through zero: not an event of the contact, but where orbits
         # are compared, see `orbit`.
-        states, guards = _series(mechanics, contact, load, y, self.order_)
-        rounding = _rounding(mechanics, contact, load, y)
-        reach = jnp.minimum(jnp.minimum(h, self.dt), _trusted(states, self.tolerance))
+        unit = _time_unit(mechanics)
+        states, guards = _series(mechanics, contact, load, y, self.order_, unit)
+        rounding = _rounding(mechanics, contact, load, y, unit)
+        reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
             scaled.append(guard * power)
             power = power * reach
+        # Slip and gap are put at zero exactly where their status begins. If they are small, they are small: a slow belt
+        # under a high load has a slip that the motion outgrows a billionfold before it is used up.
+        sliding, open_ = contact.status == Status.SLIDE, contact.status == Status.DETACH
+        exact = jnp.stack([open_, sliding | open_, jnp.zeros_like(open_)])
         safe, fires = _march_to_roots(
-            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)]
+            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )
         watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
         safe, fires = jnp.where(watching, safe, 1.0), fires & watching
@@ -111,31 +115,43 @@ class EventExact(AbstractStepper):
         fires = fires & (safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps))
         x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
         ended = fires[:2]
-        h_used = x * reach
-        reached, _ = _value_and_slope(states, h_used)
+        reached, _ = _value_and_slope(states, x * reach)
         n = y.shape[0] // 2
         rising = jnp.arange(2 * n) == n + mechanics.tangential
         reached = jnp.where(rising & fires[2], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
-        next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, RESTING * reach)
-        return Advance(y_next, next_contact, h_used, jnp.abs(y_next[n + mechanics.tangential]))
+        resting = RESTING[y.dtype.name] * reach * unit
+        next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
+        return Advance(y_next, next_contact, x * reach * unit, jnp.abs(y_next[n + mechanics.tangential]))
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Within:
         # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
         # product of two series is integrated with an error far below that of the series itself.
-        states, _ = _series(mechanics, contact, load, y, self.order_)
+        unit = _time_unit(mechanics)
+        states, _ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
-        inside, _ = _value_and_slope([state[None] for state in states], (0.5 * (points[:, None] + 1.0)) * h)
-        end, _ = _value_and_slope(states, h)
+        inside, _ = _value_and_slope([state[None] for state in states], (0.5 * (points[:, None] + 1.0)) * (h / unit))
+        end, _ = _value_and_slope(states, h / unit)
         return Within(inside, 0.5 * h * weights, end)
 
 
+def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
+    """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
+
+    In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
+    """
+    positions, velocities = jax.lax.stop_gradient((mechanics.free_position, mechanics.free_velocity))
+    rate = jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(positions))), jnp.max(jnp.abs(velocities)))
+    _, exponent = jnp.frexp(rate)
+    return jnp.ldexp(jnp.ones_like(rate), -exponent)
+
+
 def _series(
-    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
 ) -> tuple[list[State], list[Float[Array, "3"]]]:
-    """Taylor coefficients in time of the state, and of the guards with the (negative) tangential velocity.
+    """Taylor coefficients in time of the state, and of the guards with the (negative) tangential velocity; time in units.
 
     The physics is linear in the state but for friction, so it maps coefficients to coefficients, the constant parts
     (load, belt) entering with the first. Only T = σμN and N (G_nn + σμ G_nt) = -a_n multiply two series.
@@ -165,11 +181,13 @@ def _series(
         own_guards = physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k]))
         guards.append(jnp.concatenate([own_guards, -states[k][n + mechanics.tangential, None]]))
         rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
-        states.append(rate * (1.0 / (k + 1)))
+        states.append(rate * (unit / (k + 1)))
     return states[: order + 1], guards
 
 
-def _rounding(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> list[Float[Array, "3"]]:
+def _rounding(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, unit: Float[Array, ""]
+) -> list[Float[Array, "3"]]:
     """What rounding leaves of the first three coefficients of the guards where they are zero."""
     eps = jnp.finfo(y.dtype).eps
     mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
@@ -179,28 +197,36 @@ def _rounding(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y:
         own, force = (mechanics, load) if k == 0 else (at_rest, jnp.zeros_like(load))
         guards, rates = physics.magnitudes(own, contact, force, sizes)
         found.append(ROUNDINGS * eps * jnp.concatenate([guards, jnp.zeros_like(guards[:1])]))
-        sizes = rates / (k + 1)
+        sizes = rates * (unit / (k + 1))
     return found
 
 
 def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
-    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in s."""
+    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in its units of time."""
     order, n = len(states) - 1, states[0].shape[0] // 2
+    # A term that is lost in the rounding of the first ones cannot be asked to be smaller still.
+    tolerance = max(tolerance, 0.25 * float(jnp.finfo(states[0].dtype).eps))
 
     def size(k):
         return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
 
+    tiny = float(jnp.finfo(states[0].dtype).tiny)
+    moves = (size(0) > 0) | (size(1) > 0)
+
     def reach(last):
-        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish.
-        end = size(last)
-        steps = [(tolerance * size(j) / jnp.where(end > 0, end, 1.0)) ** (1.0 / (last - j)) for j in (0, 1)]
-        return jnp.where(end > 0, jnp.maximum(*steps), jnp.inf)
+        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
+        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
+        end = jnp.maximum(size(last), tiny)
+        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1)]
+        return jnp.where(moves, jnp.maximum(*steps), jnp.inf)
 
     return jnp.minimum(reach(order), reach(order - 1))
 
 
 def _march_to_roots(
-    c: list[Float[Array, " g"]], rounding: list[Float[Array, " g"]] | None = None
+    c: list[Float[Array, " g"]],
+    rounding: list[Float[Array, " g"]] | None = None,
+    exact: Bool[Array, " g"] | None = None,
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
@@ -209,11 +235,13 @@ def _march_to_roots(
     $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is what gets away from the flat start after a lift-off. On [0, 1] negative
     coefficients alone make the bounds. So no root is skipped, a dip below zero inside the interval is found at its first
     crossing, and near a simple root the march converges quadratically. Zeros at the very start are divided out: the
-    root at which the status began. A march that runs out of steps has still shown how far the way is clear.
+    root at which the status began; with an `exact` start, little is not nothing. A march that runs out of steps has still
+    shown how far the way is clear.
     """
     eps = jnp.finfo(c[0].dtype).eps
     size = sum(jnp.abs(ck) for ck in c)
-    shares = (ROUNDING, ROUNDING_OF_SLOPES, ROUNDING_OF_SLOPES)
+    shares = ROUNDING[c[0].dtype.name]
+    shares = shares if exact is None else (jnp.where(exact, 0.0, shares[0]), *shares[1:])
     rounding = [jnp.zeros_like(size)] * 3 if rounding is None else rounding
     zero = [jnp.abs(ck) <= jnp.maximum(size * share, r) for ck, share, r in zip(c, shares, rounding, strict=False)]
     none = jnp.zeros_like(size)

@@ -23,7 +23,7 @@ from . import contact as physics
 from .contact import Contact, Mechanics, Status
 from .event_exact import EventExact
 from .precision import in_double_precision, known_to_numpy
-from .scene import Scene
+from .scene import Scene, refuse_painleve
 from .simulate import Trajectory, simulate, start_state
 from .steppers import AbstractStepper, rates
 
@@ -117,6 +117,7 @@ def derivatives(
     arguments.real_number("dt_save", dt_save, above=0)
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    refuse_painleve(scene)
     begin = start_state(scene, y0)
     value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), y0, mode, method)
     calls = _closest_call(scene, method, begin, float(t1))

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import json
+import math
 from importlib import metadata
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from .scene import Scene
 from .steppers import AbstractStepper
 from .verdict import MEANING, Verdict
 from .where_switched import WhereSwitched
+
+# Lanes that a map may have: some 10 GB of results, and days of work.
+MOST_LANES = 10**8
 
 
 @in_double_precision
@@ -78,6 +82,11 @@ def bistability_map(
         )
     axes = _checked_axes(scene, axes)
     shape = tuple(len(values) for values in axes.values())
+    if math.prod(shape) > MOST_LANES:
+        raise ValueError(
+            f"The axes ask for {math.prod(shape):.3g} lanes, whose results no memory holds; the most is {MOST_LANES:.0e}. Give "
+            f"fewer values, or make several maps."
+        )
     grid = np.meshgrid(*axes.values(), indexing="ij")
     known, keep = _kept(
         resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}, axes

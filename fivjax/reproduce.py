@@ -102,7 +102,7 @@ def _names(figure) -> list[str]:
     if unknown or not names:
         raise ValueError(
             f"Argument `figure` must be a figure from 2 to 18, or table1 or table2, but is "
-            f"{repr(unknown[0]) if unknown else 'empty'}. (Fig. 1 is a drawing of the model.)"
+            f"{repr(unknown[0]) if unknown else 'empty'}. Figure 1 is a drawing of the model."
         )
     return names
 

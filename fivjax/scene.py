@@ -160,3 +160,15 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
     compliance = columns.T @ jnp.linalg.solve(structure.mass, columns)
     coupling = jnp.abs(compliance[0, 1])
     return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
+
+
+def refuse_painleve(scene: Scene) -> None:
+    """Refuse friction at which the contact problem has no unique solution, where its value is known."""
+    largest = scene.friction.static
+    if is_known(largest) and is_known(scene.structure.mass):
+        limit = painleve_friction(scene.structure)
+        if is_known(limit) and float(largest) >= limit:
+            raise ValueError(
+                f"The contact problem has no unique solution at friction {float(largest):g}: Painlevé's limit of this "
+                f"structure is {float(limit):.4g}. Lower the friction or the coupling in the mass matrix."
+            )

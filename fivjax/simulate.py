@@ -17,9 +17,12 @@ from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
-from .scene import Scene, painleve_friction, sliding_equilibrium, steady_sliding
+from .scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
 from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding, rates
 from .verdict import ENDING, Ending
+
+# Rows that a trajectory may have: some 20 GB of them.
+MOST_ROWS = 10**8
 
 
 class Trajectory(eqx.Module):
@@ -109,9 +112,14 @@ def simulate(
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)
-    _refuse_painleve(scene)
-    y0 = start_state(scene, y0)
+    refuse_painleve(scene)
     rows = math.ceil(t1 / dt_save - 1e-9)
+    if rows > MOST_ROWS:
+        raise ValueError(
+            f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
+            f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
+        )
+    y0 = start_state(scene, y0)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
@@ -281,14 +289,3 @@ def start_state(scene: Scene, y0) -> State:
                 f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
             )
     return y
-
-
-def _refuse_painleve(scene: Scene) -> None:
-    largest = scene.friction.static
-    if is_known(largest) and is_known(scene.structure.mass):
-        limit = painleve_friction(scene.structure)
-        if is_known(limit) and float(largest) >= limit:
-            raise ValueError(
-                f"The contact problem has no unique solution at friction {float(largest):g}: Painlevé's limit of this "
-                f"structure is {float(limit):.4g}. Lower the friction or the coupling in the mass matrix."
-            )

@@ -21,7 +21,7 @@ from .load import Pulse
 from .maps import bistability_map, critical_perturbation
 from .precision import in_double_precision
 from .results import labelled
-from .scene import Scene
+from .scene import Scene, refuse_painleve
 from .simulate import start_state, states_at
 from .steppers import MOST_ADVANCES, AbstractStepper
 from .verdict import Verdict
@@ -150,6 +150,7 @@ def _check(scene, methods, t1, lanes, precisions, boundary) -> None:
     arguments.real_number("t1", t1, above=0)
     if isinstance(lanes, bool) or not isinstance(lanes, int | np.integer) or lanes < 1:
         raise ValueError(f"Argument `lanes` must be a whole number of at least 1, but is {lanes!r}.")
+    refuse_painleve(scene)
     for kind in precisions:
         arguments.one_of("precisions", kind, ("float64", "float32"))
     arguments.truth("boundary", boundary)

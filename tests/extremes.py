@@ -12,6 +12,7 @@ RANGES = {
     "belt_speed": (1e-6, 1e4, "decades"),
     "theta": (-1.2, 1.2, "even"),
     "mu": (0.0, 3.0, "even"),
+    "mu_static": (1.0, 5.0, "even"),  # relative to mu; half of all lanes have one coefficient only
     "p": (0.0, 1000.0, "kick"),
     "damping": (0.0, 1e2, "damping"),  # of each spring with its mass, relative to critical
     "mass_ratio": (1e-6, 1e6, "decades"),
@@ -36,7 +37,7 @@ M1, K1 = 0.53, 1e5
 
 
 def draw(count: int, seed: int, corners: float = 0.2) -> dict[str, np.ndarray]:
-    """Parameters of a belt oscillator with constant friction, by the names of a scene; one lane per element."""
+    """Parameters of a belt oscillator with friction that does not fall, by the names of a scene; one lane per element."""
     rng = np.random.default_rng(seed)
     found = {}
     for name, (low, high, kind) in RANGES.items():
@@ -53,6 +54,9 @@ def draw(count: int, seed: int, corners: float = 0.2) -> dict[str, np.ndarray]:
         if name in CORNERS:
             values = np.where(at_corner, rng.choice(CORNERS[name], count), values)
         found[name] = values
+    found["mu_static"] = np.where(
+        rng.random(count) < 0.5, found["mu"], np.minimum(found["mu"] * found["mu_static"], RANGES["mu"][1])
+    )
     m2, k2 = M1 * found.pop("mass_ratio"), K1 * found.pop("stiffness_ratio")
     damping = found.pop("damping")
     found |= {"m1": np.full(count, M1), "m2": m2, "k1": np.full(count, K1), "k2": k2}
@@ -60,18 +64,44 @@ def draw(count: int, seed: int, corners: float = 0.2) -> dict[str, np.ndarray]:
     return found
 
 
+def draw_falling(count: int, seed: int) -> dict[str, np.ndarray]:
+    """The same with friction that falls with slip speed: not at all, at once, and in between."""
+    found = draw(count, seed)
+    rng = np.random.default_rng(seed + 1)
+    decay = 10.0 ** rng.uniform(-6.0, 6.0, count)
+    corner = rng.random(count) < 0.2
+    return {
+        **{name: values for name, values in found.items() if name != "mu"},
+        "mu_dynamic": found["mu"],
+        "decay": np.where(corner, rng.choice([0.0, 1e6], count), decay),
+    }
+
+
 def row(lanes: dict[str, np.ndarray], index: int) -> dict[str, float]:
     return {name: float(values[index]) for name, values in lanes.items()}
 
 
 def scene(lane: dict[str, float]) -> fj.Scene:
-    start = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
-    return start.replace(**lane)
+    if "decay" in lane:
+        return FALLING.replace(**lane)
+    return CONSTANT.replace(**{"mu_static": lane["mu"], **lane})
+
+
+CONSTANT = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.2), 3.0, fj.Pulse(100.0, 1.2))
+FALLING = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.2, 0.5), 3.0, fj.Pulse(100.0, 1.2))
 
 
 def slow_period(lane: dict[str, float]) -> float:
     """The longest of the periods that its masses and springs could make, s."""
     return 2 * math.pi * math.sqrt((lane["m1"] + lane["m2"]) / min(lane["k1"], lane["k2"]))
+
+
+def fastest_rate(lane: dict[str, float]) -> float:
+    """Of the free structure, overdamped motion included, rad/s."""
+    matrices = model(lane)
+    inverse, n = np.linalg.inv(matrices.mass), len(matrices.mass)
+    generator = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ matrices.stiffness, -inverse @ matrices.damping]])
+    return float(np.max(np.abs(np.linalg.eigvals(generator))))
 
 
 def model(lane: dict[str, float]) -> oracle.Model:

@@ -3,7 +3,6 @@
 No test here may reach an engine: the fixture below makes that an error of its own kind.
 """
 
-import contextlib
 import math
 import re
 import sys
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
+from refusing import refused, refused_on_the_command_line, untouched
 
 import fivjax as fj
 from fivjax import cli, results
@@ -38,33 +38,6 @@ def no_engine(monkeypatch):
 @pytest.fixture
 def constant_scene():
     return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad())
-
-
-def sentence(message):
-    return message[0].isupper() and message[-1] in ".?" and "\n" not in message
-
-
-@contextlib.contextmanager
-def refused(error, *fragments):
-    """A refusal in whole sentences that hold all of these fragments: the argument's name and the value among them."""
-    with pytest.raises(error) as refusal:
-        yield
-    message = str(refusal.value)
-    assert sentence(message), message
-    for fragment in fragments:
-        assert fragment in message, message
-
-
-@contextlib.contextmanager
-def untouched(folder):
-    """The folder holds the same files with the same contents afterwards: no result, no temporary."""
-
-    def contents():
-        return {path.name: path.is_file() and path.read_bytes() for path in folder.iterdir()}
-
-    before = contents()
-    yield
-    assert contents() == before
 
 
 def test_the_engine_is_reached_by_good_input(paper_scene):
@@ -487,20 +460,6 @@ def test_what_is_no_dataset(tmp_path, thing):
 
 
 # -------------------------------------------------------------------------------------- command line
-
-
-def refused_on_the_command_line(capsys, arguments):
-    """The sentence that a command answers with; it must come on standard error, with exit code 2 and nothing else."""
-    code = cli.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    assert code == 2
-    assert captured.out == ""
-    lines = captured.err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("fivjax: ")
-    message = lines[0].removeprefix("fivjax: ")
-    assert sentence(message), message
-    return message
 
 
 @pytest.mark.parametrize(

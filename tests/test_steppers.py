@@ -247,3 +247,27 @@ def test_a_guard_about_to_run_out_is_not_taken_for_one_that_has_just_begun():
         assert march(0.0, 0.0, 1e-14, 1.0, -1.1)[0] == pytest.approx(1 / 1.1)  # just lifted off; comes down later
         assert march(1e-15, 1.0, -2.0)[0] == pytest.approx(0.5)  # just begun to slip; stops later
         assert march(0.0, 1.0, 1.0) == (1.0, False)
+
+
+def test_a_slip_that_is_small_beside_what_follows_is_no_zero():
+    """A belt of 1 µm/s under 10⁹ N and a thousandfold kick: taken for used up at its start, slip ended without end."""
+    parameters = dict(
+        theta=-0.368,
+        mu=0.352,
+        belt_speed=1e-6,
+        force=1e9,
+        p=1000.0,
+        duration=174.0,
+        m2=34.7,
+        k2=0.286,
+        c1=3496.0,
+        c2=47.9,
+    )
+    own = {name: parameters[name] for name in ("theta", "m2", "k2", "c1", "c2")}
+    load = fj.Pulse(parameters["force"], parameters["p"], parameters["duration"])
+    scene = fj.Scene(fj.belt_oscillator(**own), fj.Coulomb(parameters["mu"]), parameters["belt_speed"], load)
+    run = fj.simulate(scene, 0.5, 0.5)
+    right = oracle.propagate(oracle.paper_model(**parameters), 0.5, np.array([0.0, 0.5]))
+    assert run.outcome == fj.Ending.FINISHED
+    np.testing.assert_allclose(run.displacement[-1], right.q[-1], rtol=0, atol=1e-9 * np.abs(right.q[-1]).max())
+    np.testing.assert_allclose(run.velocity[-1], right.v[-1], rtol=0, atol=1e-9 * np.abs(right.v[-1]).max())

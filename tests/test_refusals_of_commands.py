@@ -1,0 +1,256 @@
+"""Bad input at every other command, and at the functions behind them: a sentence, exit code 2, and nothing written."""
+
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+from refusing import refused, refused_on_the_command_line, untouched
+
+import fivjax as fj
+from fivjax import checkpoint, cli
+
+T = np.arange(64) * 1e-3
+A = np.sin(400.0 * T)
+
+
+class EngineReached(BaseException):
+    """Bad input got as far as compiled code."""
+
+
+@pytest.fixture(autouse=True)
+def no_engine(monkeypatch):
+    """Were a check made after compiling, a typing error would cost a minute."""
+
+    def reached(*_, **__):
+        raise EngineReached
+
+    for module, name in (
+        ("maps", "run_to_verdict"),
+        ("simulate", "_simulate"),
+        ("calibrate", "misfit"),
+        ("tradeoff", "_end_state"),
+        ("gradients", "_differentiated"),
+    ):
+        monkeypatch.setattr(sys.modules[f"fivjax.{module}"], name, reached)
+    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)  # it configures JAX for the whole process
+
+
+def text(rows=64, header="t,acceleration 0", change=lambda rows: rows) -> str:
+    lines = [f"{t:.6f},{a:.6f}" for t, a in zip(T[:rows], A[:rows], strict=True)]
+    return "\n".join([header, *change(lines)]) + "\n"
+
+
+FILES = {
+    "good.csv": text(),
+    "short.csv": text(8),
+    "empty.csv": "",
+    "names.csv": text(header="t,x"),
+    "timeless.csv": text(header="x,acceleration 0"),
+    "twice.csv": text(header="acceleration 0,acceleration 0"),
+    "nan.csv": text(change=lambda rows: [*rows[:9], "0.009,nan", *rows[10:]]),
+    "word.csv": text(change=lambda rows: [*rows[:9], "0.009,loud", *rows[10:]]),
+    "ragged.csv": text(change=lambda rows: [*rows[:9], "0.009,1,2", *rows[10:]]),
+    "gap.csv": text(change=lambda rows: [*rows[:9], *rows[20:]]),
+    "back.csv": text(change=lambda rows: rows[::-1]),
+    "unit.csv": text(header="t,acceleration 0 (furlong)"),
+    "far.csv": text(header="t,acceleration 7"),
+    "normal.csv": text(header="t,acceleration 2"),
+    "broken.npy": "not an array",
+    "broken.wav": "not a sound",
+    "broken.mat": "not a matrix",
+    "sheet.xlsx": "anything",
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    for name, content in FILES.items():
+        (tmp_path / name).write_text(content)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_commands_here_reach_the_engine_with_good_input(folder):
+    """Were the stand-ins in the wrong place, every other test here would pass whatever is checked and when."""
+    for command in (["calibrate", "good.csv", "--free", "mu", "--rate", "1000"], ["tradeoff", "--t1", "0.1"]):
+        with pytest.raises(EngineReached):
+            cli.main([*command, "--out", "out"])
+
+
+MU = ["--free", "mu"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["missing.csv", *MU], ["missing.csv", "does not exist"]),
+        (["sheet.xlsx", *MU], [".csv", ".xlsx"]),
+        (["empty.csv", *MU], ["line of names"]),
+        (["short.csv", *MU], ["at least 16", "8"]),
+        (["names.csv", *MU], ["no channel", "x"]),
+        (["timeless.csv", *MU], ["`t`", "`rate`"]),
+        (["twice.csv", *MU], ["twice"]),
+        (["nan.csv", *MU], ["line 11", "nan"]),
+        (["word.csv", *MU], ["line 11", "'loud'"]),
+        (["ragged.csv", *MU], ["line 11", "2 numbers expected, 3 found"]),
+        (["gap.csv", *MU], ["evenly spaced"]),
+        (["back.csv", *MU], ["strictly increasing"]),
+        (["unit.csv", *MU], ["furlong"]),
+        (["far.csv", *MU], ["coordinates are 0 to 2"]),
+        (["normal.csv", *MU, "--regime", "sliding"], ["normal coordinate"]),
+        (["broken.npy", *MU], ["cannot be read as NumPy"]),
+        (["broken.wav", *MU], ["cannot be read as WAV"]),
+        (["broken.mat", *MU], ["cannot be read as MATLAB"]),
+        (["good.csv", "--free", "nu"], ["`nu`", "belt_speed"]),
+        (["good.csv", "--free", ","], ["`free`", "empty"]),
+        (["good.csv", "--free", "mu,mu"], ["twice"]),
+        (["good.csv", *MU, "--bound", "mu"], ["NAME=LOW:HIGH", "'mu'"]),
+        (["good.csv", *MU, "--bound", "k1=1:2"], ["`k1`", "not among the free"]),
+        (["good.csv", *MU, "--bound", "mu=0.5:0.1"], ["goes up"]),
+        (["good.csv", *MU, "--bound", "mu=0.3:0.5"], ["inside its bounds", "0.227"]),
+        (["good.csv", *MU, "--column", "x"], ["--column", "'x'"]),
+        (["good.csv", *MU, "--column", "x=acceleration0"], ["no variable `x`"]),
+        (["good.csv", *MU, "--column", "t=loudness"], ["acceleration i", "'loudness'"]),
+        (["good.csv", *MU, "--unit", "t"], ["--unit", "'t'"]),
+        (["good.csv", *MU, "--unit", "t=fortnight"], ["fortnight"]),
+        (["good.csv", *MU, "--rate", "0"], ["`rate`", "positive"]),
+        (["good.csv", *MU, "--full-scale", "-1"], ["`full_scale`", "positive"]),
+        (["good.csv", *MU, "--offset", "0.5", "0.1"], ["`offset`", "go up"]),
+        (["good.csv", *MU, "--offset", "0", "0.1", "--regime", "limit cycle"], ["`offset`", '"kick"']),
+        (["good.csv", *MU, "--starts", "0"], ["`starts`", "at least 1"]),
+        (["good.csv", *MU, "--belt-speed", "0"], ["`belt_speed`", "zero"]),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else None,
+)  # fmt: skip
+def test_calibrate(folder, capsys, arguments, fragments):
+    """Were one accepted, the fit would be of something that was not measured."""
+    with untouched(folder):
+        message = refused_on_the_command_line(capsys, ["calibrate", *arguments, "--out", "out"])
+    for fragment in fragments:
+        assert fragment in message, message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["tradeoff", "--t1", "0"], ["`t1`", "positive"]),
+        (["tradeoff", "--lanes", "0"], ["`lanes`", "at least 1"]),
+        (["tradeoff", "--mu", "-1"], ["`mu`", "non-negative"]),
+        (["tradeoff", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
+        (["tradeoff", "--mu", "200"], ["Painlevé", "200"]),
+        (["reproduce", "--figure", "19"], ["`figure`", "'19'"]),
+        (["reproduce", "--figure", "1"], ["drawing"]),
+        (["cea", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
+        (["cea", "--x", "speed=1:2:3"], ["`speed`"]),
+        (["cea", "--x", "mu=-1:2:3"], ["`mu`", "-1"]),
+        (["cea", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
+        (["cea", "--k1", "-1"], ["`k1`", "non-negative"]),
+        (["cea", "--theta", "nan"], ["`theta`", "finite"]),
+        (["simulate", "--force", "-1"], ["`force`", "non-negative"]),
+        (["simulate", "--duration", "-1"], ["`duration`", "non-negative"]),
+        (["simulate", "--start", "inf"], ["`start`", "finite"]),
+        (["simulate", "--m2", "0"], ["`m2`", "positive"]),
+        (["simulate", "--c1", "-1"], ["`c1`", "non-negative"]),
+        (["simulate", "--k1", "0", "--k2", "0"], ["singular"]),
+        (["simulate", "--t1", "1e9", "--dt-save", "1e-9"], ["`dt_save`", "rows"]),
+        (["map", "--force", "nan"], ["`force`", "finite"]),
+        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["lanes", "memory"]),
+    ],
+    ids=lambda x: " ".join(x) if isinstance(x, list) else None,
+)  # fmt: skip
+def test_other_commands(folder, capsys, arguments, fragments):
+    """Were one accepted, the command would compute for an hour, or write what means nothing."""
+    with untouched(folder):
+        message = refused_on_the_command_line(capsys, [*arguments, "--out", "out"])
+    for fragment in fragments:
+        assert fragment in message, message
+
+
+@pytest.mark.parametrize("command", [["cea"], ["tradeoff"], ["calibrate", "good.csv", *MU]], ids=lambda c: c[0])
+def test_where_to_write_is_asked_first(folder, capsys, command):
+    """Were a path checked at the end, the work would have nowhere to go."""
+    (folder / "taken.nc").mkdir()
+    for out, fragment in (
+        ("missing/out", "does not exist"),
+        ("taken", "is a folder"),
+        ("good.csv/out", "not a folder"),
+    ):
+        with untouched(folder):
+            assert fragment in refused_on_the_command_line(capsys, [*command, "--out", out])
+
+
+def test_reproducing_into_a_file(folder, capsys):
+    """Were it found out after the first figure, minutes would be lost."""
+    with untouched(folder):
+        refused_on_the_command_line(capsys, ["reproduce", "--figure", "3", "--out", "good.csv"])
+
+
+def test_resuming_what_is_another_map(folder, capsys):
+    """Were it taken, lanes of two scenes would stand in one picture; were it overwritten, a night's work would be gone."""
+    (folder / "text.unfinished").write_text("notes")
+    message = refused_on_the_command_line(capsys, ["map", "--out", "text", "--resume"])
+    assert "is not a checkpoint" in message
+    checkpoint.keep(folder / "other.unfinished", {"fivjax": "0.0"}, {"verdict": np.zeros(4, np.int8)})
+    with untouched(folder):
+        assert "of another run" in refused_on_the_command_line(capsys, ["map", "--out", "other", "--resume"])
+        assert "--resume" in refused_on_the_command_line(capsys, ["map", "--out", "other"])
+
+
+def paper(**changes) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2)).replace(**changes)
+
+
+def good() -> fj.Recording:
+    return fj.Recording(T, {"acceleration 0": A}, "sliding")
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "fragments"),
+    [
+        (lambda: fj.calibrate(None, good(), ["mu"]), TypeError, ["`scene`"]),
+        (lambda: fj.calibrate(paper(), A, ["mu"]), TypeError, ["`data`"]),
+        (lambda: fj.calibrate(paper(), [], ["mu"]), TypeError, ["`data`"]),
+        (lambda: fj.calibrate(paper(), [good(), A], ["mu"]), TypeError, ["`data[1]`"]),
+        (lambda: fj.calibrate(paper(), good(), "mu"), TypeError, ["`free`", "list of names"]),
+        (lambda: fj.calibrate(paper(), good(), ["mu"], spread=2.0), ValueError, ["`spread`", "at most 0.9"]),
+        (lambda: fj.calibrate(paper(), good(), ["mu"], rate=1.0), ValueError, ["too short"]),
+        (lambda: fj.calibrate(paper(), good(), ["mu"], method="fast"), TypeError, ["`method`"]),
+        (lambda: fj.calibrate(paper(), fj.Recording(T, {"a0": A}, mu=0.3), ["mu"]), ValueError, ["states it as known"]),
+        (lambda: fj.calibrate(paper(), fj.Recording(T, {"a0": A}, heat=1.0), ["mu"]), ValueError, ["`heat`"]),
+        (lambda: fj.derivatives(None, paper(), ["mu"]), TypeError, ["`functional`"]),
+        (lambda: fj.derivatives(len, paper(), "mu"), TypeError, ["`wrt`"]),
+        (lambda: fj.derivatives(len, paper(), []), ValueError, ["`wrt`"]),
+        (lambda: fj.derivatives(len, paper(), ["mu"], mode="sideways"), ValueError, ["`mode`"]),
+        (lambda: fj.tradeoff(paper(), precisions=("float16",)), ValueError, ["`precisions`", "'float16'"]),
+        (lambda: fj.tradeoff(paper(), methods=[]), TypeError, ["`methods`"]),
+        (lambda: fj.tradeoff(paper(), boundary="yes"), TypeError, ["`boundary`"]),
+        (lambda: fj.belt_oscillator(m1=-1.0), ValueError, ["`m1`"]),
+        (lambda: fj.belt_oscillator(theta="steep"), TypeError, ["`theta`"]),
+        (lambda: fj.Structure(np.eye(3), np.eye(3), np.eye(2), [0, 0, -1]), ValueError, ["(2, 2)"]),
+        (lambda: fj.Structure(-np.eye(3), np.eye(3), np.eye(3), [0, 0, -1]), ValueError, ["`mass`"]),
+        (lambda: fj.Structure(np.eye(3), np.eye(3), np.triu(np.ones((3, 3))), [0, 0, -1]), ValueError, ["symmetric"]),
+        (lambda: fj.Structure(np.eye(3), np.eye(3), np.eye(3), [0, -1]), ValueError, ["`load_direction`"]),
+        (lambda: fj.Structure(np.eye(3), np.eye(3), np.eye(3), [0, 0, -1], normal=3), ValueError, ["`normal`"]),
+        (lambda: fj.Structure(np.eye(3), np.eye(3), np.eye(3), [0, 0, -1], tangential=2, normal=2), ValueError, ["`tangential`"]),
+        (lambda: fj.Coulomb(-0.1), ValueError, ["`mu`"]),
+        (lambda: fj.Coulomb(0.3, 0.2), ValueError, ["`mu_static`", "0.2"]),
+        (lambda: fj.ExponentialDecay(0.2, 0.1, -1.0), ValueError, ["`decay`"]),
+        (lambda: fj.Pulse(duration=-1.0), ValueError, ["`duration`"]),
+        (lambda: fj.ConstantLoad(np.nan), ValueError, ["`force`", "finite"]),
+        (lambda: paper(impact_law="bouncy"), ValueError, ["`impact_law`"]),
+        (lambda: fj.Scene(None, fj.Coulomb(0.2), 3.0, fj.Pulse()), TypeError, ["`structure`"]),
+        (lambda: fj.Scene(fj.belt_oscillator(), 0.2, 3.0, fj.Pulse()), TypeError, ["`friction`"]),
+        (lambda: fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, 100.0), TypeError, ["`load`"]),
+        (lambda: paper().replace(weight=1.0), ValueError, ["`weight`"]),
+        (lambda: fj.cea.eigenvalues(fj.belt_oscillator()), ValueError, ["`mu`"]),
+        (lambda: fj.cea.critical_friction(paper()), TypeError, ["`structure`"]),
+        (lambda: fj.cea.sensitivity(None), TypeError, ["`structure`"]),
+        (lambda: fj.energy_per_cycle(None), TypeError, ["`run`"]),
+        (lambda: fj.plot.bistability(xr.Dataset({"verdict": ("p", [0, 1])})), ValueError, ["two axes"]),
+    ],
+)  # fmt: skip
+def test_functions(call, error, fragments):
+    """Were one accepted, the answer would come from somewhere deep inside, or be wrong."""
+    with refused(error, *fragments):
+        call()
