@@ -28,7 +28,7 @@ def show(result) -> Figure:
     """The picture of a result: what a notebook shows for it.
 
     **Arguments:** `result`, a `Trajectory`, a map, a critical perturbation, modes, a stability chart, energies per cycle,
-    sensitivities or a `Calibration`.
+    sensitivities, a `tradeoff` or a `Calibration`.
 
     **Returns:** a matplotlib figure.
 
@@ -58,6 +58,7 @@ def _picture(result) -> Figure | None:
         (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),
         (lambda d: "damping_ratio" in d and d["frequency"].shape[0] > 1, plot_linear.eigenvalues),
         (lambda d: "growth_rate" in d and "mode" not in d.dims and d["growth_rate"].ndim == 2, plot_linear.chart),
+        (lambda d: "state_error" in d and "stepper" in d.dims, plot.tradeoff),
         (lambda d: "energy_gain" in d and "cycle" in d.dims and d.sizes["cycle"] > 0, plot_energy.per_cycle),
     ):
         if has(result):
