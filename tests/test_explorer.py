@@ -70,8 +70,11 @@ def test_a_click_opens_the_nearest_lane_exactly(explorer):
     width, height = axes.figure.canvas.get_width_height()
     x, y = axes.transData.transform((0.155, 1.65))
     unmarked = pixels(explorer.map)
+    # The map is of the scene it was made for, so a lane of it has that scene's springs.
+    explorer.sliders["k1"].value = 97e3
     explorer.map.clicked = [x / width, 1 - y / height]
     assert (explorer.sliders["mu"].value, explorer.sliders["p"].value) == (0.1511, 1.7)
+    assert explorer.sliders["k1"].value == 100e3
     assert np.any(pixels(explorer.map) != unmarked)
     # What a browser makes of it; then a step of the user's own.
     explorer.sliders["mu"].value = 0.151
