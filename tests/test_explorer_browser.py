@@ -130,7 +130,7 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
         page.wait_for_timeout(500)
         opened = [page.locator(".widget-readout").nth(k).inner_text() for k in range(2)]
         if screenshot is not None:
-            page.locator(".jp-Notebook").first.screenshot(path=screenshot)
+            page.locator(".jp-OutputArea-output").first.screenshot(path=screenshot)
         browser.close()
     return {"took": took, "before": before, "moved": moved, "opened": opened}
 
