@@ -20,6 +20,7 @@ from .cea import Sensitivity
 from .results import QUANTITIES, describe
 from .scene import Scene
 from .simulate import Trajectory
+from .verdict import Ending
 
 DPI = 100
 
@@ -68,7 +69,7 @@ def _picture(result) -> Figure | None:
 
 def _of_trajectory(run: Trajectory) -> Figure:
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(5, 3)))
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A part of a figure has all that a picture function asks of a figure.
     plot.response(run, figure=left)  # pyright: ignore[reportArgumentType]
     plot.phase_plane(run, last=0.25 * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
@@ -109,6 +110,8 @@ def trajectory_summary(run: Trajectory) -> str:
         said += (
             f"; {int(run.energy.ledger.events[-1])} contact events, energy residual {run.energy.ledger.worst[-1]:.1e} J"
         )
+    if int(run.outcome) != Ending.FINISHED:
+        said += f"; {run.meaning}"
     return f"{_image(_of_trajectory(run))}<div><b>Trajectory</b>: {html.escape(said)}</div>"
 
 
