@@ -89,7 +89,7 @@ class Explorer:
             self.map = picture(name="map", clickable=True)
             self.map.observe(lambda change: self.open_lane(*change["new"]), "clicked")
         self._quiet = False
-        self._lane: dict[str, float] = {}
+        self._lane = {name: float(scene.parameters[name]) for name in self.sliders}
         self._axes = axes
         for slider in self.sliders.values():
             slider.observe(lambda change: self.update(), "value")
@@ -169,6 +169,8 @@ def _slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     finest = (high - low) / 500
     power = 10.0 ** np.floor(np.log10(finest))
     step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
+    # A browser rounds to steps from the lower end; the scene's own value has to be one of them.
+    low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
     unit = QUANTITIES[name][1] if name in QUANTITIES else "1"
     return widgets.FloatSlider(
         value,

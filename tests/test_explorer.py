@@ -55,6 +55,13 @@ def test_a_moved_slider_changes_the_picture_and_compiles_nothing(explorer):
     assert compiled == []
 
 
+def test_the_scene_itself_lies_on_the_steps_of_its_sliders(explorer, scene):
+    """A browser rounds a value to the nearest step from the lower end: at the scene's own it must have nothing to round."""
+    for name, slider in explorer.sliders.items():
+        steps = (float(scene.parameters[name]) - slider.min) / slider.step
+        assert steps == pytest.approx(round(steps), abs=1e-6), name
+
+
 def test_what_is_said_is_of_the_scene_shown(explorer, scene):
     """The critical friction beside the sliders is that of the structure they describe."""
     explorer.sliders["k1"].value = 97e3
