@@ -20,6 +20,7 @@ from .cea import Sensitivity
 from .results import QUANTITIES, describe
 from .scene import Scene
 from .simulate import Trajectory
+from .verdict import Ending
 
 DPI = 100
 
@@ -28,7 +29,7 @@ def show(result) -> Figure:
     """The picture of a result: what a notebook shows for it.
 
     **Arguments:** `result`, a `Trajectory`, a map, a critical perturbation, modes, a stability chart, energies per cycle,
-    sensitivities or a `Calibration`.
+    sensitivities, a `tradeoff` or a `Calibration`.
 
     **Returns:** a matplotlib figure.
 
@@ -58,6 +59,7 @@ def _picture(result) -> Figure | None:
         (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),
         (lambda d: "damping_ratio" in d and d["frequency"].shape[0] > 1, plot_linear.eigenvalues),
         (lambda d: "growth_rate" in d and "mode" not in d.dims and d["growth_rate"].ndim == 2, plot_linear.chart),
+        (lambda d: "state_error" in d and "stepper" in d.dims, plot.tradeoff),
         (lambda d: "energy_gain" in d and "cycle" in d.dims and d.sizes["cycle"] > 0, plot_energy.per_cycle),
     ):
         if has(result):
@@ -67,7 +69,7 @@ def _picture(result) -> Figure | None:
 
 def _of_trajectory(run: Trajectory) -> Figure:
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(5, 3)))  # pyright: ignore[reportCallIssue]
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A part of a figure has all that a picture function asks of a figure.
     plot.response(run, figure=left)  # pyright: ignore[reportArgumentType]
     plot.phase_plane(run, last=0.25 * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
@@ -108,6 +110,8 @@ def trajectory_summary(run: Trajectory) -> str:
         said += (
             f"; {int(run.energy.ledger.events[-1])} contact events, energy residual {run.energy.ledger.worst[-1]:.1e} J"
         )
+    if int(run.outcome) != Ending.FINISHED:
+        said += f"; {run.meaning}"
     return f"{_image(_of_trajectory(run))}<div><b>Trajectory</b>: {html.escape(said)}</div>"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from . import arguments, plot
@@ -16,6 +17,7 @@ from .contact import Status
 from .critical import critical_friction
 from .plot import BLACK, BLUE, GREEN, STATUS_NAMES, VERMILION
 from .precision import in_double_precision
+from .results import QUANTITIES
 from .scene import Scene
 from .simulate import Trajectory, simulate
 
@@ -87,7 +89,7 @@ class Explorer:
             self.map = picture(name="map", clickable=True)
             self.map.observe(lambda change: self.open_lane(*change["new"]), "clicked")
         self._quiet = False
-        self._lane: dict[str, float] = {}
+        self._lane = {name: float(scene.parameters[name]) for name in self.sliders}
         self._axes = axes
         for slider in self.sliders.values():
             slider.observe(lambda change: self.update(), "value")
@@ -121,14 +123,19 @@ class Explorer:
         return exact if abs(value - exact) <= 0.5001 * self.sliders[name].step else value
 
     def open_lane(self, right: float, down: float) -> None:
-        """Move the sliders to the lane of the map nearest to a place, given as shares of the picture's width and height."""
+        """Show the lane of the map nearest to a place, given as shares of the picture's width and height.
+
+        The other sliders go back to the map's scene: what is shown is that lane, and not one like it.
+        """
         width, height = self._map_axes.figure.canvas.get_width_height()
         at = self._map_axes.transData.inverted().transform((right * width, (1 - down) * height))
         self._quiet = True
         try:
+            self._lane = {name: float(self.scene.parameters[name]) for name in self.sliders}
             for (name, values), value in zip(self._axes.items(), at, strict=True):
                 self._lane[name] = float(values[np.argmin(np.abs(values - value))])
-                self.sliders[name].value = self._lane[name]
+            for name, value in self._lane.items():
+                self.sliders[name].value = value
         finally:
             self._quiet = False
         self.update()
@@ -162,7 +169,19 @@ def _slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     finest = (high - low) / 500
     power = 10.0 ** np.floor(np.log10(finest))
     step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
-    return widgets.FloatSlider(value, min=low, max=high, step=step, description=name, readout_format=".5g")
+    # A browser rounds to steps from the lower end; the scene's own value has to be one of them.
+    low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
+    unit = QUANTITIES[name][1] if name in QUANTITIES else "1"
+    return widgets.FloatSlider(
+        value,
+        min=low,
+        max=high,
+        step=step,
+        description=name if unit == "1" else f"{name} ({unit})",
+        readout_format=f".{max(0, -int(np.floor(np.log10(step) + 1e-9)))}f",
+        style={"description_width": "9em"},
+        layout={"width": "330px"},
+    )
 
 
 def _said(run: Trajectory) -> str:
@@ -191,7 +210,7 @@ def _panels(t1: float):
         right=0.98,
         top=0.97,
         bottom=0.1,
-        hspace=0.3,
+        hspace=0.35,
         wspace=0.28,
     )
     response, status, energy = (figure.add_subplot(grid[k, 0]) for k in range(3))
@@ -206,10 +225,26 @@ def _panels(t1: float):
     status.set(ylim=(-0.5, 2.5), xlim=(0, t1))
     status.set_yticks([int(s) for s in Status], [STATUS_NAMES[s] for s in Status])
     energy.set(xlabel="time (s)", ylabel="energy (J)", xlim=(0, t1))
-    energy.legend(loc="upper left", fontsize="small", framealpha=0.8)
+    # Between two panels, where no curve can run behind it.
+    energy.legend(
+        loc="lower right",
+        bbox_to_anchor=(1, 0.97),
+        ncols=2,
+        fontsize="small",
+        frameon=False,
+        borderaxespad=0,
+        borderpad=0.3,
+    )
     phase.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
     for axes in (response, status):
         axes.tick_params(labelbottom=False)
+    # What places labels, and how many ticks there are, is what drawing waits for.
+    for axes, left in ((response, -0.13), (energy, -0.13), (phase, -0.21)):
+        axes.yaxis.set_label_coords(left, 0.5)
+        axes.yaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+    energy.xaxis.set_label_coords(0.5, -0.25)
+    phase.xaxis.set_label_coords(0.5, -0.075)
 
     def draw(run: Trajectory) -> bytes:
         tangential = run.scene.structure.tangential

@@ -104,17 +104,18 @@ def response(
 def shade_status(axes: Axes, run: Trajectory) -> list[Patch]:
     """Shade where the contact sticks or is detached; returns legend entries for what occurs."""
     handles = []
+    t = np.append(run.t, run.t[-1])
     for status, colour in STATUS_COLOURS.items():
         is_on = np.asarray(run.status) == status
         if not is_on.any():
             continue
         hatch = "///" if status == Status.STICK else None
-        axes.fill_between(
-            run.t,
-            0,
-            1,
-            where=is_on,
-            step="post",
+        # From the first row that has it to the row that has another, so that one row alone is seen too.
+        edges = np.diff(np.concatenate([[False], is_on, [False]]).astype(int))
+        begun, ended = t[np.flatnonzero(edges > 0)], t[np.flatnonzero(edges < 0)]
+        axes.broken_barh(
+            np.stack([begun, ended - begun], axis=1),
+            (0, 1),
             transform=axes.get_xaxis_transform(),
             facecolor=colour,
             edgecolor="none",
@@ -141,7 +142,8 @@ def phase_plane(
         axes.plot(1e3 * x, v, color=colour, ls=line, lw=0.9, label=name)
     axes.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
     if any(runs):
-        axes.legend(loc="upper right", framealpha=0.9)
+        # Beside the orbits: they may be anywhere in the plane.
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
     return figure
 
 
@@ -188,7 +190,10 @@ def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     axes = figure.add_subplot()
     x, p = dataset[names[0]].values, dataset["p_crit"].values
     only = dataset["only_crossing"].values.astype(bool)
-    axes.plot(x, p, color=BLUE, lw=1.0)
+    limit = dataset.attrs.get("mu_crit", np.inf) if names[0] == "mu" else np.inf
+    # At the limit of linear theory the curve ends; beyond it sliding is left without a kick.
+    for part in (x < limit, x >= limit):
+        axes.plot(x[part], p[part], color=BLUE, lw=1.0)
     axes.plot(x[only], p[only], "o", color=BLUE, ms=4, label="only crossing seen")
     if (~only & np.isfinite(p)).any():
         axes.plot(x[~only], p[~only], "o", color=BLUE, mfc="white", ms=5, label="islands seen above")
@@ -196,9 +201,17 @@ def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     if names[0] == "belt_speed" and len(x) > 1 and x[0] > 0 and x[-1] / x[0] > 30:
         axes.set_xscale("log")
     low, high = json.loads(dataset.attrs.get("range", "[null, null]"))
-    if names[0] == "mu" and "mu_crit" in dataset.attrs:
-        axes.axvline(dataset.attrs["mu_crit"], color=VERMILION, ls="--", lw=1.2)
-        axes.annotate(r"$\mu_\mathrm{crit}$", (dataset.attrs["mu_crit"], 0.9), xycoords=("data", "axes fraction"))
+    if np.isfinite(limit):
+        axes.axvline(limit, color=VERMILION, ls="--", lw=1.2)
+        axes.annotate(
+            rf"$\mu_\mathrm{{crit}}$ = {limit:.4f}" "\n(linear theory)",
+            (limit, 0.97),
+            (-6, 0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            ha="right",
+            va="top",
+        )
     axes.set(
         xlabel=_axis_label(dataset, names[0]),
         ylabel=r"critical perturbation $p_\mathrm{crit}$",

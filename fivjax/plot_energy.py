@@ -53,7 +53,7 @@ def mechanical_energy(
     longest = max(runs.values(), key=lambda run: run.t[-1])
     windows = windows or [(float(longest.t[0]), float(longest.t[-1]))]
     figure = figure or Figure(figsize=(2.2 + 3.6 * len(windows), 3.4), layout="constrained")
-    panels = figure.subplots(1, len(windows), squeeze=False)[0]
+    panels = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     for axes, window in zip(panels, windows, strict=True):
         for (name, run), (colour, line) in zip(runs.items(), _styles(runs), strict=True):
             part = _inside(run, window)
@@ -142,7 +142,7 @@ def growth(run: Trajectory, cycles: xr.Dataset, window: Window, *, figure: Figur
     middle.tick_params(labelbottom=False)
     handles |= _exchange(lower, run, cycles, window, "energy_gain")
     lower.set(xlabel="time (s)", xlim=window)
-    middle.legend(handles=list(handles.values()), loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
+    _legend_over(middle, list(handles.values()))
     return figure
 
 
@@ -161,13 +161,16 @@ def slip_reversal(
         whole.plot(run.t, np.asarray(run.velocity)[:, run.scene.structure.tangential], color=colour, lw=0.6, label=name)
     longest = max(run.t[-1] for run in runs.values())
     whole.set(xlabel="time (s)", ylabel="tangential\nvelocity (m/s)", xlim=(0, longest))
-    whole.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(runs), frameon=False)
+    for line in whole.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(runs), frameon=False).get_lines():
+        line.set_linewidth(3)
     for axes, (name, run) in zip(panels, runs.items(), strict=True):
         part = _inside(run, windows[name])
         velocity = np.asarray(run.velocity)[part, run.scene.structure.tangential]
         axes.axhline(0, color="0.7", lw=0.8)
         lines = axes.plot(run.t[part], velocity, color=BLUE, lw=1.2, label="velocity")
-        lines += axes.plot(run.t[part], run.slip_velocity[part], color=BLACK, ls="--", lw=1.2, label="velocity on belt")
+        lines += axes.plot(
+            run.t[part], run.slip_velocity[part], color=BLACK, ls="--", lw=1.2, label="relative to the belt"
+        )
         forces = axes.twinx()
         lines += forces.plot(
             run.t[part], run.friction_force[part], color=VERMILION, ls=":", lw=1.6, label="friction force"
@@ -178,8 +181,7 @@ def slip_reversal(
         axes.set_title(name, loc="left", fontsize="medium")
         forces.set_ylabel("friction force (N)", color=VERMILION)
         if axes is panels[0]:
-            entries = [*lines, *handles.values()]
-            axes.legend(handles=entries, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(entries), frameon=False)
+            _legend_over(axes, [*lines, *handles.values()])
     panels[-1].set_xlabel("time (s)")
     return figure
 
@@ -253,8 +255,9 @@ def _exchange(axes: Axes, run: Trajectory, cycles: xr.Dataset, window: Window, n
     sums = axes.twinx()
     start, end = cycles["cycle_start"].values, cycles["cycle_end"].values
     seen = (end > window[0]) & (start < window[1])
-    level = sums.hlines(cycles[name].values[seen], start[seen], end[seen], color=BLACK, lw=2.0, label=PER_CYCLE[name])
-    sums.set_ylabel(f"{PER_CYCLE[name]}\nper cycle (J)")
+    energy = 1e3 * cycles[name].values[seen]
+    level = sums.hlines(energy, start[seen], end[seen], color=BLACK, lw=2.0, label=PER_CYCLE[name])
+    sums.set_ylabel(f"{PER_CYCLE[name]}\nper cycle (mJ)")
     _align_zeros(axes, sums)
     _shade(axes, run, part)
     return {"power": power, "level": level}
@@ -298,6 +301,19 @@ def _styles(runs: Mapping) -> list:
 
 def _peak(run: Trajectory) -> float:
     return float(np.nanmax(np.abs(np.asarray(run.velocity)[:, run.scene.structure.tangential])))
+
+
+def _legend_over(axes: Axes, entries: list) -> None:
+    """One row of entries between a panel and the one above it."""
+    axes.legend(
+        handles=entries,
+        loc="lower right",
+        bbox_to_anchor=(1, 1),
+        ncols=len(entries),
+        frameon=False,
+        columnspacing=1.2,
+        handlelength=1.6,
+    )
 
 
 def _legend_above(figure: Figure, handles: Mapping) -> None:

@@ -11,14 +11,16 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 
-from .plot import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, shade_status
+from .plot import BLACK, BLUE, GREEN, ORANGE, VERMILION, shade_status
 from .simulate import Trajectory
 
 Window = tuple[float, float]
 
-# How far below the strongest line a spectrogram is drawn, in dB.
-DEPTH = 70.0
+# How far below the strongest line a spectrogram is drawn, in dB. The paper does not print its range; at this one its two
+# spectrograms look as it describes them.
+DEPTH = 40.0
 
 
 def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
@@ -43,17 +45,16 @@ def onset(run: Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figu
     panels = figure.subplot_mosaic("aa;bc")
     accelerations(panels["a"], run, (float(run.t[0]), float(run.t[-1])))
     panels["a"].axvspan(*window, color="0.8", zorder=0)
-    panels["a"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    _thick(panels["a"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False))
     accelerations(panels["b"], run, window)
     level = spectrum["level"]
     shown = level.sel(frequency=slice(0, 500))
     mesh = panels["c"].pcolormesh(
         shown["t"], shown["frequency"], shown, cmap="viridis", vmin=-DEPTH, vmax=0, shading="nearest", rasterized=True
     )
-    figure.colorbar(mesh, ax=panels["c"], label="power below the strongest (dB)")
+    figure.colorbar(mesh, ax=panels["c"], label="power relative to the strongest (dB)")
     panels["c"].set(xlabel="time (s)", ylabel="frequency (Hz)")
-    _letters(panels)
-    return figure
+    return lettered(figure, list(panels.values()))
 
 
 def coexistence(
@@ -68,11 +69,15 @@ def coexistence(
     overlaid(runs, axes=panels["a"])
     for name, (start, end) in marks.items():
         panels["a"].axvline(0.5 * (start + end), color=BLACK, lw=0.8, ls=":")
-        panels["a"].annotate(name, (0.5 * (start + end), 0.94), xycoords=("data", "axes fraction"))
+        panels["a"].annotate(
+            name, (0.5 * (start + end), 0.92), (3, 0), xycoords=("data", "axes fraction"), textcoords="offset points"
+        )
+    # Room above the lines for these names.
+    low, high = panels["a"].get_ylim()
+    panels["a"].set_ylim(low, high + 0.12 * (high - low))
     accelerations(panels["b"], zoomed, zoom)
     panels["b"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
-    _letters(panels)
-    return figure
+    return lettered(figure, list(panels.values()))
 
 
 def overlaid(
@@ -82,14 +87,12 @@ def overlaid(
     if axes is None:
         figure = figure or Figure(figsize=(8.4, 3.8), layout="constrained")
         axes = figure.add_subplot()
-    # From light to dark, so that what is drawn last stands out in grey too.
-    shades = [(SKY, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
+    # Of different lightness, so that they are told apart in grey too.
+    shades = [(BLUE, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
     for (name, run), colour in zip(runs.items(), shades, strict=False):
         axes.plot(run.t, run.acceleration[:, run.scene.structure.tangential], color=colour, lw=0.5, label=name)
     axes.set(xlabel="time (s)", ylabel="tangential\nacceleration (m/s²)", xlim=(0, max(r.t[-1] for r in runs.values())))
-    legend = axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(runs), frameon=False)
-    for line in legend.get_lines():
-        line.set_linewidth(3)
+    _thick(axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(runs), frameon=False))
     return figure
 
 
@@ -115,7 +118,9 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, figure: Figu
     figure = figure or Figure(figsize=(1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1)), layout="constrained")
     axes = figure.add_subplot()
     axes.set_axis_off()
-    drawn = axes.table(cellText=[list(row) for row in rows], colLabels=list(columns), loc="center", cellLoc="left")
+    drawn = axes.table(
+        cellText=[list(row) for row in rows], colLabels=list(columns), loc="center", cellLoc="left", colLoc="left"
+    )
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(10)
     drawn.auto_set_column_width(list(range(len(columns))))
@@ -130,11 +135,20 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, figure: Figu
 
 def captioned(figure: Figure, caption: str) -> Figure:
     """The figure with a caption below it."""
-    width = int(figure.get_size_inches()[0] * 15)
+    width = int(figure.get_size_inches()[0] * 17)
     figure.supxlabel(textwrap.fill(caption, width), x=0.01, ha="left", fontsize="small")
     return figure
 
 
-def _letters(panels: Mapping[str, Axes]) -> None:
-    for letter, axes in panels.items():
-        axes.set_title(f"({letter})", loc="left", fontsize="medium")
+def lettered(figure: Figure, panels: Sequence[Axes] | None = None, names: Sequence[str] = ()) -> Figure:
+    """The figure with (a), (b) … above its panels, all of them unless some are given, and a name after each letter."""
+    panels = figure.axes if panels is None else panels
+    for letter, axes, name in zip("abcdefgh", panels, names or [""] * len(panels), strict=False):
+        axes.set_title(f"({letter}) {name}".rstrip(), loc="left", fontsize="medium")
+    return figure
+
+
+def _thick(legend: Legend) -> None:
+    # Lines that are hairs in a long run are too thin to tell their colour from.
+    for line in legend.get_lines():
+        line.set_linewidth(3)

@@ -258,9 +258,9 @@ def start_state(scene: Scene, y0) -> State:
     """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
     n, normal = scene.structure.size, scene.structure.normal
     if y0 is None:
-        if is_known(scene.belt_speed):
-            sliding_equilibrium(scene)  # for what it refuses
-        q, _ = steady_sliding(scene, scene.load.force)
+        # The first refuses where there is none, which nobody can tell inside a compiled function.
+        known = is_known(scene.belt_speed)
+        q = jnp.asarray(sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0])
         return jnp.concatenate([q, jnp.zeros_like(q)])
     is_pair = isinstance(y0, tuple | list) and len(y0) == 2
     parts = tuple(y0) if is_pair else (y0,)

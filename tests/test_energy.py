@@ -667,7 +667,9 @@ def test_every_picture_draws(kicked, cycles, tmp_path):
         assert fj.save_figure(figure, tmp_path / f"{i}.png", dpi=40).read_bytes().startswith(b"\x89PNG")
         for axes in figure.axes:
             label = axes.get_ylabel()
-            assert not label or any(unit in label for unit in ("(J)", "(W)", "(mm)", "(m/s)", "(m/s²)", "(N)", "(ms)"))
+            assert not label or any(
+                unit in label for unit in ("(J)", "(mJ)", "(W)", "(mm)", "(m/s)", "(m/s²)", "(N)", "(ms)")
+            )
             assert axes.get_xlabel() in ("", "time (s)")
     with pytest.raises(ValueError, match="several instants"):
         plot_energy.mechanical_power(one, [(20.0, 21.0)])
@@ -682,7 +684,7 @@ def test_pictures_show_the_ledger(kicked, cycles):
     np.testing.assert_array_equal(lower.lines[1].get_ydata(), run.energy.power.contact[part])
     seen = (table["cycle_end"] > 1.10) & (table["cycle_start"] < 1.14)
     drawn = np.array([segment[0, 1] for segment in levels.collections[0].get_segments()])
-    np.testing.assert_array_equal(drawn, table["contact_work"].values[seen.values])
+    np.testing.assert_array_equal(drawn, 1e3 * table["contact_work"].values[seen.values])
 
 
 def test_the_command_line_writes_the_ledger(tmp_path, capsys):

@@ -55,6 +55,13 @@ def test_a_moved_slider_changes_the_picture_and_compiles_nothing(explorer):
     assert compiled == []
 
 
+def test_the_scene_itself_lies_on_the_steps_of_its_sliders(explorer, scene):
+    """A browser rounds a value to the nearest step from the lower end: at the scene's own it must have nothing to round."""
+    for name, slider in explorer.sliders.items():
+        steps = (float(scene.parameters[name]) - slider.min) / slider.step
+        assert steps == pytest.approx(round(steps), abs=1e-6), name
+
+
 def test_what_is_said_is_of_the_scene_shown(explorer, scene):
     """The critical friction beside the sliders is that of the structure they describe."""
     explorer.sliders["k1"].value = 97e3
@@ -70,8 +77,11 @@ def test_a_click_opens_the_nearest_lane_exactly(explorer):
     width, height = axes.figure.canvas.get_width_height()
     x, y = axes.transData.transform((0.155, 1.65))
     unmarked = pixels(explorer.map)
+    # The map is of the scene it was made for, so a lane of it has that scene's springs.
+    explorer.sliders["k1"].value = 97e3
     explorer.map.clicked = [x / width, 1 - y / height]
     assert (explorer.sliders["mu"].value, explorer.sliders["p"].value) == (0.1511, 1.7)
+    assert explorer.sliders["k1"].value == 100e3
     assert np.any(pixels(explorer.map) != unmarked)
     # What a browser makes of it; then a step of the user's own.
     explorer.sliders["mu"].value = 0.151

@@ -64,10 +64,12 @@ def jupyterlab(folder: Path):
     command += [
         "--allow-root",
         f"--ServerApp.root_dir={folder}",
-        "--LabApp.news_url=None",
-        "--LabApp.check_for_updates_class=",
+        "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate",
     ]
-    command[-1] += "jupyterlab.NeverCheckForUpdate"
+    # Or it asks whether news may be fetched, over the picture.
+    settings = folder / "JUPYTERLAB_SETTINGS_DIR" / "@jupyterlab" / "apputils-extension"
+    settings.mkdir(parents=True)
+    (settings / "notification.jupyterlab-settings").write_text('{"fetchNews": "false"}')
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     own = {
         name: str(folder / name) for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "JUPYTERLAB_SETTINGS_DIR")
@@ -126,11 +128,12 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
         page.mouse.click(box["x"] + 0.3 * box["width"], box["y"] + 0.3 * box["height"])
         page.wait_for_function(f"(source) => {picture} !== source", arg=source, timeout=10_000)
         page.wait_for_timeout(500)
+        springs = [page.locator(".widget-readout").nth(k).inner_text() for k in (7, 8)]
         opened = [page.locator(".widget-readout").nth(k).inner_text() for k in range(2)]
         if screenshot is not None:
-            page.locator(".jp-Notebook").first.screenshot(path=screenshot)
+            page.locator(".jp-OutputArea-output").first.screenshot(path=screenshot)
         browser.close()
-    return {"took": took, "before": before, "moved": moved, "opened": opened}
+    return {"took": took, "before": before, "moved": moved, "opened": opened, "springs": springs}
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
@@ -139,6 +142,8 @@ def test_sliders_and_the_map_in_a_browser(tmp_path):
     seen = explore(tmp_path)
     assert seen["before"] == "0.227"
     assert float(seen["moved"]) > 0.227
+    # A lane of the map has the map's springs, to the digit, whatever steps a slider has.
+    assert seen["springs"] == ["100000", "101000"]
     # Lanes of the map's grid: 0.10, 0.12 … and 1.00, 1.25 …
     mu, p = map(float, seen["opened"])
     assert round((mu - 0.1) / 0.02, 6) == round((mu - 0.1) / 0.02)

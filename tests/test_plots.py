@@ -64,6 +64,18 @@ def test_statuses_are_shaded_where_they_occur(runs):
     assert plot.response(quiet).axes[0].get_legend() is None
 
 
+def test_a_status_of_one_row_is_shaded_for_as_long_as_a_row_lasts():
+    """A stick shorter than the distance of rows is seen, and shading ends where the next status begins."""
+    t, still = np.arange(6.0), np.zeros((6, 3))
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.1), 3.0)
+    run = fj.Trajectory(t, still, still, still, np.array([1, 0, 1, 2, 2, 1]), t, t, t, scene)
+    axes = Figure().add_subplot()
+    handles = plot.shade_status(axes, run)
+    assert [handle.get_label() for handle in handles] == ["sticking", "detached"]
+    spans = [path.get_extents() for bars in axes.collections for path in bars.get_paths()]
+    assert [(span.x0, span.x1) for span in spans] == [(1, 2), (3, 5)]
+
+
 def test_the_critical_curve_marks_where_islands_were_seen(tmp_path):
     """Fig. 10: filled where the crossing is the only one, hollow elsewhere."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.05), 3.0, fj.Pulse(100.0, 1.2))
