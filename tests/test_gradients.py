@@ -111,3 +111,49 @@ def test_a_structure_of_ones_own_takes_part():
     )
     assert d.exist and all(np.isfinite(d[name]) for name in ("stiffness", "damping"))
     assert jnp.shape(d["damping"]) == ()
+
+
+def spring_loaded() -> fj.Structure:
+    """A mass along the belt, and another above it that presses by a spring: N swings on its own, whatever the belt does."""
+    stiffness = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])
+    return fj.Structure(np.eye(3), np.zeros((3, 3)), stiffness, [0.0, -1.0, 0.0], tangential=0, normal=2)
+
+
+@pytest.mark.parametrize(("late", "exist"), [(1e-9, False), (-1e-9, False), (0.1, True), (-0.1, True)])
+def test_two_events_that_swap_order_have_no_derivative(late, exist):
+    """N = 1 + 2 cos t runs out at 2π/3, the slip 1 - r cos(t - b) at that instant or a moment beside it: the next digit of
+    either decides which of the two happens."""
+    scene = fj.Scene(spring_loaded(), fj.Coulomb(0.0), 1.0, fj.ConstantLoad(1.0))
+    # x = r sin(t - b), whose speed has grown to that of the belt at this instant.
+    r, ends = 1.5, 2 * np.pi / 3 + late
+    b = ends + np.arccos(1 / r)
+    y0 = ([-r * np.sin(b), -3.0, 0.0], [r * np.cos(b), 0.0, 0.0])
+    d = fj.derivatives(lambda run: run.displacement[-1, 0], scene, ["force"], 2.5, 2.5, y0=y0)
+    assert d.exist is exist, d.reason
+
+
+@pytest.mark.parametrize(("late", "exist"), [(1e-10, False), (-1e-10, False), (0.05, True), (-0.05, True)])
+def test_an_event_on_a_jump_of_the_load_has_no_derivative(late, exist):
+    """A mass falls onto the belt at the instant at which the load jumps: it lands under the one load or the other."""
+    lands = np.sqrt(2 * 1.0 / 9.81)
+    load = fj.Pulse(9.81, 2.0, start=lands + late, duration=1.0)
+    scene = fj.Scene(point_mass(0.0), fj.Coulomb(0.0), 0.0, load, restitution=0.5)
+    d = fj.derivatives(last_rate, scene, ["p"], 0.7, 0.7, y0=([0.0, 1.0], [0.0, 0.0]))
+    assert d.exist is exist, d.reason
+
+
+@pytest.mark.parametrize(("begin", "exist"), [(3.0 - 1e-9, False), (3.0 + 1e-9, False), (2.7, True), (3.3, True)])
+def test_rest_at_the_edge_of_the_friction_cone_has_no_derivative(begin, exist):
+    """A block that swings about μN/k = 1 turns at 2 - x₀ = -1: where friction just holds it, or just does not."""
+    scene = fj.Scene(point_mass(1.0), fj.Coulomb(1.0), 0.0, fj.ConstantLoad(1.0))
+    d = fj.derivatives(lambda run: run.displacement[-1, 0], scene, ["mu"], 4.0, 4.0, y0=([begin, 0.0], [0.0, 0.0]))
+    assert d.exist is exist, d.reason
+    assert exist or "friction cone" in d.reason
+
+
+def test_an_event_at_the_very_end_has_no_derivative():
+    """The last row is before the impact, or after it."""
+    scene = fj.Scene(point_mass(0.0), fj.Coulomb(0.0), 0.0, fj.ConstantLoad(9.81), restitution=0.5)
+    for late, exist in ((1e-10, False), (0.05, True)):
+        t1 = float(np.sqrt(2 / 9.81)) - late
+        assert fj.derivatives(last_rate, scene, ["force"], t1, t1, y0=([0.0, 1.0], [0.0, 0.0])).exist is exist
