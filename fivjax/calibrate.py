@@ -27,7 +27,7 @@ from tqdm.auto import tqdm
 
 from . import arguments
 from .event_exact import EventExact
-from .misfit import OFFSET_UNIT, AbstractMisfit, CycleMisfit, KickMisfit, misfit
+from .misfit import OFFSET_UNIT, AbstractMisfit, CycleMisfit, KickMisfit, cycle_rate, misfit
 from .parameters import FreeParameters
 from .precision import in_double_precision
 from .results import labelled
@@ -36,16 +36,18 @@ from .signals import Recording, averaged
 from .sliding import linear_sliding
 from .steppers import AbstractStepper
 
+# Scenes looked at, without derivatives, for one that vibrates much as the limit cycle that was measured.
+SCREENED = 32
 # Blocks per period of the highest sliding mode of the scene that the fit starts from.
 BLOCKS_PER_PERIOD = 16
 # Starts that go on from the features to the waveform; with time offsets to try, two with three each.
-KEPT = 3
+KEPT = 4
 KEPT_WITH_OFFSETS = 6
 WINDOWS = (0.15, 0.4, 1.0)
 # Shares of the recording below this are far from the answer.
 FAR = 1.0
 # Where a fit stops: changes of every residual, in standard deviations of the noise, and of the parameters' logarithms.
-EARLY_TOLERANCE, FINAL_TOLERANCE = 1e-2, 1e-5
+EARLY_TOLERANCE, FINAL_TOLERANCE, ANY = 1e-2, 1e-5, 1e30
 MOST_STEPS = 40
 # How far the features may pull a parameter from its start, as a factor of e: what they do not tell stays where it was.
 LEASH = 0.7
@@ -187,7 +189,8 @@ def calibrate(
     - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may be anything).
     - `starts`: how many, the scene's own first, the others within `spread` (relative) around it, drawn with `seed`.
     - `rate`: blocks per second that recordings are averaged over before they are compared; 16 per period of the scene's
-      highest sliding mode unless given. The model is averaged over the same blocks, exactly.
+      highest sliding mode unless given, 28 to 48 per period of a limit cycle. The model is averaged over the
+      same blocks, exactly.
     - `identifiable_within`: the largest standard deviation, relative to the parameter, that still counts as knowing it.
     - `method`: how to step, `EventExact()` unless given. Gradients of `WhereSwitched` are wrong after contact events.
 
@@ -216,21 +219,20 @@ def calibrate(
     arguments.real_number("identifiable_within", identifiable_within, above=0)
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
-    if rate is None:
-        frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
-        rate = BLOCKS_PER_PERIOD * float(frequencies.max())
-    arguments.real_number("rate", rate, above=0)
+    if rate is not None:
+        arguments.real_number("rate", rate, above=0)
 
-    blocks = [averaged(recording, rate) for recording in recordings]
+    blocks = [averaged(recording, _rate(scene, recording) if rate is None else rate) for recording in recordings]
     for k, block in enumerate(blocks):
         if len(block.means) < 2 * len(parameters.names) + 8:
             raise ValueError(
-                f"Recording {k} is too short: {len(block.means)} blocks at {rate:g} per second for "
+                f"Recording {k} is too short: {len(block.means)} blocks at {1 / np.diff(block.edges[:2])[0]:g} per second for "
                 f"{len(parameters.names)} parameters. Raise `rate`, or record for longer."
             )
     moved = tuple(r.regime == "kick" and r.offset[0] < r.offset[1] for r in recordings)
     references = jnp.array([r.offset[0] for r in recordings])
-    begins = _starts(parameters, scene, int(starts), float(spread), seed)
+    cycles = all(r.regime == "limit cycle" for r in recordings)
+    begins = _starts(parameters, scene, max(int(starts), SCREENED) if cycles else int(starts), float(spread), seed)
     kicked = any(r.regime == "kick" for r in recordings)
     # A response to a kick is first taken to slide throughout, which is quick to try and checked afterwards.
     for uneventful in (True, False) if kicked and scene.friction.constant else (False,):
@@ -384,15 +386,20 @@ class _Fit:
     def run(self):
         """Yields the name of each stage before it begins."""
         yield "features"
-        candidates = self.starts if self.cycles else self._from_features()
+        candidates = self._screened() if self.cycles else self._from_features()
         yield "time offsets"
         candidates = self._with_offsets(candidates)
         for share in self.windows:
             yield f"waveform, {100 * share:.0f} %"
-            candidates = self._waveform(candidates, share)
+            candidates = self._waveform(candidates, share, EARLY_TOLERANCE if share < FAR else FINAL_TOLERANCE)
         yield "noise and uncertainties"
         if self._estimate_noise():
-            self._waveform(candidates[:1], 1.0)
+            self._waveform(candidates[:1], 1.0, FINAL_TOLERANCE)
+
+    def _screened(self) -> np.ndarray:
+        """The starts that come closest to the limit cycles. Far off, a scene may have none, and no derivative leads there."""
+        # A fit that may stop at once, so that nothing new is compiled.
+        return self._waveform(self.starts, self.windows[0], ANY)
 
     def _from_features(self) -> np.ndarray:
         found, cost, steps = map(np.asarray, _fit_features(self.problem, jnp.asarray(self.starts)))
@@ -428,10 +435,9 @@ class _Fit:
         best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
         return np.minimum(step * best, high - low) / OFFSET_UNIT
 
-    def _waveform(self, candidates: np.ndarray, share: float) -> np.ndarray:
+    def _waveform(self, candidates: np.ndarray, share: float, tolerance: float) -> np.ndarray:
         # Always as many at a time, so that it compiles once.
         count = KEPT_WITH_OFFSETS if any(self.problem.moved) else KEPT
-        tolerance = FINAL_TOLERANCE if share == 1.0 else EARLY_TOLERANCE
         found = []
         for begin in range(0, len(candidates), count):
             padded = jnp.asarray(np.resize(candidates[begin : begin + count], (count, candidates.shape[1])))
@@ -573,6 +579,13 @@ def _distinct(candidates: np.ndarray) -> np.ndarray:
         if not any(np.allclose(candidate, other, atol=1e-2) for other in kept):
             kept.append(candidate)
     return np.array(kept)
+
+
+def _rate(scene: Scene, recording: Recording) -> float:
+    """Blocks per second that tell what the scene can do."""
+    frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
+    rate = BLOCKS_PER_PERIOD * float(frequencies.max())
+    return cycle_rate(recording, scene) if recording.regime == "limit cycle" else rate
 
 
 def _starts(parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from . import features
 from .contact import Mechanics, Status, status_from_forces
 from .scene import Scene, steady_sliding
-from .signals import Averaged, Channel, Recording
+from .signals import Averaged, Channel, Recording, averaged
 from .simulate import states_at
 from .sliding import linear_sliding
 from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
@@ -37,6 +37,8 @@ OFFSET_UNIT = 1e-3
 SETTLING_PERIODS = 80
 CYCLE_PERIODS = 30
 MOST_HARMONICS = 8
+# Blocks per period: many, because landings are short; the least and the most.
+CYCLE_BLOCKS = (28, 48)
 
 
 class AbstractMisfit(eqx.Module):
@@ -197,7 +199,9 @@ class CycleMisfit(AbstractMisfit):
         start = (y0, status_from_forces(mechanics, load, y0), jnp.zeros(2))
         _, (y, spent) = jax.lax.scan(to_next, start, spans)
         means = jnp.diff(_integrals(y, self.channels), axis=0) / self.width
-        return means, (spent[-1] - spent[0]) / (self.blocks * self.width)
+        # Tapered, because it need not be a whole number of periods.
+        weights = jnp.hanning(self.blocks)
+        return means, weights @ jnp.diff(spent, axis=0) / (jnp.sum(weights) * self.width)
 
 
 def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
@@ -364,14 +368,45 @@ def _features_with_slopes(means, width, lowest, highest, count: int):
     return features_of(means), jax.jacrev(features_of)(means)
 
 
-def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
+def cycle_rate(recording: Recording, scene: Scene) -> float:
+    """Blocks per second for a limit cycle, so many to a period that what averaging folds down lies between its lines."""
+    blocks = averaged(recording, 16 * _sliding_frequencies(scene, recording).max())
     width = float(blocks.edges[1] - blocks.edges[0])
-    # The fundamental lies about where the sliding modes do; a start 30 % off in a spring is 16 % off in frequency.
+    samples = recording.rate / _first_frequency(recording, blocks.means, width, scene)
+    choices = np.arange(max(1, int(samples / CYCLE_BLOCKS[1])), max(2, int(samples / CYCLE_BLOCKS[0]) + 1))
+    return recording.rate / float(choices[np.argmin([_folded(samples / choice) for choice in choices])])
+
+
+def _folded(per_period: float) -> float:
+    """How much of the lines around each multiple of the block rate is taken for fitted lines, in units of a flat spectrum.
+
+    Averaging leaves a share h/(m r) of what lies next to m times the rate of r blocks per period, for the line h; the
+    taper keeps out what is folded down far enough from it.
+    """
+    m = np.arange(1, 13)
+    aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
+    t = np.linspace(0, 1, 401)
+    taper = features.taper(len(t))
+    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ taper) / taper.sum()
+    return float(np.sum(seen * MOST_HARMONICS / (m * per_period)))
+
+
+def _sliding_frequencies(scene: Scene, recording: Recording) -> np.ndarray:
     modes = np.linalg.eigvals(np.asarray(linear_sliding(scene.replace(**recording.known)).matrix))
     modes = np.abs(modes.imag) / (2 * np.pi)
-    modes = modes[modes > 0]
+    return modes[modes > 0]
+
+
+def _first_frequency(recording: Recording, means: np.ndarray, width: float, scene: Scene) -> float:
+    """The fundamental, sought where the sliding modes are: a start 30 % off in a spring is 16 % off in frequency."""
+    modes = _sliding_frequencies(scene, recording)
+    return _fundamental(jnp.asarray(means), width, 0.6 * modes.min(), 1.6 * modes.max(), 1)
+
+
+def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
+    width = float(blocks.edges[1] - blocks.edges[0])
     means = jnp.asarray(blocks.means)
-    frequency = _fundamental(means, width, 0.6 * modes.min(), 1.6 * modes.max(), 1)
+    frequency = _first_frequency(recording, blocks.means, width, scene)
     count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
     limits = (0.6 * frequency, 1.6 * frequency)
     frequency = _fundamental(means, width, *limits, count)
