@@ -12,7 +12,7 @@ import time
 from collections import Counter
 
 import numpy as np
-from recordings import CASES, FREE, case, noisy, off, paper, recording
+from recordings import CASES, FREE, case, noisy, off, paper, recording, times
 from tqdm import tqdm
 
 import fivjax as fj
@@ -54,13 +54,6 @@ def draws(name: str, count: int, total: int, starts: int = 4) -> None:
     for n, t, s in zip(names, told, spread, strict=True):
         print(f"   {n:<6} identifiable in {t} draws; error {s:.2f} standard deviations (root mean square)")
     sys.stdout.flush()
-
-
-def times(scene) -> dict[str, float]:
-    """Fractions of time sticking and detached on the limit cycle."""
-    run = fj.simulate(scene, 3.0, 2e-5, y0=(fj.sliding_equilibrium(scene), [-0.9 * float(scene.belt_speed), 0.0, 0.0]))
-    late = run.status[run.t > 2.0]
-    return {"sticking": float(np.mean(late == 0)), "detached": float(np.mean(late == 2))}
 
 
 def recovery(total, only_case=None, only_free=None):
