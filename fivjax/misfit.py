@@ -416,7 +416,9 @@ def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> C
         sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / (len(left) - 2 * count - 1)))
 
     # How the noise of every sample reaches every feature, to first order.
-    measured, jacobian = _features_with_slopes(means, *map(jnp.asarray, (width, *limits)), count)
+    # As arrays, so that another recording finds it compiled.
+    low, high = jnp.asarray(limits[0]), jnp.asarray(limits[1])
+    measured, jacobian = _features_with_slopes(means, jnp.asarray(width), low, high, count)
     jacobian = np.asarray(jacobian)
     covariance = np.einsum("abk,cbk,k->ac", jacobian, jacobian, sigma**2)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
