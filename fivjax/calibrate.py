@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import xarray as xr
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from tqdm.auto import tqdm
 
 from . import arguments
 from .event_exact import EventExact
-from .misfit import OFFSET_UNIT, AbstractMisfit, CycleMisfit, KickMisfit, misfit
+from .misfit import OFFSET_UNIT, AbstractMisfit, CycleMisfit, KickMisfit, cycle_rate, misfit
 from .parameters import FreeParameters
 from .precision import in_double_precision
 from .results import labelled
@@ -36,12 +36,18 @@ from .signals import Recording, averaged
 from .sliding import linear_sliding
 from .steppers import AbstractStepper
 
+# Scenes looked at, without derivatives, for one that vibrates much as the limit cycle that was measured.
+SCREENED = 32
 # Blocks per period of the highest sliding mode of the scene that the fit starts from.
 BLOCKS_PER_PERIOD = 16
 # Starts that go on from the features to the waveform; with time offsets to try, two with three each.
-KEPT = 3
+KEPT = 4
 KEPT_WITH_OFFSETS = 6
 WINDOWS = (0.15, 0.4, 1.0)
+# Shares of the recording below this are far from the answer.
+FAR = 1.0
+# Where a fit stops: changes of every residual, in standard deviations of the noise, and of the parameters' logarithms.
+EARLY_TOLERANCE, FINAL_TOLERANCE, ANY = 1e-2, 1e-5, 1e30
 MOST_STEPS = 40
 # How far the features may pull a parameter from its start, as a factor of e: what they do not tell stays where it was.
 LEASH = 0.7
@@ -183,7 +189,8 @@ def calibrate(
     - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may be anything).
     - `starts`: how many, the scene's own first, the others within `spread` (relative) around it, drawn with `seed`.
     - `rate`: blocks per second that recordings are averaged over before they are compared; 16 per period of the scene's
-      highest sliding mode unless given. The model is averaged over the same blocks, exactly.
+      highest sliding mode unless given, 28 to 48 per period of a limit cycle. The model is averaged over the
+      same blocks, exactly.
     - `identifiable_within`: the largest standard deviation, relative to the parameter, that still counts as knowing it.
     - `method`: how to step, `EventExact()` unless given. Gradients of `WhereSwitched` are wrong after contact events.
 
@@ -212,26 +219,27 @@ def calibrate(
     arguments.real_number("identifiable_within", identifiable_within, above=0)
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
-    if rate is None:
-        frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
-        rate = BLOCKS_PER_PERIOD * float(frequencies.max())
-    arguments.real_number("rate", rate, above=0)
+    if rate is not None:
+        arguments.real_number("rate", rate, above=0)
 
+    blocks = []
     for k, recording in enumerate(recordings):
-        if round(recording.rate / rate) > len(recording.t):
+        own = _rate(scene, recording) if rate is None else rate
+        if round(recording.rate / own) > len(recording.t):
             raise ValueError(
-                f"Recording {k} is too short: not one block at {rate:g} per second. Raise `rate`, or record for longer."
+                f"Recording {k} is too short: not one block at {own:g} per second. Raise `rate`, or record for longer."
             )
-    blocks = [averaged(recording, rate) for recording in recordings]
+        blocks.append(averaged(recording, own))
     for k, block in enumerate(blocks):
         if len(block.means) < 2 * len(parameters.names) + 8:
             raise ValueError(
-                f"Recording {k} is too short: {len(block.means)} blocks at {rate:g} per second for "
+                f"Recording {k} is too short: {len(block.means)} blocks at {1 / np.diff(block.edges[:2])[0]:g} per second for "
                 f"{len(parameters.names)} parameters. Raise `rate`, or record for longer."
             )
     moved = tuple(r.regime == "kick" and r.offset[0] < r.offset[1] for r in recordings)
     references = jnp.array([r.offset[0] for r in recordings])
-    begins = _starts(parameters, scene, int(starts), float(spread), seed)
+    cycles = all(r.regime == "limit cycle" for r in recordings)
+    begins = _starts(parameters, scene, max(int(starts), SCREENED) if cycles else int(starts), float(spread), seed)
     kicked = any(r.regime == "kick" for r in recordings)
     # A response to a kick is first taken to slide throughout, which is quick to try and checked afterwards.
     for uneventful in (True, False) if kicked and scene.friction.constant else (False,):
@@ -273,12 +281,14 @@ class _Problem(eqx.Module):
 
     def coarse(self, u, u0):
         scene = self.parameters.scene(self.scene, u)
-        return jnp.concatenate([*(m.coarse(scene) for m in self.misfits), (u - u0) / LEASH])
+        return jnp.concatenate([*(m.coarse(scene) for m in self.misfits), (u - u0) / LEASH]), []
 
-    def residual(self, x, share):
+    def residual(self, x, x0, share):
         scene = self.parameters.scene(self.scene, x[: self.size])
         found = [m.residual(scene, offset, share) for m, offset in zip(self.misfits, self.offsets(x), strict=True)]
-        return jnp.concatenate([residual for residual, _ in found]), [model for _, model in found]
+        # Far from the answer the features of a limit cycle alone may leave a parameter untold.
+        leash = jnp.where(share < FAR, (x - x0)[: self.size] / LEASH, 0.0)
+        return jnp.concatenate([*(residual for residual, _ in found), leash]), [model for _, model in found]
 
 
 @eqx.filter_custom_jvp
@@ -289,65 +299,78 @@ def _coarse(u, problem: _Problem, u0):
 @_coarse.def_jvp
 def _(primals, tangents):
     u, problem, u0 = primals
-    return _with_dense_jacobian(lambda u: problem.coarse(u, u0), u, tangents[0])
+    found, models, along = _with_dense_jacobian(lambda u: problem.coarse(u, u0), u, tangents[0])
+    return (found, models), (along, models)
 
 
 @eqx.filter_custom_jvp
-def _waveform(x, problem: _Problem, share):
-    return problem.residual(x, share)[0]
+def _waveform(x, problem: _Problem, x0, share):
+    return problem.residual(x, x0, share)
 
 
 @_waveform.def_jvp
 def _(primals, tangents):
-    x, problem, share = primals
-    return _with_dense_jacobian(lambda x: problem.residual(x, share)[0], x, tangents[0])
+    x, problem, x0, share = primals
+    found, models, along = _with_dense_jacobian(lambda x: problem.residual(x, x0, share), x, tangents[0])
+    # Models are looked at, not fitted.
+    return (found, models), (along, jax.tree.map(jnp.zeros_like, models))
 
 
 def _with_dense_jacobian(function, x, tangent):
-    """A value and its derivative along `tangent`, by way of the whole Jacobian.
+    """Residuals, models, and the residuals' derivative along `tangent`, by way of the whole Jacobian.
 
     The optimiser linearises the residuals and applies that to each unit vector. Left to itself JAX would keep what a
     linearisation needs of every step of the simulation; pure forward mode keeps nothing, and compiles four times faster.
     """
 
     def twice(x):
-        found = function(x)
-        return found, found
+        found, models = function(x)
+        return found, (found, models)
 
-    jacobian, found = jax.jacfwd(twice, has_aux=True)(x)
-    return found, jacobian @ tangent
+    jacobian, (found, models) = jax.jacfwd(twice, has_aux=True)(x)
+    return found, models, jacobian @ tangent
 
 
-def _minimise(function, start, *args, tolerance=1e-7):
-    def with_cost(x, args):
-        residual = function(x, *args)
-        return residual, jax.lax.stop_gradient(jnp.sum(residual**2))
+class _Minimum(eqx.Module):
+    """Where a minimisation ended, with everything that is wanted there, so that nothing is computed or compiled anew."""
+
+    x: Float[Array, " j"]
+    cost: Float[Array, ""]
+    residual: Float[Array, " r"]
+    jacobian: Float[Array, "r j"]
+    models: list[Float[Array, "B k"]]
+    arrived: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+def _minimise(function, start, *args, tolerance) -> _Minimum:
+    def with_models(x, args):
+        residual, models = function(x, *args)
+        return residual, jax.lax.stop_gradient(models)
 
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    solution = optx.least_squares(with_cost, solver, start, args, has_aux=True, max_steps=MOST_STEPS, throw=False)
-    arrived = solution.result == optx.RESULTS.successful
-    return solution.value, solution.aux, arrived, solution.stats["num_steps"]
+    solution = optx.least_squares(with_models, solver, start, args, has_aux=True, max_steps=MOST_STEPS, throw=False)
+    there = solution.state.f_info
+    return _Minimum(
+        x=solution.value,
+        cost=jnp.sum(there.residual**2),
+        residual=there.residual,
+        jacobian=there.jac.as_matrix(),
+        models=solution.aux,
+        arrived=solution.result == optx.RESULTS.successful,
+        steps=solution.stats["num_steps"],
+    )
 
 
 @eqx.filter_jit
 def _fit_features(problem: _Problem, starts: Float[Array, "s k"]):
-    return jax.vmap(lambda u0: _minimise(_coarse, u0, problem, u0, tolerance=1e-3))(starts)
+    found = jax.vmap(lambda u0: _minimise(_coarse, u0, problem, u0, tolerance=1e-3))(starts)
+    return found.x, found.cost, found.steps
 
 
 @eqx.filter_jit
-def _fit_waveform(problem: _Problem, starts: Float[Array, "s j"], share: Float[Array, ""]):
-    return jax.vmap(lambda x0: _minimise(_waveform, x0, problem, share))(starts)
-
-
-@eqx.filter_jit
-def _linearised(problem: _Problem, x: Float[Array, " j"]):
-    def residual(x):
-        found, models = problem.residual(x, jnp.asarray(1.0))
-        return found, (found, models)
-
-    jacobian, (found, models) = jax.jacfwd(residual, has_aux=True)(x)
-    slope = jax.jacfwd(problem.parameters.values)(x[: problem.size])
-    return found, jacobian, models, jnp.diagonal(slope)
+def _fit_waveform(problem: _Problem, starts: Float[Array, "s j"], share: Float[Array, ""], tolerance: Float[Array, ""]):
+    return jax.vmap(lambda x0: _minimise(_waveform, x0, problem, x0, share, tolerance=tolerance))(starts)
 
 
 @eqx.filter_jit
@@ -361,34 +384,40 @@ class _Fit:
 
     def __init__(self, problem: _Problem, starts: np.ndarray, recordings: tuple[Recording, ...]):
         self.problem, self.starts, self.recordings = problem, starts, recordings
-        self.windows = (1.0,) if all(isinstance(m, CycleMisfit) for m in problem.misfits) else WINDOWS
+        # Limit cycles have no window that grows: their features are compared first roughly, then to the noise.
+        self.cycles = all(isinstance(m, CycleMisfit) for m in problem.misfits)
+        self.windows = (WINDOWS[0], WINDOWS[-1]) if self.cycles else WINDOWS
         self.stages = len(self.windows) + 3
         self.steps = 0
 
     def run(self):
         """Yields the name of each stage before it begins."""
         yield "features"
-        candidates = self._from_features()
+        candidates = self._screened() if self.cycles else self._from_features()
         yield "time offsets"
         candidates = self._with_offsets(candidates)
         for share in self.windows:
             yield f"waveform, {100 * share:.0f} %"
-            candidates = self._waveform(candidates, share)
+            candidates = self._waveform(candidates, share, EARLY_TOLERANCE if share < FAR else FINAL_TOLERANCE)
         yield "noise and uncertainties"
-        self.best = candidates[0]
         if self._estimate_noise():
-            self.best = self._waveform(candidates[:1], 1.0)[0]
+            self._waveform(candidates[:1], 1.0, FINAL_TOLERANCE)
+
+    def _screened(self) -> np.ndarray:
+        """The starts that come closest to the limit cycles. Far off, a scene may have none, and no derivative leads there."""
+        # A fit that may stop at once, so that nothing new is compiled.
+        return self._waveform(self.starts, self.windows[0], ANY)
 
     def _from_features(self) -> np.ndarray:
-        found, cost, _, steps = map(np.asarray, _fit_features(self.problem, jnp.asarray(self.starts)))
+        found, cost, steps = map(np.asarray, _fit_features(self.problem, jnp.asarray(self.starts)))
         self.steps += int(steps.max())
         best_first = found[np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")]
-        return _distinct(np.concatenate([best_first, self.starts]))
+        return _distinct(np.concatenate([best_first, self.starts]))[:KEPT]
 
     def _with_offsets(self, candidates: np.ndarray) -> np.ndarray:
         """The candidates with the time offsets at which each agrees best over all of the recording, or its beginning."""
         if not any(self.problem.moved):
-            return candidates[:KEPT]
+            return candidates
         chosen = candidates[: KEPT_WITH_OFFSETS // len(WINDOWS)]
         offsets = np.stack(
             [self._offsets(k, chosen) for k, moved in enumerate(self.problem.moved) if moved], axis=-1
@@ -413,20 +442,23 @@ class _Fit:
         best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
         return np.minimum(step * best, high - low) / OFFSET_UNIT
 
-    def _waveform(self, candidates: np.ndarray, share: float) -> np.ndarray:
-        # Always as many, so that it compiles once.
+    def _waveform(self, candidates: np.ndarray, share: float, tolerance: float) -> np.ndarray:
+        # Always as many at a time, so that it compiles once.
         count = KEPT_WITH_OFFSETS if any(self.problem.moved) else KEPT
-        padded = np.resize(candidates, (count, candidates.shape[1]))
-        found = _fit_waveform(self.problem, jnp.asarray(padded), jnp.asarray(share))
-        found, cost, arrived, steps = map(np.asarray, found)
-        self.steps += int(steps.max())
-        order = np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
-        self.arrived = bool(arrived[order[0]])
-        return found[order]
+        found = []
+        for begin in range(0, len(candidates), count):
+            padded = jnp.asarray(np.resize(candidates[begin : begin + count], (count, candidates.shape[1])))
+            batch = _fit_waveform(self.problem, padded, jnp.asarray(share), jnp.asarray(tolerance))
+            self.steps += int(batch.steps.max())
+            found.append(jax.tree.map(np.asarray, batch))
+        found = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+        order = np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf), kind="stable")
+        self.best = jax.tree.map(lambda leaf: leaf[order[0]], found)
+        return found.x[order][:count]
 
     def _estimate_noise(self) -> bool:
         """Puts the noise that is left in place of the assumed one; whether that changed anything."""
-        models = _linearised(self.problem, jnp.asarray(self.best))[2]
+        models = self.best.models
         changed = False
         for k, (recording, model) in enumerate(zip(self.recordings, models, strict=True)):
             mine = self.problem.misfits[k]
@@ -434,7 +466,7 @@ class _Fit:
                 continue
             left = np.asarray(mine.means) - np.asarray(model)
             # Every fitted number takes its share of the noise away with it; the amplitudes of a small motion count.
-            free = len(self.best) / len(models) + (len(model) > 0) * mine.fitted_by_elimination
+            free = len(self.best.x) / len(models) + (len(model) > 0) * mine.fitted_by_elimination
             sigma = np.sqrt(np.sum(left**2, axis=0) / max(len(left) - free / left.shape[1], 1.0))
             sigma = np.where(np.isfinite(sigma) & (sigma > 0), sigma, np.asarray(mine.sigma))
             self.problem = eqx.tree_at(lambda p, k=k: p.misfits[k].sigma, self.problem, jnp.asarray(sigma))
@@ -443,33 +475,33 @@ class _Fit:
 
     def result(self, blocks, identifiable_within: float) -> Calibration:
         problem, size = self.problem, self.problem.size
-        found, jacobian, models, slope = _linearised(problem, jnp.asarray(self.best))
-        found, jacobian, slope = map(np.asarray, (found, jacobian, slope))
-        estimates = np.asarray(problem.parameters.values(jnp.asarray(self.best[:size])))
+        # Without the rows of the leash, which is let go by then.
+        found, jacobian, models = self.best.residual[:-size], self.best.jacobian[:-size], self.best.models
+        u = jnp.asarray(self.best.x[:size])
+        estimates, slope = map(np.asarray, _values_and_slopes(problem.parameters, u))
         # In whole parameters, so that singular values compare: a change of 100 %, or of a millisecond of offset.
         whole = np.where(estimates == 0, problem.parameters.size, np.abs(estimates))
-        scales = np.concatenate([whole / slope, np.ones(len(self.best) - size)])
+        scales = np.concatenate([whole / slope, np.ones(len(self.best.x) - size)])
         deviations, correlation, singular = _covariance(jacobian * scales)
-        models = [np.asarray(model) for model in models]
         means = [np.asarray(block.means)[: len(model)] for block, model in zip(blocks, models, strict=True)]
         signal = self._stands_out(models)
         identified = (deviations[:size] <= identifiable_within) & signal
-        freedom = max(len(found) - len(self.best) - sum(m.fitted_by_elimination for m in problem.misfits), 1)
+        freedom = max(len(found) - len(self.best.x) - sum(m.fitted_by_elimination for m in problem.misfits), 1)
         misfit = float(found @ found) / freedom
         if not signal:
             outcome = Outcome.NO_SIGNAL
-        elif not self.arrived:
+        elif not self.best.arrived:
             outcome = Outcome.NOT_CONVERGED
         elif self._structure_left(means, models, misfit):
             outcome = Outcome.STRUCTURE_LEFT
         else:
             outcome = Outcome.CONVERGED
         offsets, at = [], size
-        for moved, offset in zip(problem.moved, problem.offsets(self.best), strict=True):
+        for moved, offset in zip(problem.moved, problem.offsets(self.best.x), strict=True):
             offsets.append((float(offset), float(OFFSET_UNIT * deviations[at])) if moved else None)
             at += moved
         return Calibration(
-            scene=problem.parameters.scene(problem.scene, jnp.asarray(self.best[:size])),
+            scene=problem.parameters.scene(problem.scene, u),
             names=problem.parameters.names,
             estimates=estimates,
             deviations=deviations[:size] * whole,
@@ -492,12 +524,12 @@ class _Fit:
         problem = self.problem
         for k, mine in enumerate(problem.misfits):
             if isinstance(mine, KickMisfit):
-                instants = mine.edges + problem.offsets(self.best)[k]
-                u = jnp.asarray(self.best[None, : problem.size])
-                without = np.asarray(_integrals(problem, k, u, instants))
-                through = np.asarray(_integrals(problem, k, u, instants, eventful=True))
+                instants = mine.edges + problem.offsets(self.best.x)[k]
+                u = jnp.asarray(self.best.x[None, : problem.size])
+                width = float(mine.edges[1] - mine.edges[0])
+                found = np.diff(np.asarray(_integrals(problem, k, u, instants, eventful=True))[0], axis=0) / width
                 # Rounding of both ways; an event leaves a trace that is larger by far.
-                if not np.allclose(without, through, rtol=0, atol=1e-7 * np.ptp(without)):
+                if not np.allclose(found, self.best.models[k], rtol=0, atol=1e-6 * np.ptp(found)):
                     return False
         return True
 
@@ -510,7 +542,7 @@ class _Fit:
             else:
                 means, sigma = np.asarray(mine.means), np.asarray(mine.sigma)
                 explained = np.sum((means / sigma) ** 2) - np.sum(((means - model) / sigma) ** 2)
-            if explained > SIGNIFICANT * (len(self.best) + mine.fitted_by_elimination):
+            if explained > SIGNIFICANT * (len(self.best.x) + mine.fitted_by_elimination):
                 return True
         return False
 
@@ -526,6 +558,11 @@ class _Fit:
         pairs = zip(self.recordings, self.problem.misfits, strict=True)
         stated = any(r.noise is not None or isinstance(m, CycleMisfit) for r, m in pairs)
         return stated and misfit > 2.0
+
+
+@eqx.filter_jit
+def _values_and_slopes(parameters: FreeParameters, u: Float[Array, " k"]):
+    return parameters.values(u), jnp.diagonal(jax.jacfwd(parameters.values)(u))
 
 
 def _covariance(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -549,6 +586,13 @@ def _distinct(candidates: np.ndarray) -> np.ndarray:
         if not any(np.allclose(candidate, other, atol=1e-2) for other in kept):
             kept.append(candidate)
     return np.array(kept)
+
+
+def _rate(scene: Scene, recording: Recording) -> float:
+    """Blocks per second that tell what the scene can do."""
+    frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
+    rate = BLOCKS_PER_PERIOD * float(frequencies.max())
+    return cycle_rate(recording, scene) if recording.regime == "limit cycle" else rate
 
 
 def _starts(parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int) -> np.ndarray:

@@ -58,13 +58,23 @@ def poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> Poles:
 
 
 def lines(means: Float[Array, "B k"], dt: float, frequency: Float[Array, ""], count: int) -> Complex[Array, "count k"]:
-    r"""Complex amplitudes $c_h$ of $\mathrm{Re}\, c_h e^{2πi h f t}$ for h = 1 … `count`, by least squares."""
+    r"""Complex amplitudes $c_h$ of $\mathrm{Re}\, c_h e^{2πi h f t}$ for h = 1 … `count`, by weighted least squares.
+
+    Where the contact closes, accelerations have lines without end. Those above `count`, and what sampling folds down of
+    them between the lines, would leak into the fitted ones; a tapered weight keeps them out.
+    """
     t = dt * jnp.arange(means.shape[0])
     turns = 2 * jnp.pi * frequency * t[:, None] * jnp.arange(1, count + 1)
     waves = jnp.concatenate([jnp.ones_like(t)[:, None], jnp.cos(turns), jnp.sin(turns)], axis=1)
+    weighted = waves.T * taper(means.shape[0])
     # Over several periods the columns are nearly orthogonal, so the normal equations lose nothing.
-    shares = jnp.linalg.solve(waves.T @ waves, waves.T @ means)
+    shares = jnp.linalg.solve(weighted @ waves, weighted @ means)
     return shares[1 : count + 1] - 1j * shares[count + 1 :]
+
+
+def taper(count: int) -> Float[np.ndarray, " count"]:
+    """A weight over evenly spaced instants whose spectrum falls off fast: from the fourth line on below a thousandth."""
+    return np.hanning(count) ** 2
 
 
 def fundamental(means: Float[Array, "B k"], dt: float, count: int, lowest: float, highest: float) -> Float[Array, ""]:

@@ -7,7 +7,9 @@ follows the trajectory's guards and says how close it comes to that.
 
 At an event a guard $g$ crosses zero with slope $\dot g$; it would turn back at a depth of $\dot g^2 / (2 |\ddot g|)$ (to
 second order). Between events it may come down to a smallest value and recover. Both, relative to the largest size of that
-guard on the trajectory, say how far the event is from vanishing, or a new one from appearing.
+guard on the trajectory, say how far the event is from vanishing, or a new one from appearing. Two events at one instant,
+or one on a jump of the load or at the very end, would swap their order; a friction cone that an impact or a contact at
+rest just touches would be left. How far these are is looked at likewise.
 """
 
 from collections.abc import Callable, Iterable
@@ -36,6 +38,12 @@ GUARDS = {
     (Status.SLIDE, 1): "the slip running out",
     (Status.DETACH, 0): "the gap closing",
 }
+# What an event decides beside itself, and what a decision by a hair says.
+DECISIONS = (
+    "an impact at the edge of the friction cone, where it either ends slip or does not",
+    "the slip running out at the edge of the friction cone, where the contact either sticks or slips back",
+    "sliding that begins without a normal force",
+)
 
 
 class Derivatives(eqx.Module):
@@ -135,7 +143,7 @@ def derivatives(
 @eqx.filter_jit
 def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
     def of(values):
-        value = functional(simulate(scene.replace(**values), t1, dt_save, method, y0=y0))
+        value = functional(simulate(scene.replace(**values), t1, dt_save, method, y0=y0, derivatives=mode))
         return value, value
 
     jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
@@ -164,9 +172,11 @@ def _closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> _Call
     ends = [*jumps, t1]
     y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
     largest: dict = {}
-    calls, events = [], 0
+    # Distances by guard, in its own unit, and decisions, which are relative already.
+    calls, decisions, events = [], [], 0
     for end in ends:
         load = scene.load(jnp.asarray(0.5 * (t + end)))
+        begin = t
         while t < end:
             look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
             status = int(contact.status)
@@ -174,24 +184,38 @@ def _closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> _Call
             # Detached before and after, but put on the belt in between: a rebound.
             bounced = status == Status.DETACH == int(look.contact.status) and look.y[normal] == 0
             fired = status != int(look.contact.status) or bool(look.turned) or bounced
-            relevant = range(1 if status == Status.DETACH else 2)
+            # A guard that is zero but for rounding of what it is a sum of is none: friction without a coefficient.
+            relevant = [k for k in range(2) if np.abs(look.guards[:, k]).max() > 1e-12 * look.size[k]]
+            relevant = relevant[:1] if status == Status.DETACH else relevant
             for which in relevant:
                 guard, key = look.guards[:, which], (status, which)
                 largest[key] = max(largest.get(key, 0.0), float(np.abs(guard).max()))
                 turns = np.flatnonzero(look.turns[:, which])
                 calls += [(key, float(look.lowest[i, which]), t + float(look.h) * i / LOOKS) for i in turns]
-            if fired:
+                # What a jump of the load leaves of a guard: next to nothing, and it might as well be less than that.
+                if 0 < t == begin:
+                    calls.append((key, abs(float(guard[0])), t))
+            at = t + float(look.h)
+            if fired and relevant:
                 # What ran out is the guard that is nearest to zero at the end, in units of its size.
                 which = min(relevant, key=lambda k: abs(look.guards[-1, k]) / max(largest[status, k], 1e-300))
+                # One that a jump of the load used up was passed by far, not turned round.
+                passed = abs(float(look.guards[0, which])) if look.h == 0 else 0.0
                 depth = float(look.slope[which] ** 2 / (2 * max(abs(look.bend[which]), 1e-300)))
-                calls.append(((status, which), depth, t + float(look.h)))
+                calls.append(((status, which), max(depth, passed), at))
+                # The others at that instant: were one of them zero as well, either might be the first.
+                calls += [((status, k), abs(float(look.guards[-1, k])), at) for k in relevant if k != which]
+                decisions += [(float(margin), at, DECISIONS[k]) for k, margin in enumerate(look.decisions)]
                 events += 1
-            t = end if look.h >= end - t else t + float(look.h)
+            elif look.h >= end - t:
+                # An event on the jump of the load, or at the end, has it on either side of it.
+                calls += [((status, k), abs(float(look.guards[-1, k])), at) for k in relevant]
+            t = end if look.h >= end - t else at
             y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
             if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not fired):
                 return _Calls(events, 0.0, t, "the motion stopping to be finite")
     closest = [(value / max(largest[key], 1e-300), at, GUARDS[Status(key[0]), key[1]]) for key, value, at in calls]
-    return _Calls(events, *min(closest, default=(float("inf"), float("nan"), "none")))
+    return _Calls(events, *min(closest + decisions, default=(float("inf"), float("nan"), "none")))
 
 
 class _Look(eqx.Module):
@@ -206,6 +230,10 @@ class _Look(eqx.Module):
     lowest: Float[Array, "l 2"]  # that value
     slope: Float[Array, "2"]  # of the guards at the end, per s, and per s²
     bend: Float[Array, "2"]
+    size: Float[Array, "2"]  # of the terms that the guards are sums of
+    decisions: Float[
+        Array, "3"
+    ]  # how clearly what follows was decided at the end, relative; infinite if it was not asked
 
 
 @eqx.filter_jit
@@ -235,4 +263,38 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
     turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
     turned = turned & (after.contact.status == Status.SLIDE)
-    return _Look(after.y, after.contact, after.h, turned, value, near, lowest, slope[-1], bend[-1])
+    size, _ = physics.magnitudes(mechanics, contact, load, jnp.max(jnp.abs(states), axis=0))
+    decisions = _decisions(mechanics, contact, load, states[-1], after.contact, after.y)
+    return _Look(after.y, after.contact, after.h, turned, value, near, lowest, slope[-1], bend[-1], size, decisions)
+
+
+def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: Contact, after) -> Float[Array, "3"]:
+    """Margins of the questions that an event asks, in the order of `DECISIONS`: the friction cone at an impact, the
+    friction cone at rest on the belt, and the pressing force where it goes on to slide."""
+    n = before.shape[0] // 2
+    landed = (contact.status == Status.DETACH) & (following.status != Status.DETACH)
+    # An impulse takes the place of a force, and changes of velocity that of accelerations.
+    demanded = jnp.zeros(n).at[mechanics.tangential].set(physics.relative_velocity(mechanics, before))
+    demanded = demanded.at[mechanics.normal].set((1 + mechanics.restitution) * before[n + mechanics.normal])
+    dragged = mechanics.friction(jnp.abs(physics.relative_velocity(mechanics, before)))
+    at_impact = _margin(dragged, *physics.sticking_forces(mechanics, demanded))
+    by_impulse = landed & (mechanics.impact_law == "coulomb")
+    came_to_rest = (contact.status != Status.STICK) & (physics.relative_velocity(mechanics, after) == 0)
+    holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, after))
+    at_rest = _margin(mechanics.friction.static, *holding)
+    pressed = physics.guards(mechanics, following, load, after)[0]
+    terms, _ = physics.magnitudes(mechanics, following, load, jnp.abs(after))
+    slides = (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
+    return jnp.stack(
+        [
+            jnp.where(by_impulse, at_impact, jnp.inf),
+            jnp.where(came_to_rest & (following.status != Status.DETACH), at_rest, jnp.inf),
+            jnp.where(slides, jnp.abs(pressed) / jnp.where(terms[0] > 0, terms[0], 1.0), jnp.inf),
+        ]
+    )
+
+
+def _margin(mu, tangential, normal) -> Float[Array, ""]:
+    """How far a force is from the edge of the friction cone, relative; infinite without friction and without force."""
+    room, need = mu * jnp.abs(normal), jnp.abs(tangential)
+    return jnp.where(room + need > 0, jnp.abs(room - need) / jnp.where(room + need > 0, room + need, 1.0), jnp.inf)

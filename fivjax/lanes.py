@@ -180,6 +180,8 @@ def follow(
             y,
             changed,
             peak,
+            t,
+            modes.slowest_decay,
             resolution,
         )
         return Lane(

@@ -19,13 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from . import features
-from .contact import Mechanics, Status
-from .load import ConstantLoad
+from .contact import Mechanics, Status, status_from_forces
 from .scene import Scene, steady_sliding
-from .signals import Averaged, Channel, Recording
+from .signals import Averaged, Channel, Recording, averaged
 from .simulate import states_at
 from .sliding import linear_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper
+from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding
 
 # What stands for a motion that is not finite: bad enough never to be chosen, small enough to square.
 HOPELESS = 1e6
@@ -38,6 +37,8 @@ OFFSET_UNIT = 1e-3
 SETTLING_PERIODS = 80
 CYCLE_PERIODS = 30
 MOST_HARMONICS = 8
+# Blocks per period: many, because landings are short; the least and the most.
+CYCLE_BLOCKS = (28, 48)
 
 
 class AbstractMisfit(eqx.Module):
@@ -146,59 +147,61 @@ class CycleMisfit(AbstractMisfit):
     method: AbstractStepper
     width: Float[Array, ""]  # of a block, s
     frequency: Float[Array, ""]  # Hz, as measured
-    timed: bool = eqx.field(static=True)  # whether any fraction was measured
     blocks: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
     fitted_by_elimination: int = eqx.field(static=True, default=0)
 
     def coarse(self, scene):
-        found = self._features(self._orbit(scene)[0]) / self.measured[1]
-        expected = self.measured / self.measured[1]
-        # Frequency to a per mille, lines to 5 % of the largest.
-        error = jnp.full(found.shape, 0.05).at[0].set(1e-3 * expected[0])
-        return _finite((expected - found) / error)
+        return self._roughly(*self._orbit(scene))
 
     def residual(self, scene, offset, share):
         means, fractions = self._orbit(scene)
         lines = self.whitening @ (self.measured - self._features(means))
-        return _finite(jnp.concatenate([lines, (self.fractions[:, 0] - fractions) / self.fractions[:, 1]])), means
+        exactly = _finite(jnp.concatenate([lines, (self.fractions[:, 0] - fractions) / self.fractions[:, 1]]))
+        return jnp.where(share < 1, self._roughly(means, fractions), exactly), means
+
+    def _roughly(self, means, fractions):
+        """The same features, with errors that are those of a guess."""
+        found = self._features(means) / self.measured[1]
+        expected = self.measured / self.measured[1]
+        # Frequency to a per mille, lines to 5 % of the largest, fractions of time to 5 % of it all.
+        error = jnp.full(found.shape, 0.05).at[0].set(1e-3 * expected[0])
+        times = (self.fractions[:, 0] - fractions) / jnp.maximum(self.fractions[:, 1], 0.05)
+        return _finite(jnp.concatenate([(expected - found) / error, times]))
 
     def _features(self, means):
         return features.harmonics(means, self.width, self.count, 0.6 * self.frequency, 1.6 * self.frequency)
 
     def _orbit(self, scene) -> tuple[Float[Array, "b k"], Float[Array, "2"]]:
+        """Block means on the orbit that it settles on, and the fractions of their time spent sticking and detached."""
         scene = scene.replace(**self.known)
+        mechanics, load = Mechanics(scene), scene.load.final
         n, tangential = scene.structure.size, scene.structure.tangential
-        q, _ = steady_sliding(scene, scene.load.final)
+        q, _ = steady_sliding(scene, load)
         # A kick almost as fast as the belt: outside everything that dies out.
         y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + tangential].set(0.9 * scene.belt_speed)
-        scene = eqx.tree_at(lambda s: s.load, scene, ConstantLoad(scene.load.final))
-        begin = SETTLING_PERIODS / self.frequency
-        instants = jnp.concatenate([jnp.zeros(1), begin + self.width * jnp.arange(self.blocks + 1)])
-        y, contacts, _ = states_at(scene, self.method, y0, instants, MOST_ADVANCES)
-        means = jnp.diff(_integrals(y[1:], self.channels), axis=0) / self.width
-        if not self.timed:
-            return means, jnp.zeros(2)
-        return means, self._spent(scene, y[1], jax.tree.map(lambda leaf: leaf[1], contacts))
-
-    def _spent(self, scene, y, contact) -> Float[Array, "2"]:
-        """Fractions of time sticking and detached over the periods looked at."""
-        mechanics, load = Mechanics(scene), scene.load(jnp.zeros(()))
-        span = self.blocks * self.width
         codes = jnp.array([Status.STICK, Status.DETACH])
 
-        def body(carry):
-            y, contact, left, spent = carry
-            after = self.method.advance(mechanics, contact, load, y, jnp.minimum(left, self.method.dt))
-            spent = spent + jnp.where(contact.status == codes, after.h, 0.0)
-            return after.y, after.contact, left - after.h, spent
+        def spend(spent, contact, y, after):
+            return spent + jnp.where(contact.status == codes, after.h, 0.0)
 
-        def going(carry):
-            return carry[2] > 1e-12 * span
+        def to_next(carry, h):
+            y, contact, spent = carry
+            y, contact, spent, reached = advance_adding(
+                self.method, mechanics, contact, load, y, h, MOST_ADVANCES, spent, spend, "lax"
+            )
+            y = jnp.where(reached, y, jnp.nan)
+            return (y, contact, spent), (y, spent)
 
-        start = (y, contact, jnp.asarray(span), jnp.zeros(2))
-        return jax.lax.while_loop(going, body, start)[3] / span
+        settling = SETTLING_PERIODS / self.frequency
+        spans = jnp.concatenate([settling[None], jnp.full(self.blocks, self.width)])
+        start = (y0, status_from_forces(mechanics, load, y0), jnp.zeros(2))
+        _, (y, spent) = jax.lax.scan(to_next, start, spans)
+        means = jnp.diff(_integrals(y, self.channels), axis=0) / self.width
+        # Tapered, because it need not be a whole number of periods.
+        weights = jnp.hanning(self.blocks)
+        return means, weights @ jnp.diff(spent, axis=0) / (jnp.sum(weights) * self.width)
 
 
 def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
@@ -206,7 +209,7 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
     q, _ = steady_sliding(scene, scene.load.force)
     y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
-    y, *_ = states_at(scene, method, y0, instants, MOST_ADVANCES)
+    y, *_ = states_at(scene, method, y0, instants, MOST_ADVANCES, derivatives="forward")
     return y[1:]
 
 
@@ -342,30 +345,81 @@ def misfit(
     return KickMisfit(**common, method=method, uneventful=uneventful)
 
 
-def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
+def _fundamental(means, width: float, lowest: float, highest: float, count: int) -> float:
+    # As arrays, so that another recording finds it compiled.
+    return float(_compiled_fundamental(means, jnp.asarray(width), count, jnp.asarray(lowest), jnp.asarray(highest)))
+
+
+_compiled_fundamental = eqx.filter_jit(features.fundamental)
+
+
+def _left_by_lines(means: np.ndarray, width: float, frequency: float, count: int) -> np.ndarray:
+    """What harmonics of this frequency do not explain."""
+    turns = 2 * np.pi * frequency * width * np.outer(np.arange(len(means)), np.arange(1, count + 1))
+    waves = np.concatenate([np.ones((len(means), 1)), np.cos(turns), np.sin(turns)], axis=1)
+    return means - waves @ np.linalg.lstsq(waves, means, rcond=None)[0]
+
+
+@eqx.filter_jit
+def _features_with_slopes(means, width, lowest, highest, count: int):
+    def features_of(means):
+        return features.harmonics(means, width, count, lowest, highest)
+
+    return features_of(means), jax.jacrev(features_of)(means)
+
+
+def cycle_rate(recording: Recording, scene: Scene) -> float:
+    """Blocks per second for a limit cycle, so many to a period that what averaging folds down lies between its lines."""
+    blocks = averaged(recording, 16 * _sliding_frequencies(scene, recording).max())
     width = float(blocks.edges[1] - blocks.edges[0])
-    # The fundamental lies about where the sliding modes do; a start 30 % off in a spring is 16 % off in frequency.
+    samples = recording.rate / _first_frequency(recording, blocks.means, width, scene)
+    choices = np.arange(max(1, int(samples / CYCLE_BLOCKS[1])), max(2, int(samples / CYCLE_BLOCKS[0]) + 1))
+    return recording.rate / float(choices[np.argmin([_folded(samples / choice) for choice in choices])])
+
+
+def _folded(per_period: float) -> float:
+    """How much of the lines around each multiple of the block rate is taken for fitted lines, in units of a flat spectrum.
+
+    Averaging leaves a share h/(m r) of what lies next to m times the rate of r blocks per period, for the line h; the
+    taper keeps out what is folded down far enough from it.
+    """
+    m = np.arange(1, 13)
+    aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
+    t = np.linspace(0, 1, 401)
+    taper = features.taper(len(t))
+    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ taper) / taper.sum()
+    return float(np.sum(seen * MOST_HARMONICS / (m * per_period)))
+
+
+def _sliding_frequencies(scene: Scene, recording: Recording) -> np.ndarray:
     modes = np.linalg.eigvals(np.asarray(linear_sliding(scene.replace(**recording.known)).matrix))
     modes = np.abs(modes.imag) / (2 * np.pi)
-    modes = modes[modes > 0]
+    return modes[modes > 0]
+
+
+def _first_frequency(recording: Recording, means: np.ndarray, width: float, scene: Scene) -> float:
+    """The fundamental, sought where the sliding modes are: a start 30 % off in a spring is 16 % off in frequency."""
+    modes = _sliding_frequencies(scene, recording)
+    return _fundamental(jnp.asarray(means), width, 0.6 * modes.min(), 1.6 * modes.max(), 1)
+
+
+def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> CycleMisfit:
+    width = float(blocks.edges[1] - blocks.edges[0])
     means = jnp.asarray(blocks.means)
-    frequency = float(features.fundamental(means, width, 1, 0.6 * modes.min(), 1.6 * modes.max()))
+    frequency = _first_frequency(recording, blocks.means, width, scene)
     count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
     limits = (0.6 * frequency, 1.6 * frequency)
-    frequency = float(features.fundamental(means, width, count, *limits))
-    found = np.asarray(features.lines(means, width, frequency, count))
-    t = width * np.arange(len(blocks.means))
-    waves = np.exp(2j * np.pi * frequency * np.outer(t, np.arange(1, count + 1)))
-    left = blocks.means - blocks.means.mean(axis=0) - (waves @ found).real
+    frequency = _fundamental(means, width, *limits, count)
+    left = _left_by_lines(blocks.means, width, frequency, count)
     if recording.noise is None:
         # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
         sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / (len(left) - 2 * count - 1)))
 
-    def measure(values):
-        return features.harmonics(values, width, count, *limits)
-
     # How the noise of every sample reaches every feature, to first order.
-    jacobian = np.asarray(jax.jit(jax.jacrev(measure))(means)).reshape(-1, *means.shape)
+    # As arrays, so that another recording finds it compiled.
+    low, high = jnp.asarray(limits[0]), jnp.asarray(limits[1])
+    measured, jacobian = _features_with_slopes(means, jnp.asarray(width), low, high, count)
+    jacobian = np.asarray(jacobian)
     covariance = np.einsum("abk,cbk,k->ac", jacobian, jacobian, sigma**2)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
@@ -373,14 +427,14 @@ def _cycle(recording, blocks: Averaged, method, known, sigma, scene: Scene) -> C
         means=means,
         sigma=jnp.asarray(sigma),
         known=known,
-        measured=measure(means),
+        measured=measured,
         whitening=jnp.asarray(whitening),
         fractions=jnp.asarray(fractions),
-        timed=bool(np.any(np.isfinite(fractions[:, 1]))),
         method=method,
         width=jnp.asarray(width),
         frequency=jnp.asarray(frequency),
-        blocks=int(min(len(blocks.means), np.ceil(CYCLE_PERIODS / (width * frequency)))),
+        # In tens, so that recordings of nearly the same frequency share what is compiled.
+        blocks=int(min(len(blocks.means), 10 * np.ceil(0.1 * CYCLE_PERIODS / (width * frequency)))),
         count=count,
         channels=recording.channels,
     )

@@ -5,7 +5,8 @@ lag again and again, with contact events in between and without drifting off. Tw
 
 - *tight*: the states are the same to within the method's error, as on a periodic orbit;
 - *loose*: the state went away and came back close. Above 1.7 m/s the paper's limit cycle is not periodic: it winds
-  around a torus, its amplitude beats over some 14 periods of 68 Hz for ever, and no two crossings are the same.
+  around a torus, its amplitude beats over some 14 periods of 68 Hz for ever, and no two crossings are the same. So do
+  impacts that die out slowly in a structure that is hardly damped; loose returns have to go on for long enough to tell.
 
 Merely being close to an earlier state proves nothing. Right at the critical perturbation trajectories linger near an
 unstable cycle for seconds, almost periodic, before they decide. They stay close without going away, so they are no loose
@@ -28,6 +29,8 @@ LOOSE_DISTANCE = 0.02
 LOOSE_SHARE = 0.15
 LOOSE_SPAN = 16
 ROOM = 1.5
+# Loose returns go on for so long that what is not sustained would have decayed by this much: more than they may be apart.
+DECAYED = 0.2
 # Loose returns each this much further than the one before drift off; on a torus they scatter, or stay the same.
 DRIFT = 0.02
 
@@ -49,6 +52,8 @@ class Orbit(eqx.Module):
     changes: Int[Array, ""]  # status changes since the anchor was set
     lag: Int[Array, ""]  # crossings per return; 0 while none is known
     returns: Int[Array, ""]  # returns in a row at that lag
+    since: Float[Array, ""]  # when the first of these returns set out, s
+    set_out: Float[Array, ""]  # when the anchor was set, s
     first_distance: Float[Array, ""]  # of the first of these returns, relative
     last_distance: Float[Array, ""]  # of the last of them
     rising: Bool[Array, ""]  # each of them further than the one before
@@ -68,6 +73,8 @@ def new_orbit(y: State) -> Orbit:
         changes=none,
         lag=none,
         returns=none,
+        since=zero,
+        set_out=zero,
         first_distance=zero,
         last_distance=zero,
         rising=jnp.zeros((), bool),
@@ -87,12 +94,15 @@ def observe(
     after: State,
     changed: Bool[Array, ""],
     peak: Float[Array, ""],
+    t: Float[Array, ""],
+    decay: Float[Array, ""],
     resolution: Resolution,
 ) -> Orbit:
     """The orbit's memory after one more step, from the state `before` it to the state `after` it.
 
     `weights` make displacements and velocities comparable; distances are relative to that from `equilibrium`. `changed`
-    says whether the status changed in the step, `peak` is the largest tangential speed in it.
+    says whether the status changed in the step, `peak` is the largest tangential speed in it, `t` is the time at its end,
+    and `decay` the slowest rate (1/s) at which a vibration decays that nothing sustains.
     """
     tangential_velocity = before.shape[0] // 2 + tangential
     speed = before[tangential_velocity], after[tangential_velocity]
@@ -122,7 +132,9 @@ def observe(
     lag = jnp.where(found, crossings, jnp.where(lost, 0, orbit.lag))
     span = jnp.where(loose, LOOSE_SPAN, resolution.span)
     needed = jnp.maximum(LEAST_RETURNS, -(-span // jnp.maximum(lag, 1)))
-    complete = again & (returns >= needed)
+    # A vibration that merely decays slowly comes back loosely, too.
+    sustained = (t - orbit.since) * decay >= DECAYED
+    complete = again & (returns >= needed) & (~loose | sustained)
     # Below a hundredth of the method's error there is nothing left to drift.
     further = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
     rising = jnp.where(again, orbit.rising & (distance > (1 + DRIFT) * orbit.last_distance), orbit.rising)
@@ -142,6 +154,8 @@ def observe(
         changes=jnp.where(new_anchor, 0, changes),
         lag=lag,
         returns=jnp.where(restart, 1, returns),
+        since=jnp.where(restart, orbit.set_out, orbit.since),
+        set_out=jnp.where(new_anchor, t, orbit.set_out),
         first_distance=jnp.where(restart, distance, orbit.first_distance),
         last_distance=jnp.where(found | again, distance, orbit.last_distance),
         rising=restart | rising,

@@ -121,7 +121,7 @@ def _advance(
 
     velocity = n + mechanics.tangential
 
-    def follow() -> tuple[Contact, Float[Array, "2n l"], Float[Array, " l"]]:
+    def follow() -> tuple[Float[Array, " l"], tuple[Contact, Float[Array, "2n l"]]]:
         reached = series.state(share)
         rows = jnp.arange(2 * n)[:, None]
         reached = jnp.where(rows >= n, reached / prepared.interval, reached)
@@ -455,8 +455,8 @@ def _first_root(
         open_, which, root, _, tries = carry
         mine = index == which
         guess, high = _chosen(brackets.guess, which), jnp.minimum(_chosen(brackets.end, which), root)
-        solved = _stage(lambda: _chosen_polynomial(series, brackets, which), (zeros_like_c, which))
-        root = _polished(*solved, jnp.minimum(guess, high), high, root, open_)
+        c, zeros = _stage(lambda: _chosen_polynomial(series, brackets, which), (zeros_like_c, which))
+        root = _polished(c, zeros, jnp.minimum(guess, high), high, root, open_)
 
         def compare():
             # A dip is over where its bracket ends.

@@ -18,7 +18,8 @@ from .event_exact import EventExact
 from .precision import in_double_precision, is_known, known_to_numpy, real
 from .results import labelled
 from .scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
-from .steppers import MOST_ADVANCES, AbstractStepper, advance_adding, rates
+from .span import MODES, Begin, go_on
+from .steppers import MOST_ADVANCES, AbstractStepper, rates
 from .verdict import ENDING, Ending
 
 # Rows that a trajectory may have: some 20 GB of them.
@@ -86,6 +87,7 @@ def simulate(
     *,
     y0=None,
     energy: bool = False,
+    derivatives: str = "both",
 ) -> Trajectory:
     """The response of a scene from t = 0 to `t1`.
 
@@ -98,6 +100,8 @@ def simulate(
     - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
       equilibrium at rest unless given.
     - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
+    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward" or "reverse". In one mode alone it
+      is faster, `jax.grad` about ten times. It matters only inside a transformation.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
     being finite, or contact events come without end, the rows from there on are NaN; `run.outcome` (an `Ending`) and
@@ -112,6 +116,7 @@ def simulate(
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)
+    arguments.one_of("derivatives", derivatives, MODES)
     refuse_painleve(scene)
     rows = math.ceil(t1 / dt_save - 1e-9)
     if rows > MOST_ROWS:
@@ -123,7 +128,10 @@ def simulate(
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
     saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    rows = jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most, bool(energy)))
+    # What is known has no derivatives.
+    if all(map(is_known, jax.tree.leaves((scene, method, y0, saved)))):
+        derivatives = "forward"
+    rows = jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most, bool(energy), derivatives))
     return Trajectory(**rows, scene=scene, outcome=_ending(scene, method, rows, most))
 
 
@@ -163,11 +171,17 @@ def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: 
 
 @eqx.filter_jit
 def _simulate(
-    scene: Scene, method: AbstractStepper, y0: State, saved: Float[Array, " T"], most: int, energy: bool
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    saved: Float[Array, " T"],
+    most: int,
+    energy: bool,
+    derivatives: str,
 ) -> dict:
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
-    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books)
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, derivatives)
     # What follows a number that was not reached is none either, also where the contact would hold it at zero.
     reached = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
     y = jnp.where(reached[:, None], y, jnp.nan)
@@ -206,12 +220,13 @@ def states_at(
     instants: Float[Array, " T"],
     most: int,
     books: Books | None = None,
+    derivatives: str = "both",
 ) -> tuple[Float[Array, "T 2n"], Contact, Ledger | None]:
     """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
     where `most` advances between two of them were not enough.
 
-    Differentiable in both modes, in the instants and in the load's jumps too. In reverse mode only the states at the
-    instants are kept; what lies between is computed again.
+    Differentiable in the instants and in the load's jumps too; in "both" modes, or faster in "forward" or "reverse" mode
+    alone. In reverse mode only the states at the instants are kept; what lies between is computed again.
     """
     mechanics = Mechanics(scene)
     # Steps end on the load's jumps as well as on the instants.
@@ -229,11 +244,8 @@ def states_at(
         # the motion under the load just before the jump.
         before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
         drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
-
-        def enter(ledger, contact, y, after):
-            return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
-
-        moved, following, ledger, reached = advance_adding(method, mechanics, contact, load, y, h, most, ledger, enter)
+        begin = Begin(mechanics, contact, load, y, h, ledger, books)
+        moved, following, ledger, reached = go_on(begin, method, most, derivatives)
         # A number that was not reached is no number; counts stay what they are.
         moved, ledger = jax.tree.map(
             lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
@@ -244,7 +256,7 @@ def states_at(
     contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
     ledger0 = None if books is None else accounts.open_ledger(books, y0)
     # Inside a scan nothing can be merged across the checkpoint anyway.
-    step = jax.checkpoint(to_next, prevent_cse=False)
+    step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
     _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
     rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
 

@@ -36,6 +36,7 @@ class LinearSliding(eqx.Module):
 
     equilibrium: Float[Array, " 2n"]  # the state about which the deviation z is measured
     matrix: Float[Array, "m m"]
+    frictionless: Float[Array, "m m"]  # the same without friction
     pressing: Float[Array, " m"]  # row: how z changes the pressing acceleration, the free one towards the belt
     pressing_margin: Float[Array, ""]  # its size at equilibrium, m/s²
     slip: Float[Array, " m"]  # row: how z changes the slip speed
@@ -81,6 +82,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     return LinearSliding(
         equilibrium=equilibrium,
         matrix=jax.jacfwd(rates)(rest),
+        frictionless=_frictionless(scene),
         pressing=jax.grad(pressing)(rest),
         pressing_margin=pressing(rest),
         slip=jax.grad(slip)(rest),
@@ -104,6 +106,7 @@ class SlidingModes(eqx.Module):
     slip: Complex[Array, " k"]
     remainder: Complex[Array, " k"]
     envelope: "Envelope"
+    slowest_decay: Float[Array, ""]  # of the structure on a belt without friction, 1/s; negative where it grows
     stable: Bool[Array, ""]
 
 
@@ -147,8 +150,24 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
         remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
+        slowest_decay=_slowest_decay(linear.frictionless),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
+
+
+def _frictionless(scene: Scene) -> Float[Array, "m m"]:
+    """Rates of what sliding leaves free, without friction: whatever sustains a vibration, this damps it."""
+    structure = scene.structure
+    free = np.array([i for i in range(structure.size) if i != structure.normal])
+    block = np.ix_(free, free)
+    right = -jnp.concatenate([structure.stiffness[block], structure.damping[block]], axis=1)
+    below = jnp.linalg.solve(structure.mass[block], right)
+    return jnp.concatenate([jnp.eye(2 * len(free), dtype=right.dtype)[len(free) :], below])
+
+
+def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
+    finite = np.all(np.isfinite(matrix), axis=(-2, -1))
+    return np.where(finite, -np.max(np.linalg.eigvals(np.where(finite[:, None, None], matrix, 0)).real, axis=-1), 0.0)
 
 
 def _clusters(eigenvalues: np.ndarray) -> np.ndarray:

@@ -130,8 +130,12 @@ def advance_adding(
     most: int,
     total: Total,
     add: Callable[[Total, Contact, State, Advance], Total],
+    kind: str = "bounded",
 ) -> tuple[State, Contact, Total, Bool[Array, ""]]:
-    """`advance_by`, with a `total` to which `add` adds what each advance contributes, from its start and what it reached."""
+    """`advance_by`, with a `total` to which `add` adds what each advance contributes, from its start and what it reached.
+
+    `kind` of loop: "bounded" can be differentiated in both modes; "lax" in forward mode only, and costs less.
+    """
 
     def body(carry):
         y, contact, left, total = carry
@@ -142,7 +146,8 @@ def advance_adding(
         total = add(total, contact, y, after)
         return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
 
+    start = (y, contact, jnp.asarray(h, y.dtype), total)
     y, contact, left, total = eqx.internal.while_loop(
-        lambda carry: carry[2] > 0, body, (y, contact, jnp.asarray(h, y.dtype), total), max_steps=most, kind="bounded"
+        lambda carry: carry[2] > 0, body, start, max_steps=most, kind=kind
     )
     return y, contact, total, left <= 0

@@ -56,3 +56,10 @@ def off(scene: fj.Scene, names, seed: int, share: float = 0.3) -> fj.Scene:
     """The scene with each of these parameters 30 % too high or too low."""
     signs = np.random.default_rng(1000 + seed).choice([-1.0, 1.0], len(names))
     return scene.replace(**{n: float(scene.parameters[n]) * (1 + share * s) for n, s in zip(names, signs, strict=True)})
+
+
+def times(scene) -> dict[str, float]:
+    """Fractions of time sticking and detached on the limit cycle."""
+    run = fj.simulate(scene, 3.0, 2e-5, y0=(fj.sliding_equilibrium(scene), [-0.9 * float(scene.belt_speed), 0.0, 0.0]))
+    late = run.status[run.t > 2.0]
+    return {"sticking": float(np.mean(late == 0)), "detached": float(np.mean(late == 2))}

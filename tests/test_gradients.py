@@ -41,8 +41,29 @@ def test_reverse_equals_forward_in_the_table():
         expected, _ = measure.differences(scene, t1)
         assert measure.relative(reverse, forward).max() < 1e-10
         assert measure.relative(forward, expected).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_bouncing_mass_and_stick_slip_block_reverse():
     for _, found, expected in measure.closed_forms("reverse"):
         assert measure.relative(found, expected).max() < 1e-10
+
+
+@pytest.mark.slow
+def test_energy_in_reverse_and_a_run_that_may_be_differentiated_both_ways():
+    """The ledger's own derivative takes part in that of a span; JAX's loop without `derivatives` says the same."""
+    scene = measure.paper(p=1.3, start=0.0)
+    with jax.enable_x64(True):
+
+        def loss(mu, derivatives):
+            run = fj.simulate(scene.replace(mu=mu), 0.3, 0.01, energy=True, derivatives=derivatives)
+            return run.energy.work.damping[-1] + run.energy.impact[-1] + jnp.sum(run.velocity[:, 0] ** 2)
+
+        forward = jax.jvp(lambda mu: loss(mu, "forward"), (0.227,), (1.0,))[1]
+        reverse = jax.grad(lambda mu: loss(mu, "reverse"))(0.227)
+        both = jax.grad(lambda mu: loss(mu, "both"))(0.227)
+    assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
+    assert float(both) == pytest.approx(float(forward), rel=1e-10)
 
 
 @pytest.mark.slow
@@ -58,8 +79,14 @@ def test_the_end_of_a_kick_on_a_saved_instant():
     assert float(on_it) == pytest.approx(float(between), rel=1e-9)
 
 
-def last_rate(run):
-    return run.velocity[-1, 1]
+# Whether a derivative exists is no matter of the method's order; a low one compiles faster.
+FEW = fj.EventExact(order=8)
+END = 4.0
+
+
+def existing(scene, y0, t1=END) -> fj.Derivatives:
+    # One functional and one parameter for all, so that they share what is compiled.
+    return fj.derivatives(measure.last_state, scene, ["force"], t1, t1, y0=y0, method=FEW)
 
 
 @pytest.mark.parametrize(("touch", "exist"), [(1e-9, False), (-1e-9, False), (0.3, True), (-0.3, True)])
@@ -68,7 +95,7 @@ def test_a_graze_is_said_to_have_no_derivative(touch, exist):
     velocity after it turns by twice itself with the next digit of F."""
     structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
     scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.ConstantLoad(0.5 * (1.0 + touch)), restitution=1.0)
-    d = fj.derivatives(last_rate, scene, ["force"], 5.0, 5.0, y0=([0.0, 1.0], [0.0, 0.0]))
+    d = existing(scene, ([0.0, 1.0], [0.0, 0.0]))
     assert d.exist is exist
     assert d.events == (1 if touch < 0 else 0)
     assert "the gap closing" in d.reason
@@ -76,8 +103,50 @@ def test_a_graze_is_said_to_have_no_derivative(touch, exist):
     assert d.closest_at == pytest.approx(np.arccos(max(-lift / (1.0 - lift), -1.0)), abs=0.05)
 
 
+@pytest.mark.parametrize(("late", "exist"), [(1e-9, False), (-1e-9, False), (0.1, True), (-0.1, True)])
+def test_two_events_that_swap_order_have_no_derivative(late, exist):
+    """N = 1 + 2 cos t runs out at 2π/3, the slip 1 - r cos(t - b) at that instant or a moment beside it: the next digit
+    of either decides which of the two happens."""
+    # A mass along the belt, and another above it that presses by a spring: N swings on its own.
+    stiffness = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])
+    structure = fj.Structure(np.eye(3), np.zeros((3, 3)), stiffness, [0.0, -1.0, 0.0], tangential=0, normal=2)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 1.0, fj.ConstantLoad(1.0))
+    # x = r sin(t - b), whose speed has grown to that of the belt at this instant.
+    r, ends = 1.5, 2 * np.pi / 3 + late
+    b = ends + np.arccos(1 / r)
+    d = existing(scene, ([-r * np.sin(b), -3.0, 0.0], [r * np.cos(b), 0.0, 0.0]), 2.5)
+    assert d.exist is exist, d.reason
+
+
+@pytest.mark.parametrize(("late", "exist"), [(1e-10, False), (-1e-10, False), (0.1, True), (-0.1, True)])
+def test_an_event_on_a_jump_of_the_load_has_no_derivative(late, exist):
+    """A mass falls onto the belt at the instant at which the load jumps: it lands under the one load or the other."""
+    load = fj.Pulse(1.0, 2.0, start=np.sqrt(2.0) + late, duration=10.0)
+    scene = fj.Scene(point_mass(0.0), fj.Coulomb(0.0), 0.0, load, restitution=0.5)
+    d = existing(scene, ([0.0, 1.0], [0.0, 0.0]), 2.0)
+    assert d.exist is exist, d.reason
+
+
+@pytest.mark.parametrize(("begin", "exist"), [(3.0 - 1e-9, False), (3.0 + 1e-9, False), (2.7, True), (3.3, True)])
+def test_rest_at_the_edge_of_the_friction_cone_has_no_derivative(begin, exist):
+    """A block that swings about μN/k = 1 turns at 2 - x₀ = -1: where friction just holds it, or just does not."""
+    scene = fj.Scene(point_mass(1.0), fj.Coulomb(1.0), 0.0, fj.ConstantLoad(1.0))
+    d = existing(scene, ([begin, 0.0], [0.0, 0.0]))
+    assert d.exist is exist, d.reason
+    if begin == 3.0 - 1e-9:
+        assert "either sticks or slips back" in d.reason
+
+
+@pytest.mark.parametrize(("late", "exist"), [(1e-10, False), (0.1, True)])
+def test_an_event_at_the_very_end_has_no_derivative(late, exist):
+    """The last row is before the impact, or after it."""
+    scene = fj.Scene(point_mass(1.0), fj.Coulomb(0.0), 0.0, fj.ConstantLoad(1.0), restitution=0.5)
+    height = 0.5 * (END - late) ** 2
+    assert existing(scene, ([0.0, height], [0.0, 0.0])).exist is exist
+
+
 def test_quiet_motion_has_derivatives_and_says_so():
-    d = fj.derivatives(lambda run: run.velocity[-1, 0], measure.paper(p=1.0), ["p"], 0.05, 0.05)
+    d = fj.derivatives(measure.last_state, measure.paper(p=1.0), ["p"], 0.05, 0.05, method=FEW)
     assert d.exist and d.events == 0
 
 
@@ -106,8 +175,9 @@ def test_refusals(options, error, fragments):
 def test_a_structure_of_ones_own_takes_part():
     """Parameters of a builder that is not fivjax's are parameters like any other."""
     scene = fj.Scene(point_mass(1.0, 0.1), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
-    d = fj.derivatives(
-        lambda run: run.displacement[-1, 0], scene, ["stiffness", "damping"], 1.0, 1.0, y0=([0.0, 0.0], [0.5, 0.0])
-    )
-    assert d.exist and all(np.isfinite(d[name]) for name in ("stiffness", "damping"))
-    assert jnp.shape(d["damping"]) == ()
+    start = ([0.0, 0.0], [0.5, 0.0])
+    d = fj.derivatives(measure.last_state, scene, ["stiffness", "damping"], 1.0, 1.0, y0=start, method=FEW)
+    assert d.exist and all(np.all(np.isfinite(d[name])) for name in ("stiffness", "damping"))
+    assert jnp.shape(d["damping"]) == (4,)
+    # Slips towards rest about F μ / k; more stiffness holds it back.
+    assert d["stiffness"][0] < 0 and d["damping"][0] < 0

@@ -90,20 +90,22 @@ def test_no_proof_above_the_stability_limit():
     assert not proved(scene, q0 + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
 
 
-def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True):
-    """An orbit that has seen these crossing states, each entered by a step whose velocity rises through zero."""
+def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True, decay=1.0):
+    """When an orbit counts as returned that sees these crossing states, one a second, each entered by a step whose velocity
+    rises through zero.
+    """
     with jax.enable_x64(True):
         resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
         step = jax.jit(
-            lambda orbit, before, after, changed: observe(
-                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, jnp.abs(after[2]), resolution
+            lambda orbit, before, after, changed, t: observe(
+                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, jnp.abs(after[2]), t, decay, resolution
             )
         )
         orbit, when = new_orbit(jnp.zeros(4)), None
         for count, state in enumerate(states):
             after = jnp.asarray(state, float).at[2].set(0.0)
-            orbit = step(orbit, after.at[2].set(-1.0), after, jnp.asarray(events))
-            orbit = step(orbit, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False))
+            orbit = step(orbit, after.at[2].set(-1.0), after, jnp.asarray(events), 1.0 * count)
+            orbit = step(orbit, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False), count + 0.5)
             if when is None and bool(orbit.returned):
                 when = count
         return when
@@ -141,6 +143,25 @@ def test_a_spiral_out_of_an_unstable_cycle_is_no_return():
     assert fed(states) is None
 
 
+def test_what_decays_slowly_comes_back_loosely_and_is_no_limit_cycle():
+    """A beat of an amplitude that nothing sustains: it counts only if the structure's damping would have ended it long ago."""
+    k = np.arange(400)
+    angle, size, scatter = 2 * np.pi * k / 7.0, np.exp(-1e-4 * k), 1e-3 * np.random.default_rng(7).normal(size=400)
+    states = size[:, None] * np.stack(
+        [3 + 0.3 * np.cos(angle) + scatter, 0.3 * np.sin(angle), 0 * angle, 0 * angle], axis=1
+    )
+    assert fed(states, decay=1e-4) is None
+    assert fed(states, decay=1.0) is not None
+
+
 def test_without_contact_events_nothing_is_a_limit_cycle():
     """An undamped sliding oscillation returns too; it is no squeal."""
     assert fed([[1.0, 2.0, 0, 3.0]] * 60, events=False) is None
+
+
+def test_impacts_that_die_out_in_a_structure_hardly_damped_are_no_limit_cycle():
+    """Without friction nothing can squeal; the impacts end after twenty seconds and more than a thousand events."""
+    structure = fj.belt_oscillator(theta=-0.102434, m2=0.04505, k2=30962.2, c1=0.00272133, c2=0.000441476)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 1e4, fj.Pulse(0.506638, 18.2095, 0.00180242), restitution=0.265366)
+    m = fj.bistability_map(scene, p=[18.2095], t_max=40.0, progress=False)
+    assert int(m["verdict"][0]) == fj.Verdict.SLIDING and int(m["contact_events"][0]) > 1000
