@@ -83,6 +83,7 @@ def falling_friction():
     return scene, data
 
 
+@pytest.mark.slow
 def test_friction_that_falls_with_speed_from_two_belt_speeds():
     """One speed tells a slope; two tell the law. Fails if what is known of a run does not reach its own misfit."""
     scene, data = falling_friction()

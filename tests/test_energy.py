@@ -719,6 +719,7 @@ def test_a_map_keeps_the_ledger_of_each_lane(paper_scene):
     assert plain["verdict"].equals(m["verdict"]) and "energy_residual" not in plain
 
 
+@pytest.mark.slow
 def test_the_critical_energy_is_what_the_kick_leaves_at_p_crit(paper_scene):
     """At the end of the critical kick: 36.08 mJ of vibration at 3 m/s, though the load has taken 0.55 mJ out."""
     table = fj.critical_perturbation(

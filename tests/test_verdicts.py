@@ -160,8 +160,8 @@ def test_without_contact_events_nothing_is_a_limit_cycle():
 
 
 def test_impacts_that_die_out_in_a_structure_hardly_damped_are_no_limit_cycle():
-    """Without friction nothing can squeal; the impacts end after twenty seconds and more than a thousand events."""
+    """Without friction nothing can squeal; the impacts end after twenty seconds."""
     structure = fj.belt_oscillator(theta=-0.102434, m2=0.04505, k2=30962.2, c1=0.00272133, c2=0.000441476)
     scene = fj.Scene(structure, fj.Coulomb(0.0), 1e4, fj.Pulse(0.506638, 18.2095, 0.00180242), restitution=0.265366)
     m = fj.bistability_map(scene, p=[18.2095], t_max=40.0, progress=False)
-    assert int(m["verdict"][0]) == fj.Verdict.SLIDING and int(m["contact_events"][0]) > 1000
+    assert int(m["verdict"][0]) == fj.Verdict.SLIDING and float(m["last_event"][0]) > 10
