@@ -2,7 +2,6 @@
 
 import numpy as np
 import xarray as xr
-from scipy.signal import spectrogram as short_time_spectrum
 
 from . import arguments
 from .results import labelled
@@ -36,6 +35,9 @@ def spectrogram(
             f"Argument `window` must hold at least 8 rows and fit into the run, but {window:g} s holds {samples} of "
             f"{len(run.t)} rows."
         )
+    # Half a second to import, which no map should wait for.
+    from scipy.signal import spectrogram as short_time_spectrum
+
     coordinate = run.scene.structure.tangential if coordinate is None else coordinate
     signal = np.asarray(getattr(run, quantity))[:, coordinate]
     frequency, t, power = short_time_spectrum(

@@ -92,6 +92,7 @@ def test_bouncing_mass_comes_to_rest_after_endless_bounces():
     assert np.all(run.normal_force[run.t > rest] == pytest.approx(9.81))
 
 
+@pytest.mark.slow
 def test_where_switched_meets_the_closed_forms_to_first_order():
     """Halving the step halves the error in the resting place and the stick–slip state, and nothing stays below the floor."""
     errors = []
