@@ -217,6 +217,16 @@ def guards_under(
     )
 
 
+def exactly_zero(contact: Contact) -> Bool[Array, "2"]:
+    """Which guards are put at zero exactly where their status begins: slip and gap.
+
+    If these are small, they are small, and not zero but for rounding: a slow belt under a high load has a slip that the
+    motion outgrows a billionfold before it is used up.
+    """
+    sliding, detached = contact.status == Status.SLIDE, contact.status == Status.DETACH
+    return jnp.stack([detached, sliding | detached])
+
+
 def magnitudes(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
 ) -> tuple[Float[Array, "2"], State]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import arguments
 from . import contact as physics
-from .contact import Contact, Mechanics, State, Status
+from .contact import Contact, Mechanics, State
 from .orbit import Resolution
 from .scene import Scene
 from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
@@ -101,10 +101,7 @@ class EventExact(AbstractStepper):
         for guard in guards:
             scaled.append(guard * power)
             power = power * reach
-        # Slip and gap are put at zero exactly where their status begins. If they are small, they are small: a slow belt
-        # under a high load has a slip that the motion outgrows a billionfold before it is used up.
-        sliding, open_ = contact.status == Status.SLIDE, contact.status == Status.DETACH
-        exact = jnp.stack([open_, sliding | open_, jnp.zeros_like(open_)])
+        exact = jnp.append(physics.exactly_zero(contact), False)
         safe, fires = _march_to_roots(
             [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )

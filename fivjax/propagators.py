@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
+from .event_exact import ROUNDING, ROUNDINGS
 from .steppers import Advance
 
 # Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
@@ -31,10 +32,6 @@ INTERVALS = 16
 TURN = 0.35
 # Order of the Taylor series within an interval: TURN^14 / 14! is below rounding.
 ORDER = 13
-# A guard whose first coefficients are this much smaller than those after them starts at zero, but for rounding.
-ROUNDING = (1e-12, 1e-9, 1e-9)
-# Or if they are this many roundings of the terms that they are sums of.
-ROUNDINGS = 64
 # Rebounds shorter than this share of an interval are at rest.
 RESTING = 1e-7
 MOST_ROOT_STEPS = 60
@@ -102,10 +99,8 @@ def _advance(
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
     here = _stacked(mechanics, contact, load, y)
-    # Slip and gap are put at zero exactly where their status begins. If they are small, they are small.
-    sliding, open_ = contact.status == Status.SLIDE, contact.status == Status.DETACH
-    exact = jnp.stack([open_, sliding | open_])
-    window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n)
+    exact = physics.exactly_zero(contact)
+    window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n, mechanics.tangential)
     none = jnp.zeros_like(load)
 
     interval = _stage(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
@@ -175,8 +170,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
     hulls = jnp.einsum("jk,kwgc->jwgc", _bernstein(ORDER), coefficients)[1:]
     values, slopes = guards @ samples, coefficients[1] @ samples
     control = jnp.stack([values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3])
-    velocity = n + mechanics.tangential
-    window = [coefficients[:4], hulls, control, samples[:, :, velocity : velocity + 1], samples[:, :, : 2 * n]]
+    window = [coefficients[:4], hulls, control, samples[:, :, : 2 * n]]
     falling = -orders[:, None, None] * powers[1:, :, mechanics.tangential]
     watched = jnp.concatenate([coefficients, falling[:, :, None]], axis=2)
     series = [watched, jnp.sum(watched, axis=0), powers[:, :, :n]]
@@ -275,22 +269,27 @@ class _Window(eqx.Module):
 
     rows: Float[Array, "r l"]
     sizes: Float[Array, "8 l"]
-    exact: Bool[Array, "2 l"]  # guards that are exactly zero where they are meant to be
+    exact: Bool[Array, "2 l"]  # see `contact.exactly_zero`
     n: int = eqx.field(static=True)
+    tangential: int = eqx.field(static=True)
 
     @property
     def parts(self) -> list[Array]:
         """First coefficients of the guards at the start; control points of their series there; their control points as
-        cubics in each interval; samples of the tangential velocity; samples of the state.
+        cubics in each interval; samples of the state.
         """
-        n_states = (INTERVALS + 1, 2 * self.n)
-        return _parts(self.rows, (4, 2), (ORDER, 2), (3, INTERVALS, 2), (INTERVALS + 1, 1), n_states)
+        return _parts(self.rows, (4, 2), (ORDER, 2), (3, INTERVALS, 2), (INTERVALS + 1, 2 * self.n))
+
+    @property
+    def speed(self) -> Float[Array, "i l"]:
+        """Samples of the tangential velocity."""
+        return self.parts[-1][:, self.n + self.tangential]
 
     def safe_intervals(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
         """How many intervals from the start on are certain to hold no event and no end of the step (`steps` intervals
         off): a polynomial stays positive where its control points are.
         """
-        start, hull, control, speed, _ = self.parts
+        start, hull, control, _ = self.parts
         limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
         safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, lane]
         # In the first interval a guard may start at zero, because its status has just begun.
@@ -299,7 +298,7 @@ class _Window(eqx.Module):
         first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
         index = jnp.arange(INTERVALS)[:, None]
         safe = safe[:, 0] & safe[:, 1] | (index == 0)
-        speed = speed[:, 0]
+        speed = self.speed
         rises = (speed[:-1] < 0) & (speed[1:] >= 0)
         first = _least(jnp.where(safe & ~rises, INTERVALS, index).astype(jnp.int32))
         first = jnp.where(first_safe[0] & first_safe[1], first, 0)
@@ -316,7 +315,7 @@ class _Window(eqx.Module):
 
     def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
         """The largest tangential speed up to the beginning of an interval."""
-        speed = jnp.abs(self.parts[3][:, 0])
+        speed = jnp.abs(self.speed)
         return -_least(jnp.where(jnp.arange(INTERVALS + 1)[:, None] <= interval, -speed, 0.0))
 
 
@@ -325,7 +324,7 @@ class _Series(eqx.Module):
 
     rows: Float[Array, "q l"]
     sizes: Float[Array, "8 l"]
-    exact: Bool[Array, "2 l"]  # guards that are exactly zero where they are meant to be
+    exact: Bool[Array, "2 l"]  # see `contact.exactly_zero`
     n: int = eqx.field(static=True)
 
     @property
@@ -392,10 +391,11 @@ def _start(
 ) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
+    shares = ROUNDING[c.dtype.name]
     zero = jnp.ones_like(size, bool)
     zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
     for k in range(3):
-        share = jnp.where(exact, 0.0, size * ROUNDING[k]) if k == 0 else size * ROUNDING[k]
+        share = jnp.where(exact, 0.0, size * shares[k]) if k == 0 else size * shares[k]
         zero = zero & (jnp.abs(c[k]) <= jnp.maximum(share, limits[k]))
         zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
     return zeros, lead

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
+from .friction import Coulomb
 from .scene import Scene, steady_sliding
 
 # The proof for speed-dependent friction speaks of slip speeds above this share of the belt's.
@@ -59,7 +60,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), direction)
     keep = _sliding_coordinates(n, mechanics.normal)
 
-    def rates(z):
+    def rates(z, mechanics):
         y = equilibrium.at[keep].add(z)
         return jnp.concatenate([y[n:], physics.acceleration(mechanics, contact, load, y)])[keep]
 
@@ -81,8 +82,9 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     )
     return LinearSliding(
         equilibrium=equilibrium,
-        matrix=jax.jacfwd(rates)(rest),
-        frictionless=_frictionless(scene),
+        matrix=jax.jacfwd(rates)(rest, mechanics),
+        # Whatever sustains a vibration, this damps it.
+        frictionless=jax.jacfwd(rates)(rest, eqx.tree_at(lambda m: m.friction, mechanics, Coulomb(0.0))),
         pressing=jax.grad(pressing)(rest),
         pressing_margin=pressing(rest),
         slip=jax.grad(slip)(rest),
@@ -153,16 +155,6 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         slowest_decay=_slowest_decay(linear.frictionless),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
-
-
-def _frictionless(scene: Scene) -> Float[Array, "m m"]:
-    """Rates of what sliding leaves free, without friction: whatever sustains a vibration, this damps it."""
-    structure = scene.structure
-    free = np.array([i for i in range(structure.size) if i != structure.normal])
-    block = np.ix_(free, free)
-    right = -jnp.concatenate([structure.stiffness[block], structure.damping[block]], axis=1)
-    below = jnp.linalg.solve(structure.mass[block], right)
-    return jnp.concatenate([jnp.eye(2 * len(free), dtype=right.dtype)[len(free) :], below])
 
 
 def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
