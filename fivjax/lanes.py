@@ -6,7 +6,6 @@ that a tile of groups. After each round of steps the decided lanes leave, the ot
 filled anew: work is spent only where the verdict is open.
 """
 
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -17,11 +16,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from tqdm.auto import tqdm
 
+from . import attractor as attractors
 from . import contact as physics
 from . import orbit as orbits
+from .attractor import Approach, Attractor
 from .contact import Contact, Mechanics, State
 from .energy import Books, Ledger, enter, exchanged, open_ledger, vibration_energy
 from .event_exact import EventExact
@@ -32,19 +33,20 @@ from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
 from .steppers import AbstractStepper, Advance
+from .structure import Structure
+from .tiles import in_tiles, workers
 from .verdict import Verdict
 from .wedging import Wedge, sticks_forever, wedge
 
-# Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
-TILE_ON_CPU = 128
-LARGE_TILE_ON_CPU = 512
-TILE_ELSEWHERE = 65536
-# Lanes from which on it pays to compile the larger tile.
-MANY = 8192
 # Lanes of a group that stand side by side in a tile: enough to fill a vector unit and to make matrix products pay.
 SIDE_BY_SIDE = 16
 # What a lane that shares nothing costs, in lanes that stand side by side.
 COST_OF_STANDING_ALONE = 4
+# Steps between two looks at how near a lane is to a known limit cycle: about a cycle for the fastest method.
+LOOK_EVERY = 8
+# Rounds after which lanes want to know their limit cycle, and lanes of a group for which it is worth the work.
+KNOWN_FROM = 4
+WORTH_KNOWING = 32
 # Looks at a lane's verdict while its time grows e-fold.
 LOOKS = 8
 # The longest advance that a ledger is asked to enter, s.
@@ -83,6 +85,7 @@ class Lane(eqx.Module):
     orbit: Orbit
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
+    approach: Approach
     verdict: Int[Array, ""]
     account: "Account | None" = None  # where its energy went, when asked for
 
@@ -102,6 +105,7 @@ class Shared(eqx.Module):
     prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
     modes: SlidingModes
     wedge: Wedge
+    attractor: Attractor
 
 
 class Outcome(NamedTuple):
@@ -113,6 +117,19 @@ class Outcome(NamedTuple):
     events: np.ndarray
     last_event: np.ndarray  # s
     energy: dict[str, np.ndarray]  # lines of the ledger by name, J; empty where not asked for
+
+
+class Batch(NamedTuple):
+    """What all lanes of a run have in common, and how they are computed."""
+
+    scene: Scene
+    method: AbstractStepper | Windowed
+    resolution: orbits.Resolution
+    names: tuple[str, ...]  # parameters that make groups
+    history: tuple[str, ...]  # those of the load's history
+    energy: bool
+    width: int  # lanes of a group side by side
+    pool: ThreadPoolExecutor
 
 
 def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
@@ -132,9 +149,17 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
         orbit=orbits.new_orbit(y),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
+        approach=attractors.no_approach(y),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         account=Account(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
     )
+
+
+def released(scene: Scene, lane: Lane, load: Float[Array, ""]) -> Lane:
+    """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks."""
+    q, _ = steady_sliding(scene, load * scene.load.final)
+    at_rest = jnp.concatenate([q, jnp.zeros_like(q)])
+    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (at_rest, jnp.max(scene.load.jumps, initial=0.0)))
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
@@ -154,13 +179,13 @@ def follow(
     prepared,
     modes: SlidingModes,
     wedge: Wedge,
+    attractor: Attractor,
     lane: Lane,
-    steps,
+    looks,
 ) -> Lane:
-    """One lane, `steps` steps further, with the verdict if it can be proved by then."""
+    """One lane, `looks` times `LOOK_EVERY` steps further, with the verdict if it can be proved by then."""
     structure = scene.structure
-    # The square roots of the diagonals make squares of displacements and velocities comparable energies.
-    weights = jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
+    weights = _weights(structure)
     # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
     longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
 
@@ -191,6 +216,7 @@ def follow(
             orbit=orbit,
             events=lane.events + changed,
             last_event=jnp.where(changed, t, lane.last_event),
+            approach=lane.approach,
             verdict=lane.verdict,
             account=None if lane.account is None else entered(lane.account, lane, load, after, t),
         )
@@ -203,7 +229,17 @@ def follow(
         vibration = vibration_energy(structure, rest, after.y)
         return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
-    after = jax.lax.fori_loop(0, steps, step, lane)
+    def look(_, carry: tuple[Lane, Bool[Array, ""]]):
+        lane = jax.lax.fori_loop(0, LOOK_EVERY, step, carry[0])
+        latest = lane.orbit.latest
+        deviation = weights * (latest - modes.linear.equilibrium)
+        approach, reached = attractors.approached(lane.approach, attractor, deviation, latest)
+        return eqx.tree_at(lambda lane: lane.approach, lane, approach), carry[1] | reached
+
+    after, reached = jax.lax.fori_loop(0, looks, look, (lane, jnp.zeros((), bool)))
+    reached = reached & ~after.orbit.returned
+    amplitude = jnp.where(reached, attractor.amplitude, after.orbit.amplitude)
+    after = eqx.tree_at(lambda lane: lane.orbit.amplitude, after, amplitude)
     deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
     yardstick = jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
     grown = jnp.max(jnp.abs(weights * deviation)) > GROWTH * yardstick
@@ -218,7 +254,7 @@ def follow(
                 quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
                 Verdict.SLIDING,
                 jnp.where(
-                    quiet_load & after.orbit.returned,
+                    quiet_load & (after.orbit.returned | reached),
                     Verdict.LIMIT_CYCLE,
                     jnp.where(
                         quiet_load & (sticks_forever(wedge, mechanics, after.contact, after.y) | grown),
@@ -230,6 +266,11 @@ def follow(
         ),
     )
     return eqx.tree_at(lambda lane: lane.verdict, after, verdict.astype(jnp.int8))
+
+
+def _weights(structure: Structure) -> Float[Array, " 2n"]:
+    # The square roots of the diagonals make squares of displacements and velocities comparable energies.
+    return jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
 
 
 def run_to_verdict(
@@ -260,7 +301,6 @@ def run_to_verdict(
     resolution = method.resolution
     if not lingering:
         resolution = eqx.tree_at(lambda r: r.span, resolution, np.asarray(resolution.span) // SPAN_SHARE)
-    stepper = method if energy else in_bulk(method, scene)
     total = len(next(iter(values.values())))
     outcome = Outcome(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
@@ -289,19 +329,30 @@ def run_to_verdict(
             kept, new = time.monotonic(), 0
 
     distinct, group = _groups(values)
+    company = np.bincount(group)[group]
     # The same in all rounds and blocks, because products of other shapes round differently.
     in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
     width = SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1
     # Blocks that are filled group by group share the most.
     order = np.argsort(group, kind="stable")
     block = max(1, int(memory // bytes_per_lane(scene, sharing=total / len(distinct))))
-    with noted() as signals, bar:
+    batch = Batch(
+        scene=scene,
+        method=method if energy else in_bulk(method, scene),
+        resolution=resolution,
+        names=tuple(name for name in values if name not in HISTORY),
+        history=tuple(name for name in values if name in HISTORY),
+        energy=energy,
+        width=width,
+        pool=ThreadPoolExecutor(max_workers=workers()),
+    )
+    with noted() as signals, bar, batch.pool:
         try:
             for start in range(0, total, block):
                 chosen = order[start : start + block]
                 if np.any(outcome.verdict[chosen] == Verdict.NOT_RUN):
                     rows = {name: column[chosen] for name, column in values.items()}
-                    _run_block(scene, rows, stepper, resolution, width, t_max, max_steps, outcome, chosen, finished)
+                    _run_block(batch, rows, company[chosen], t_max, max_steps, outcome, chosen, finished)
         except KeyboardInterrupt:
             open_lanes = int(np.sum(outcome.verdict == Verdict.NOT_RUN))
             warnings.warn(
@@ -340,37 +391,72 @@ def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _run_block(
-    scene, values, method, resolution, width, t_max, max_steps, outcome: Outcome, index: np.ndarray, report
+    batch: Batch, values, company: np.ndarray, t_max: float, max_steps: int, outcome: Outcome, index: np.ndarray, report
 ) -> None:
-    """Lanes that fit in memory together; writes the outcomes of those not run yet at `index`."""
-    names = tuple(name for name in values if name not in HISTORY)
-    history = tuple(name for name in values if name in HISTORY)
+    """Lanes that fit in memory together; writes the outcomes of those not run yet at `index`.
+
+    `company` says how many lanes of the whole run are in a lane's group.
+    """
     distinct, group = _groups(values)
-    shared = _shared(scene, method, names, distinct)
-    columns = np.stack([np.zeros(len(index)), *(values[name] for name in history)], axis=-1)[:, 1:]
-    with ThreadPoolExecutor(max_workers=_workers()) as pool:
-        start = lambda *a: _begin(scene, names, history, bool(outcome.energy), *a)  # noqa: E731
-        # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
-        pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
-        lanes = _in_tiles(start, shared, group[pending], (columns[pending],), width, pool)
-        done = 0
-        while True:
-            verdict, t = lanes.verdict, lanes.t
-            if done >= max_steps:
-                verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), Verdict.STEP_FAILURE, verdict)
-                lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
-            finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
-            _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
-            report(int(finished.sum()))
-            if finished.all():
-                return
-            pending = pending[~finished]
-            lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
-            # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
-            steps = min(max(method.round, done // LOOKS), max(max_steps - done, 1))
-            done += steps
-            step = lambda *a, steps=steps: _follow(scene, method, resolution, names, history, np.int32(steps), *a)  # noqa: E731
-            lanes = _in_tiles(step, shared, group[pending], (columns[pending], lanes), width, pool)
+    shared = _shared(batch, distinct)
+    columns = np.stack([np.zeros(len(index)), *(values[name] for name in batch.history)], axis=-1)[:, 1:]
+    # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
+    pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
+    lanes = _begun(batch, shared, group[pending], columns[pending])
+    done = 0
+    while True:
+        verdict, t = lanes.verdict, lanes.t
+        if done >= max_steps:
+            verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), Verdict.STEP_FAILURE, verdict)
+            lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
+        finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
+        _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
+        report(int(finished.sum()))
+        if finished.all():
+            return
+        pending = pending[~finished]
+        lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
+        if done == KNOWN_FROM * batch.method.round:
+            many = pending[company[pending] >= WORTH_KNOWING]
+            groups, first = np.unique(group[many], return_index=True)
+            if len(groups):
+                shared = _with_attractors(batch, shared, groups, columns[many[first]], report)
+        # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
+        steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
+        looks = -(-steps // LOOK_EVERY)
+        lanes = _followed(batch, shared, group[pending], columns[pending], lanes, looks)
+        done += looks * LOOK_EVERY
+
+
+def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: np.ndarray, report) -> Shared:
+    """`shared` with the limit cycles of these groups, where their ensembles meet on one; `columns` of any lane of each."""
+    structure = batch.scene.structure
+    members, weights = len(attractors.RELEASES), np.asarray(_weights(structure))
+    found = attractors.unknown(len(shared.values), 2 * structure.size)
+    own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
+    running, at_rest = np.arange(len(own)), np.zeros(len(own), bool)
+    lanes = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
+    looks = []
+    while len(running) and len(looks) < max(attractors.TESTS):
+        report(0)
+        lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
+        lanes = _followed(batch, shared, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
+        look = attractors.blank(len(own), len(weights))
+        look.deviations[running] = weights * (lanes.orbit.latest - shared.modes.linear.equilibrium[own[running]])
+        look.peaks[running], look.times[running] = lanes.orbit.peak, lanes.t
+        looks.append(look)
+        at_rest[running] = lanes.verdict == Verdict.SLIDING
+        over = (lanes.verdict != Verdict.UNDECIDED) & (lanes.verdict != Verdict.LIMIT_CYCLE)
+        if len(looks) in attractors.TESTS:
+            ensembles = attractors.in_ensembles(looks, ~at_rest, members)
+            for k in np.unique(running // members):
+                cycle = attractors.met(ensembles[k], shared.modes.slowest_decay[groups[k]])
+                if cycle is not None:
+                    found.crossings[groups[k]], found.amplitude[groups[k]] = cycle
+                    found.known[groups[k]] = True
+            over |= found.known[own[running]]
+        running, lanes = running[~over], jax.tree.map(lambda leaf, over=over: leaf[~over], lanes)
+    return eqx.tree_at(lambda shared: shared.attractor, shared, found)
 
 
 def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
@@ -391,16 +477,23 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     outcome.verdict[index] = verdict
 
 
-def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], distinct: np.ndarray) -> Shared:
+def _shared(batch: Batch, distinct: np.ndarray) -> Shared:
     """`Shared` of each row of `distinct`; arrays over groups."""
     size, parts = 64, []
     for start in range(0, len(distinct), size):
         # Filled up with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = jax.tree.map(np.asarray, _prepared(scene, method, names, distinct[rows]))
+        part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
     mechanics, prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Shared(distinct, mechanics, prepared, sliding_modes(linear), wedges)
+    return Shared(
+        distinct,
+        mechanics,
+        prepared,
+        sliding_modes(linear),
+        wedges,
+        attractors.unknown(len(distinct), 2 * batch.scene.structure.size),
+    )
 
 
 @eqx.filter_jit
@@ -413,24 +506,49 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
     return jax.vmap(one)(values)
 
 
+def _begun(batch: Batch, shared: Shared, group: np.ndarray, columns: np.ndarray, releases=None) -> Lane:
+    """Lanes at their beginning; those that are released (from these multiples of their final load) after all kicks."""
+    kicked = releases is None
+    releases = np.ones(len(group)) if kicked else releases
+
+    def function(*tile):
+        return _begin(batch.scene, batch.names, batch.history, batch.energy, kicked, *tile)
+
+    return in_tiles(function, shared, group, (columns, releases), batch.width, batch.pool)
+
+
+def _followed(batch: Batch, shared: Shared, group: np.ndarray, columns: np.ndarray, lanes: Lane, looks: int) -> Lane:
+    """Lanes `looks` looks further."""
+
+    def function(*tile):
+        return _follow(batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *tile)
+
+    return in_tiles(function, shared, group, (columns, lanes), batch.width, batch.pool)
+
+
 @eqx.filter_jit
-def _begin(scene: Scene, names: tuple[str, ...], history: tuple[str, ...], energy: bool, shared: Shared, columns):
-    def group(shared, columns):
+def _begin(scene, names, history, energy: bool, kicked: bool, shared: Shared, columns, releases):
+    def group(shared, columns, releases):
         own = _with(scene, names, shared.values)
-        return jax.vmap(lambda row: begin(_with(own, history, row), shared.mechanics, shared.modes, energy))(columns)
 
-    return jax.vmap(group)(shared, columns)
+        def one(row, release):
+            lane = begin(_with(own, history, row), shared.mechanics, shared.modes, energy)
+            return lane if kicked else released(own, lane, release)
+
+        return jax.vmap(one)(columns, releases)
+
+    return jax.vmap(group)(shared, columns, releases)
 
 
 @eqx.filter_jit
-def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, steps, shared: Shared, columns, lanes):
+def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, looks, shared: Shared, columns, lanes):
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
-        known = shared.mechanics, shared.prepared, shared.modes, shared.wedge
+        known = shared.mechanics, shared.prepared, shared.modes, shared.wedge, shared.attractor
 
         def one(row, lane):
-            return follow(_with(own, history, row), method, resolution, *known, lane, steps)
+            return follow(_with(own, history, row), method, resolution, *known, lane, looks)
 
         return jax.vmap(one)(columns, lanes)
 
@@ -439,48 +557,3 @@ def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, s
 
 def _with(scene: Scene, names: tuple[str, ...], row) -> Scene:
     return scene.replace(**{name: row[i] for i, name in enumerate(names)})
-
-
-def _workers() -> int:
-    # A tile is too small for XLA to split among cores; tiles side by side use them all.
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-
-
-def _in_tiles(function, shared: Shared, group: np.ndarray, inputs: tuple, width: int, pool: ThreadPoolExecutor):
-    """`function(shared, *inputs)` over all lanes, in tiles of one size, so that a scene is compiled once for any map."""
-    slots, filled = _side_by_side(group, width)
-    size = TILE_ELSEWHERE
-    if jax.default_backend() == "cpu":
-        size = LARGE_TILE_ON_CPU if len(group) >= MANY else TILE_ON_CPU
-    rows = max(1, size // width)
-
-    def run(start: int):
-        # The last tile is filled up with copies of its first row.
-        chosen = np.arange(start, start + rows)
-        real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
-        place = slots[np.where(chosen < len(slots), chosen, start)]
-        with jax.enable_x64(True):  # the setting is a thread's own
-            own = jax.tree.map(lambda leaf: leaf[group[place[:, 0]]], shared)
-            result = function(own, *jax.tree.map(lambda leaf: leaf[place], inputs))
-            return place[real], jax.tree.map(lambda leaf: np.asarray(leaf)[real], result)
-
-    places, results = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
-    back = np.argsort(np.concatenate(places))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[back], *results)
-
-
-def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `width` lanes of one group each, as places in `group`; what is left over repeats the row's first lane.
-
-    Second, which of the places are not such repetitions.
-    """
-    order = np.argsort(group, kind="stable")
-    _, first, count = np.unique(group[order], return_index=True, return_counts=True)
-    rows = -(-count // width)
-    before = np.cumsum(rows) - rows
-    start = np.repeat(first, rows) + width * (np.arange(rows.sum()) - np.repeat(before, rows))
-    places = start[:, None] + np.arange(width)
-    filled = places < np.repeat(first + count, rows)[:, None]
-    return order[np.where(filled, places, start[:, None])], filled

@@ -46,6 +46,7 @@ class Resolution(eqx.Module):
 class Orbit(eqx.Module):
     """What has to be remembered of a trajectory to see that its orbit returns: one earlier state and a few counts."""
 
+    latest: Float[Array, " 2n"]  # the last crossing state
     anchor: Float[Array, " 2n"]  # the crossing state that later ones are compared with
     crossings: Int[Array, ""]  # since the anchor was set
     patience: Int[Array, ""]  # crossings after which a search starts again from a newer anchor
@@ -67,6 +68,7 @@ def new_orbit(y: State) -> Orbit:
     zero, none = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
     # No anchor yet: an infinite one is never returned to, and a patience of one replaces it at the first crossing.
     return Orbit(
+        latest=jnp.full_like(y, jnp.nan),
         anchor=jnp.full_like(y, jnp.inf),
         crossings=none,
         patience=none + 1,
@@ -148,6 +150,7 @@ def observe(
         jnp.where(tired, jnp.clip(2 * orbit.patience, SHORTEST_SEARCH, LONGEST_SEARCH), orbit.patience),
     )
     seen = Orbit(
+        latest=at,
         anchor=jnp.where(new_anchor, at, orbit.anchor),
         crossings=jnp.where(new_anchor, 0, crossings),
         patience=patience,

@@ -57,7 +57,7 @@ class Windowed(eqx.Module):
     """
 
     dt: ClassVar = np.inf
-    round: ClassVar = 32
+    round: ClassVar = 16
 
     def prepare(self, mechanics: Mechanics) -> Propagators:
         return propagators(mechanics)

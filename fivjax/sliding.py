@@ -234,11 +234,13 @@ def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Arr
     """
     sizes = jnp.abs(shares)
     growth = envelope.growth
-    slow = jnp.hypot(
-        growth.real @ shares.real - growth.imag @ shares.imag, growth.real @ shares.imag + growth.imag @ shares.real
+    real, imag = (
+        growth.real @ shares.real - growth.imag @ shares.imag,
+        growth.real @ shares.imag + growth.imag @ shares.real,
     )
+    slow = real**2 + imag**2
     bend = envelope.bending @ sizes  # [cluster, instant]
-    chord = jnp.maximum(slow[:, 1:], slow[:, :-1]) + envelope.chord * jnp.maximum(bend[:, 1:], bend[:, :-1])
+    chord = jnp.sqrt(jnp.maximum(slow[:, 1:], slow[:, :-1])) + envelope.chord * jnp.maximum(bend[:, 1:], bend[:, :-1])
     peaks = jnp.maximum(jnp.max(envelope.decay * chord, axis=-1), envelope.last @ sizes)
     bound = jnp.sum(jnp.minimum(peaks, envelope.members @ sizes))
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)

@@ -1,0 +1,134 @@
+"""The proof that a limit cycle is reached: the orbit has come to where many others of the same structure have met.
+
+To see a lane's own orbit return (`orbit`) takes many cycles, most of all on a torus, whose beat has to be waited for. Lanes
+that differ in their kick only share their limit cycle; where it is known, a few cycles show that a lane has come to it.
+So an *ensemble* per structure is released from rest under loads of different sizes, whatever the lanes are. Its members have
+different energies, and they come to know the limit cycle by meeting on it (`met`): an unstable cycle is met by nobody.
+
+A lane has reached the limit cycle once its crossing states, one after the other, are as close to the known ones, and do
+not recede. A crossing is one of the tangential velocity through zero, upwards.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .contact import State
+from .orbit import DECAYED
+
+# Loads that the ensemble is released from, in final loads.
+RELEASES = np.linspace(1.5, 6.0, 16)
+# When an ensemble is asked whether it has met, in rounds of its method; later ones are not waited for.
+TESTS = (18, 21, 25, 31, 37, 44, 53, 64)
+# Members that have to meet.
+LEAST_MEMBERS = 6
+# Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
+KEPT = 128
+# This close, relative to the own distance from equilibrium, it is the same limit cycle.
+REACHED = 0.02
+# Distances between crossing states and the nearest that are kept scatter by this much where the states lie on one torus.
+SCATTER = 0.01
+# Crossing states in a row that have to be as close.
+LOOKS_NEAR = 4
+
+
+class Attractor(eqx.Module):
+    """A limit cycle that is known: what lanes are compared with."""
+
+    # Deviations from equilibrium at crossings, weighted as in `lanes.follow`.
+    crossings: Float[Array, "s 2n"]
+    amplitude: Float[Array, ""]  # its largest tangential speed, m/s
+    known: Bool[Array, ""]
+
+
+class Approach(eqx.Module):
+    """How near a lane has been to the known limit cycle lately."""
+
+    seen: State  # the crossing state that was looked at last
+    near: Int[Array, ""]  # crossing states in a row that were close
+    first: Float[Array, ""]  # relative distance of the first of these
+
+
+class Ensemble(NamedTuple):
+    """The last crossing states of `e` members, look by look; NaN where a member was not followed any more."""
+
+    deviations: Float[np.ndarray, "*k e 2n"]  # weighted
+    peaks: Float[np.ndarray, "*k e"]  # largest tangential speed since the look before, m/s
+    times: Float[np.ndarray, "*k e"]  # s
+    moving: Bool[np.ndarray, " e"]  # members that have not come to rest
+
+
+def blank(members: int, size: int) -> Ensemble:
+    """One look at members with states of this size, to be filled in."""
+    one = np.full(members, np.nan)
+    return Ensemble(np.full((members, size), np.nan), one.copy(), one, np.ones(members, bool))
+
+
+def in_ensembles(looks: list[Ensemble], moving: Bool[np.ndarray, " e"], members: int) -> list[Ensemble]:
+    """Looks at the members of several ensembles, ensemble by ensemble."""
+    deviations, peaks, times, _ = (np.array(part) for part in zip(*looks, strict=True))
+    return [
+        Ensemble(deviations[:, own], peaks[:, own], times[:, own], moving[own])
+        for own in (slice(k, k + members) for k in range(0, len(moving), members))
+    ]
+
+
+def unknown(groups: int, size: int) -> Attractor:
+    """Of several groups (leading axis), none known yet; `size` is the state's."""
+    return Attractor(np.zeros((groups, KEPT, size)), np.zeros(groups), np.zeros(groups, bool))
+
+
+def no_approach(y: State) -> Approach:
+    return Approach(jnp.full_like(y, jnp.nan), jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
+
+
+def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
+    """The crossing states and the amplitude (m/s) of the limit cycle that the ensemble has met on, if it has.
+
+    Members have met when the last third of their crossing states are all close to states that *others* were in during the
+    third before. In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its
+    slowest rate in 1/s); theirs has not.
+    """
+    looks = len(ensemble.times)
+    earlier, later = slice(looks // 3, 2 * looks // 3), slice(2 * looks // 3, looks)
+    if not np.all(np.isfinite(ensemble.deviations[looks // 3 :, ensemble.moving])):
+        return None
+    members = []
+    for member in np.flatnonzero(ensemble.moving):
+        others = ensemble.moving & (np.arange(len(ensemble.moving)) != member)
+        known = ensemble.deviations[earlier, others].reshape(-1, ensemble.deviations.shape[-1])
+        if len(known) and np.all(_distance(known, ensemble.deviations[later, member]) <= REACHED):
+            members.append(member)
+    if len(members) < LEAST_MEMBERS:
+        return None
+    lasting = decay * (np.mean(ensemble.times[later, members]) - np.mean(ensemble.times[earlier, members]))
+    sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]
+    if lasting < DECAYED or sizes[1] < (1 - DECAYED / 4) * sizes[0]:
+        return None
+    states = ensemble.deviations[later][:, members].reshape(-1, ensemble.deviations.shape[-1])
+    chosen = np.linspace(0, len(states) - 1, KEPT).round().astype(int)
+    return states[chosen], float(np.max(ensemble.peaks[later][:, members]))
+
+
+def _distance(known: Float[np.ndarray, "k 2n"], states: Float[np.ndarray, "m 2n"]) -> Float[np.ndarray, " m"]:
+    apart = np.linalg.norm(states[:, None] - known, axis=-1)
+    return np.min(apart, axis=1) / np.linalg.norm(states, axis=-1)
+
+
+def approached(
+    approach: Approach, attractor: Attractor, deviation: State, crossing: State
+) -> tuple[Approach, Bool[Array, ""]]:
+    """The approach after a look at a crossing state, and whether the attractor is reached; `deviation` is its, weighted."""
+    size = jnp.sum(deviation**2)
+    apart = size - 2 * attractor.crossings @ deviation + jnp.sum(attractor.crossings**2, axis=-1)
+    distance = jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size)
+    close = attractor.known & (distance <= REACHED)
+    first = jnp.where(close & (approach.near == 0), distance, approach.first)
+    near = jnp.where(close, approach.near + 1, 0)
+    reached = (near >= LOOKS_NEAR) & (distance <= jnp.maximum(first, SCATTER))
+    fresh = jnp.any(crossing != approach.seen)
+    look = Approach(crossing, jnp.where(fresh, near, approach.near), jnp.where(fresh, first, approach.first))
+    return look, fresh & reached

@@ -1,0 +1,63 @@
+"""Batches of lanes cut into tiles of one size, so that a scene is compiled once for any number of lanes.
+
+A tile is a number of rows of lanes side by side. The lanes of a row belong to one *group* and share what is worked out
+once for it; tiles run in threads, one per core.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+
+# Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
+TILE_ON_CPU = 128
+LARGE_TILE_ON_CPU = 512
+TILE_ELSEWHERE = 65536
+# Lanes from which on it pays to compile the larger tile.
+MANY = 8192
+
+
+def workers() -> int:
+    # A tile is too small for XLA to split among cores; tiles side by side use them all.
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def in_tiles(function, shared, group: np.ndarray, inputs: tuple, width: int, pool: ThreadPoolExecutor):
+    """`function(shared, *inputs)` over all lanes, in tiles of one size, so that a scene is compiled once for any map."""
+    slots, filled = _side_by_side(group, width)
+    size = TILE_ELSEWHERE
+    if jax.default_backend() == "cpu":
+        size = LARGE_TILE_ON_CPU if len(group) >= MANY else TILE_ON_CPU
+    rows = max(1, size // width)
+
+    def run(start: int):
+        # The last tile is filled up with copies of its first row.
+        chosen = np.arange(start, start + rows)
+        real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
+        place = slots[np.where(chosen < len(slots), chosen, start)]
+        with jax.enable_x64(True):  # the setting is a thread's own
+            own = jax.tree.map(lambda leaf: leaf[group[place[:, 0]]], shared)
+            result = function(own, *jax.tree.map(lambda leaf: leaf[place], inputs))
+            return place[real], jax.tree.map(lambda leaf: np.asarray(leaf)[real], result)
+
+    places, results = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
+    back = np.argsort(np.concatenate(places))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[back], *results)
+
+
+def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `width` lanes of one group each, as places in `group`; what is left over repeats the row's first lane.
+
+    Second, which of the places are not such repetitions.
+    """
+    order = np.argsort(group, kind="stable")
+    _, first, count = np.unique(group[order], return_index=True, return_counts=True)
+    rows = -(-count // width)
+    before = np.cumsum(rows) - rows
+    start = np.repeat(first, rows) + width * (np.arange(rows.sum()) - np.repeat(before, rows))
+    places = start[:, None] + np.arange(width)
+    filled = places < np.repeat(first + count, rows)[:, None]
+    return order[np.where(filled, places, start[:, None])], filled
