@@ -22,8 +22,8 @@ from tqdm.auto import tqdm
 
 from . import contact as physics
 from . import orbit as orbits
-from .contact import Contact, Mechanics, State
-from .energy import Books, Ledger, enter, exchanged, open_ledger, vibration_energy
+from .contact import Contact, Mechanics, Rest, State
+from .energy import Books, Ledger, enter, exchanged, mechanical_energy, open_ledger
 from .event_exact import EventExact
 from .interrupts import noted
 from .load import AbstractLoad
@@ -78,7 +78,7 @@ class Lane(eqx.Module):
     """One trajectory on its way to a verdict."""
 
     t: Float[Array, ""]
-    y: State
+    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
     contact: Contact
     orbit: Orbit
     events: Int[Array, ""]  # status changes so far
@@ -115,10 +115,23 @@ class Outcome(NamedTuple):
     energy: dict[str, np.ndarray]  # lines of the ledger by name, J; empty where not asked for
 
 
+def measured_from_rest(scene: Scene) -> Mechanics:
+    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
+
+    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
+    would be decided, and the balance of energy upset, by noise.
+    """
+    load = scene.load.final
+    _, normal_force = steady_sliding(scene, load)
+    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
+
+
 def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
     """A lane at the sliding equilibrium of its scene, just before anything happens."""
     q, _ = steady_sliding(scene, scene.load.force)
-    y = jnp.concatenate([q, jnp.zeros_like(q)])
+    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
+    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
     verdict = jnp.where(
         ~modes.linear.solvable,
         Verdict.PAINLEVE,
@@ -128,7 +141,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
     return Lane(
         t=jnp.zeros((), y.dtype),
         y=y,
-        contact=physics.status_from_forces(mechanics, scene.load.force, y),
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
         orbit=orbits.new_orbit(y),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
@@ -166,7 +179,7 @@ def follow(
 
     def step(_, lane: Lane) -> Lane:
         t = next_step_end(scene.load, lane.t, longest)
-        load = scene.load(0.5 * (lane.t + t))
+        load = scene.load(0.5 * (lane.t + t)) - scene.load.final
         after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
         y, contact, h, peak = after
         t = jnp.where(h >= t - lane.t, t, lane.t + h)
@@ -174,7 +187,7 @@ def follow(
         orbit = orbits.observe(
             lane.orbit,
             weights,
-            modes.linear.equilibrium,
+            jnp.zeros_like(y),
             structure.tangential,
             lane.y,
             y,
@@ -197,16 +210,16 @@ def follow(
 
     def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
         ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
-        rest = modes.linear.equilibrium[: structure.size]
         kick_ends = jnp.max(scene.load.jumps, initial=0.0)
         just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
-        vibration = vibration_energy(structure, rest, after.y)
+        vibration = mechanical_energy(structure, after.y)
         return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
     after = jax.lax.fori_loop(0, steps, step, lane)
-    deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
-    yardstick = jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
-    grown = jnp.max(jnp.abs(weights * deviation)) > GROWTH * yardstick
+    equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
+    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    grown = jnp.max(jnp.abs(weights * after.y)) > GROWTH * yardstick
+    wedged = sticks_forever(wedge, mechanics.of_totals, after.contact, after.y + equilibrium)
     quiet_load = jnp.all(scene.load.jumps <= after.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(after.y)),
@@ -221,7 +234,7 @@ def follow(
                     quiet_load & after.orbit.returned,
                     Verdict.LIMIT_CYCLE,
                     jnp.where(
-                        quiet_load & (sticks_forever(wedge, mechanics, after.contact, after.y) | grown),
+                        quiet_load & (wedged | grown),
                         Verdict.UNBOUNDED,
                         Verdict.UNDECIDED,
                     ),
@@ -407,7 +420,7 @@ def _shared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, 
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
-        mechanics = Mechanics(own)
+        mechanics = measured_from_rest(own)
         return mechanics, method.prepare(mechanics), linear_sliding(own), wedge(own)
 
     return jax.vmap(one)(values)
