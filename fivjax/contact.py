@@ -177,7 +177,7 @@ def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) ->
     # Sums over columns rather than matrix products: in a batch these become one fused loop over lanes.
     acceleration = mechanics.free_load * load
     position, displacement = mechanics.free_position, y[:n]
-    if mechanics.springs is not None:
+    if mechanics.springs is not None and mechanics.from_springs is not None:
         position, displacement = mechanics.from_springs, mechanics.springs.stretches(displacement)
     for j in range(n):
         acceleration = acceleration + position[:, j] * displacement[j] + mechanics.free_velocity[:, j] * y[n + j]
@@ -307,9 +307,10 @@ def cone_margins(
     margins = jnp.stack([edge - tangential_force, edge + tangential_force])
     if mechanics.rest is None:
         return margins
-    # Apart from what is added, because at rest one of them is exactly zero unless static friction is larger.
-    edge, pulling = static * mechanics.rest.normal_force, mechanics.rest.tangential_force
-    return margins + jnp.stack([edge - pulling, edge + pulling])
+    # Apart from what is added, and not as a difference of forces that are rounded: at rest one of them is exactly zero
+    # unless static friction is larger.
+    friction = mechanics.rest.friction
+    return margins + jnp.stack([static - friction, static + friction]) * mechanics.rest.normal_force
 
 
 def exactly_zero(contact: Contact) -> Bool[Array, "2"]:
@@ -342,13 +343,10 @@ def magnitudes(
     compliance = jnp.abs(mechanics.normal_compliance(contact.direction, static))
     sliding_n = free_n / jnp.where(compliance > 0, compliance, 1.0)
     none = jnp.zeros_like(free_n)
-    tangential_force = _by_status(
-        contact, stick=(g_tn * free_n + g_nn * free_t) / determinant, slide=static * sliding_n, detach=none
-    )
-    normal_force = _by_status(
-        contact, stick=(g_tn * free_t + g_tt * free_n) / determinant, slide=sliding_n, detach=none
-    )
-    pressing, margins = normal_force, jnp.zeros(2, normal_force.dtype)
+    stick_t, stick_n = (g_tn * free_n + g_nn * free_t) / determinant, (g_tn * free_t + g_tt * free_n) / determinant
+    tangential_force = _by_status(contact, stick=stick_t, slide=static * sliding_n, detach=none)
+    normal_force = _by_status(contact, stick=stick_n, slide=sliding_n, detach=none)
+    pressing, margins, onset = normal_force, jnp.zeros(2, normal_force.dtype), none
     if mechanics.rest is not None:
         at_rest, rest_t, rest_n = mechanics.rest, mechanics.rest.tangential_force, mechanics.rest.normal_force
         # What is added to the forces at rest is all that is rounded in the rates, but for forces that are not those.
@@ -362,6 +360,10 @@ def magnitudes(
         )
         pressing = normal_force + jnp.abs(rest_n)
         margins = jnp.abs(cone_margins(mechanics, none, none))
+        # Slip sets out with the acceleration that rounding leaves of the margin at which sticking ended; were that taken for
+        # more than nothing, the two would hand over to each other for ever.
+        edge = static * stick_n + stick_t
+        onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
     slip = y[n + mechanics.tangential] + jnp.abs(mechanics.belt_speed)
     edge = static * normal_force + tangential_force
     guards = _by_status(
@@ -373,6 +375,7 @@ def magnitudes(
     acceleration = (
         free + jnp.abs(mechanics.from_tangential) * tangential_force + jnp.abs(mechanics.from_normal) * normal_force
     )
+    acceleration = acceleration + jnp.where(jnp.arange(n) == mechanics.tangential, onset, 0.0)
     return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
 
 
