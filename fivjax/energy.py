@@ -260,7 +260,10 @@ def open_ledger(books: Books, y: State) -> Ledger:
 
 
 def residual(books: Books, ledger: Ledger, y: State) -> Float[Array, ""]:
-    """Growth of mechanical energy that no line accounts for, in J: the error of the computation."""
+    """Growth of mechanical energy that no line accounts for, in J: the error of the computation.
+
+    `y` is the state as the mechanics measure it with which the ledger was entered: a total, or a deviation from rest.
+    """
     grown = _stored(books, y) - ledger.start
     return grown - (ledger.beyond_rest - ledger.impact)
 
@@ -271,7 +274,10 @@ def _stored(books: Books, y: State) -> Float[Array, ""]:
 
 
 def exchanged(ledger: Ledger) -> Float[Array, "..."]:
-    """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
+    """How much the lines of the balance hold together, in J: what a residual is to be measured against.
+
+    Each line counts net, so what a vibration takes up and gives back within a cycle does not.
+    """
     work = ledger.work
     return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(ledger.impact)
 
