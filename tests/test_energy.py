@@ -786,10 +786,12 @@ def test_the_balance_closes_however_little_moves_under_however_high_a_load(paper
         )
     assert outcome.verdict.tolist() == [Verdict.SLIDING, Verdict.SLIDING, Verdict.UNDECIDED]
     energy = outcome.energy
-    assert np.all(energy["energy_residual"] <= 1e-10 * energy["energy_exchanged"])
     # An impulse (p - 1) F t, that is, in the mass that the load acts on.
     impulse = np.array([1e6 * 1e-9, 0.5e9 * 1e-7])
     np.testing.assert_allclose(energy["kick_energy"][:2], impulse**2 / (2 * 0.53), rtol=1e-4)
+    # And what the soft spring lets go of; hardly any of that is exchanged with anything.
+    moved = np.append(impulse**2 / (2 * 0.53), 0.1**2 / (2 * 0.1))
+    assert np.all(energy["energy_residual"] <= 1e-11 * moved)
 
 
 @pytest.mark.slow
