@@ -118,12 +118,10 @@ def _distance(known: Float[np.ndarray, "k 2n"], states: Float[np.ndarray, "m 2n"
     return np.min(apart, axis=1) / np.linalg.norm(states, axis=-1)
 
 
-def approached(
-    approach: Approach, attractor: Attractor, deviation: State, crossing: State
-) -> tuple[Approach, Bool[Array, ""]]:
-    """The approach after a look at a crossing state, and whether the attractor is reached; `deviation` is its, weighted."""
-    size = jnp.sum(deviation**2)
-    apart = size - 2 * attractor.crossings @ deviation + jnp.sum(attractor.crossings**2, axis=-1)
+def approached(approach: Approach, attractor: Attractor, crossing: State) -> tuple[Approach, Bool[Array, ""]]:
+    """The approach after a look at a crossing state (a weighted deviation), and whether the attractor is reached."""
+    size = jnp.sum(crossing**2)
+    apart = size - 2 * attractor.crossings @ crossing + jnp.sum(attractor.crossings**2, axis=-1)
     distance = jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size)
     close = attractor.known & (distance <= REACHED)
     first = jnp.where(close & (approach.near == 0), distance, approach.first)

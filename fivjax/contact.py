@@ -17,6 +17,12 @@ A status lasts while its *guards* are positive: the two edges of the friction co
 while sliding, the gap while detached. When one is used up, `transition` puts the state on its constraint, applies the
 impact law where the gap closed, and chooses the next status from the forces, never from which guard it was.
 
+Where a high load stores much more energy than a small vibration moves, states as totals cannot hold the vibration: its
+digits are lost in the rounding of what is at rest. `Mechanics.about` makes mechanics for displacements and loads that are
+deviations from a `Rest` instead. The free acceleration is then that under the contact forces at rest, and
+`sticking_forces`, `sliding_forces` and `forces_by_status` are what is *added* to those; `guards` and `contact_forces` are of
+the total forces either way.
+
 Everything here is about one contact at one instant; batches come from `jax.vmap`.
 """
 
@@ -28,6 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .friction import AbstractFriction
 from .scene import Scene
+from .structure import Springs, Structure
 
 
 class Status(enum.IntEnum):
@@ -45,6 +52,22 @@ class Contact(eqx.Module):
     direction: Float[Array, ""]
 
 
+class Rest(eqx.Module):
+    """A state of steady sliding, as the forces that hold it; displacements and loads may be measured from there."""
+
+    load: Float[Array, ""]  # N
+    tangential_force: Float[Array, ""]  # N
+    normal_force: Float[Array, ""]  # N
+    friction: Float[Array, ""]  # σμ, the ratio of the two
+
+    def __init__(self, scene: Scene, load: Float[Array, ""], normal_force: Float[Array, ""]):
+        """Of a scene that presses with `normal_force` under `load`, see `scene.steady_sliding`."""
+        self.load = load
+        self.friction = jnp.sign(scene.belt_speed) * scene.friction(jnp.abs(scene.belt_speed))
+        self.tangential_force = self.friction * normal_force
+        self.normal_force = normal_force
+
+
 class Mechanics(eqx.Module):
     """A scene in the form that accelerations need: everything divided by the mass matrix, once."""
 
@@ -59,6 +82,10 @@ class Mechanics(eqx.Module):
     impact_law: str = eqx.field(static=True)
     tangential: int = eqx.field(static=True)
     normal: int = eqx.field(static=True)
+    # See `about`; none: states are totals.
+    rest: Rest | None = None
+    springs: Springs | None = None
+    from_springs: Float[Array, "n n"] | None = None  # -M⁻¹Bᵀk, 1/s²
 
     def __init__(self, scene: Scene):
         structure = scene.structure
@@ -80,6 +107,33 @@ class Mechanics(eqx.Module):
         self.impact_law = scene.impact_law
         self.tangential = structure.tangential
         self.normal = structure.normal
+        self.rest = self.springs = self.from_springs = None
+
+    def about(self, rest: Rest, structure: Structure) -> "Mechanics":
+        """The same mechanics for displacements and loads measured from a rest; velocities stay what they are.
+
+        Forces are then as exact as a small deviation can tell them, those of the springs included: of a rigid motion,
+        however far it goes, there are none.
+        """
+        springs = Springs(structure.stiffness)
+        from_springs = -jnp.linalg.solve(structure.mass, springs.stretch.T * springs.rates)
+        return self._with_reference(rest, springs, from_springs)
+
+    @property
+    def of_totals(self) -> "Mechanics":
+        """The same mechanics for displacements and loads as they are, whatever they were measured from."""
+        return self._with_reference(None, None, None)
+
+    @property
+    def homogeneous(self) -> "Mechanics":
+        """Without what does not change in time, belt and rest: under no load, the physics of derivatives."""
+        still = eqx.tree_at(lambda m: m.belt_speed, self, jnp.zeros_like(self.belt_speed))
+        return still._with_reference(None, self.springs, self.from_springs)
+
+    def _with_reference(self, *changed) -> "Mechanics":
+        return eqx.tree_at(
+            lambda m: (m.rest, m.springs, m.from_springs), self, changed, is_leaf=lambda leaf: leaf is None
+        )
 
     @property
     def compliance(self) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
@@ -118,17 +172,20 @@ def gap(mechanics: Mechanics, y: State) -> Float[Array, ""]:
 
 
 def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
-    """Accelerations without contact forces, in m/s²."""
+    """Accelerations without contact forces, or with those at `mechanics.rest`, in m/s²."""
     n = _n(y)
     # Sums over columns rather than matrix products: in a batch these become one fused loop over lanes.
     acceleration = mechanics.free_load * load
+    position, displacement = mechanics.free_position, y[:n]
+    if mechanics.springs is not None and mechanics.from_springs is not None:
+        position, displacement = mechanics.from_springs, mechanics.springs.stretches(displacement)
     for j in range(n):
-        acceleration = acceleration + mechanics.free_position[:, j] * y[j] + mechanics.free_velocity[:, j] * y[n + j]
+        acceleration = acceleration + position[:, j] * displacement[j] + mechanics.free_velocity[:, j] * y[n + j]
     return acceleration
 
 
 def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(T, N) in N that hold the contact still."""
+    """(T, N) in N that hold the contact still, added to those at rest."""
     g_tt, g_tn, g_nn = mechanics.compliance
     free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
     determinant = g_tt * g_nn - g_tn**2
@@ -138,16 +195,38 @@ def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Flo
 def sliding_forces(
     mechanics: Mechanics, free: Float[Array, " n"], direction: Float[Array, ""], slip: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(T, N) in N while sliding, the friction force pointing in `direction`."""
+    """(T, N) in N while sliding, the friction force pointing in `direction`; added to those at rest."""
     mu = mechanics.friction(slip)
-    normal_force = -free[mechanics.normal] / mechanics.normal_compliance(direction, mu)
-    return direction * mu * normal_force, normal_force
+    if mechanics.rest is None:
+        normal_force = -free[mechanics.normal] / mechanics.normal_compliance(direction, mu)
+        return direction * mu * normal_force, normal_force
+    _, g_tn, _ = mechanics.compliance
+    # What friction pulls otherwise than at rest under the same pressing force: exactly zero where friction is constant.
+    otherwise = (direction * mu - mechanics.rest.friction) * mechanics.rest.normal_force
+    added = -(free[mechanics.normal] + g_tn * otherwise) / mechanics.normal_compliance(direction, mu)
+    return direction * mu * added + otherwise, added
+
+
+def total_forces(
+    mechanics: Mechanics, tangential_force: Float[Array, ""], normal_force: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N from what is added to those at rest."""
+    if mechanics.rest is None:
+        return tangential_force, normal_force
+    return tangential_force + mechanics.rest.tangential_force, normal_force + mechanics.rest.normal_force
 
 
 def contact_forces(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(T, N) in N in the given status; N is negative beyond the instant where contact is lost."""
+    return total_forces(mechanics, *added_forces(mechanics, contact, load, y))
+
+
+def added_forces(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N in the given status, what is added to those at rest."""
     free = free_acceleration(mechanics, load, y)
     sliding = sliding_forces(mechanics, free, contact.direction, slip_speed(mechanics, contact, y))
     return forces_by_status(mechanics, contact, free, sliding)
@@ -159,20 +238,22 @@ def forces_by_status(
     free: Float[Array, " n"],
     sliding: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(T, N) in the given status, from the free accelerations and the forces that sliding would have."""
+    """(T, N) in the given status from the free accelerations and the forces of sliding; added to those at rest."""
     stick_t, stick_n = sticking_forces(mechanics, free)
     slide_t, slide_n = sliding
-    none = jnp.zeros_like(slide_n)
+    open_t = open_n = jnp.zeros_like(slide_n)
+    if mechanics.rest is not None:
+        open_t, open_n = -mechanics.rest.tangential_force, -mechanics.rest.normal_force
     return (
-        _by_status(contact, stick=stick_t, slide=slide_t, detach=none),
-        _by_status(contact, stick=stick_n, slide=slide_n, detach=none),
+        _by_status(contact, stick=stick_t, slide=slide_t, detach=open_t),
+        _by_status(contact, stick=stick_n, slide=slide_n, detach=open_n),
     )
 
 
 def acceleration(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
     """Accelerations in the given status, in m/s²; those that the status forbids are exactly zero."""
     free = free_acceleration(mechanics, load, y)
-    return acceleration_under(mechanics, contact, free, *contact_forces(mechanics, contact, load, y))
+    return acceleration_under(mechanics, contact, free, *added_forces(mechanics, contact, load, y))
 
 
 def acceleration_under(
@@ -182,7 +263,7 @@ def acceleration_under(
     tangential_force: Float[Array, ""],
     normal_force: Float[Array, ""],
 ) -> Float[Array, " n"]:
-    """Accelerations from the free ones and the contact forces, in m/s²."""
+    """Accelerations from the free ones and the contact forces added to those at rest, in m/s²."""
     total = free + mechanics.from_tangential * tangential_force + mechanics.from_normal * normal_force
     index = jnp.arange(free.shape[0])
     held = (index == mechanics.normal) & (contact.status != Status.DETACH)
@@ -195,7 +276,7 @@ def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: St
 
     stick: distances of T from both edges of the friction cone; slide: N and the slip speed; detach: the gap, twice.
     """
-    forces = contact_forces(mechanics, contact, load, y)
+    forces = added_forces(mechanics, contact, load, y)
     return guards_under(mechanics, contact, *forces, slip_speed(mechanics, contact, y), gap(mechanics, y))
 
 
@@ -207,14 +288,29 @@ def guards_under(
     slip: Float[Array, ""],
     height: Float[Array, ""],
 ) -> Float[Array, "2"]:
-    """`guards` from the contact forces, the slip speed and the gap; linear in all of them."""
-    edge = mechanics.friction.static * normal_force
+    """`guards` from the contact forces added to those at rest, the slip speed and the gap; linear in all of them."""
+    _, pressing = total_forces(mechanics, tangential_force, normal_force)
     return _by_status(
         contact,
-        stick=jnp.stack([edge - tangential_force, edge + tangential_force]),
-        slide=jnp.stack([normal_force, slip]),
+        stick=cone_margins(mechanics, tangential_force, normal_force),
+        slide=jnp.stack([pressing, slip]),
         detach=jnp.stack([height, height]),
     )
+
+
+def cone_margins(
+    mechanics: Mechanics, tangential_force: Float[Array, ""], normal_force: Float[Array, ""]
+) -> Float[Array, "2"]:
+    """Distances of T from both edges of the friction cone, in N, from the contact forces added to those at rest."""
+    static = mechanics.friction.static
+    edge = static * normal_force
+    margins = jnp.stack([edge - tangential_force, edge + tangential_force])
+    if mechanics.rest is None:
+        return margins
+    # Apart from what is added, and not as a difference of forces that are rounded: at rest one of them is exactly zero
+    # unless static friction is larger.
+    friction = mechanics.rest.friction
+    return margins + jnp.stack([static - friction, static + friction]) * mechanics.rest.normal_force
 
 
 def exactly_zero(contact: Contact) -> Bool[Array, "2"]:
@@ -247,23 +343,39 @@ def magnitudes(
     compliance = jnp.abs(mechanics.normal_compliance(contact.direction, static))
     sliding_n = free_n / jnp.where(compliance > 0, compliance, 1.0)
     none = jnp.zeros_like(free_n)
-    tangential_force = _by_status(
-        contact, stick=(g_tn * free_n + g_nn * free_t) / determinant, slide=static * sliding_n, detach=none
-    )
-    normal_force = _by_status(
-        contact, stick=(g_tn * free_t + g_tt * free_n) / determinant, slide=sliding_n, detach=none
-    )
+    stick_t, stick_n = (g_tn * free_n + g_nn * free_t) / determinant, (g_tn * free_t + g_tt * free_n) / determinant
+    tangential_force = _by_status(contact, stick=stick_t, slide=static * sliding_n, detach=none)
+    normal_force = _by_status(contact, stick=stick_n, slide=sliding_n, detach=none)
+    pressing, margins, onset = normal_force, jnp.zeros(2, normal_force.dtype), none
+    if mechanics.rest is not None:
+        at_rest, rest_t, rest_n = mechanics.rest, mechanics.rest.tangential_force, mechanics.rest.normal_force
+        # What is added to the forces at rest is all that is rounded in the rates, but for forces that are not those.
+        dragging = contact.direction * mechanics.friction(jnp.zeros_like(static))
+        otherwise = jnp.abs(dragging - at_rest.friction) if mechanics.friction.constant else 2 * static
+        tangential_force = tangential_force + _by_status(
+            contact, stick=none, slide=otherwise * jnp.abs(rest_n), detach=jnp.abs(rest_t)
+        )
+        normal_force = normal_force + _by_status(
+            contact, stick=none, slide=g_tn * otherwise * jnp.abs(rest_n) / compliance, detach=jnp.abs(rest_n)
+        )
+        pressing = normal_force + jnp.abs(rest_n)
+        margins = jnp.abs(cone_margins(mechanics, none, none))
+        # Slip sets out with the acceleration that rounding leaves of the margin at which sticking ended; were that taken for
+        # more than nothing, the two would hand over to each other for ever.
+        edge = static * stick_n + stick_t
+        onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
     slip = y[n + mechanics.tangential] + jnp.abs(mechanics.belt_speed)
     edge = static * normal_force + tangential_force
     guards = _by_status(
         contact,
-        stick=jnp.stack([edge, edge]),
-        slide=jnp.stack([normal_force, slip]),
+        stick=edge + margins,
+        slide=jnp.stack([pressing, slip]),
         detach=jnp.stack([y[mechanics.normal]] * 2),
     )
     acceleration = (
         free + jnp.abs(mechanics.from_tangential) * tangential_force + jnp.abs(mechanics.from_normal) * normal_force
     )
+    acceleration = acceleration + jnp.where(jnp.arange(n) == mechanics.tangential, onset, 0.0)
     return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
 
 
@@ -347,11 +459,13 @@ def status_from_forces(
     free = free_acceleration(mechanics, load, y)
     slip = relative_velocity(mechanics, y)
     open_ = (gap(mechanics, y) > 0) | (y[_n(y) + mechanics.normal] > 0)
-    holding, pressing = sticking_forces(mechanics, free)
-    sticks = may_stick & (slip == 0) & (pressing > 0) & (jnp.abs(holding) <= mechanics.friction.static * pressing)
+    holds = sticking_forces(mechanics, free)
+    held = jnp.all(cone_margins(mechanics, *holds) >= 0)
+    holding, pressing = total_forces(mechanics, *holds)
+    sticks = may_stick & (slip == 0) & (pressing > 0) & held
     pushed = jnp.where(slip == 0, jnp.sign(holding), -jnp.sign(slip))
     direction = jnp.where(pushed == 0, 1.0, pushed).astype(y.dtype)
-    _, sliding_normal_force = sliding_forces(mechanics, free, direction, jnp.abs(slip))
+    _, sliding_normal_force = total_forces(mechanics, *sliding_forces(mechanics, free, direction, jnp.abs(slip)))
     status = jnp.where(
         open_,
         Status.DETACH,
@@ -410,6 +524,9 @@ def impact(mechanics: Mechanics, y: State) -> State:
 def _resting(mechanics: Mechanics, load: Float[Array, ""], y: State, resolution: Float[Array, ""]) -> State:
     rate = y[_n(y) + mechanics.normal]
     free_n = free_acceleration(mechanics, load, y)[mechanics.normal]
+    if mechanics.rest is not None:
+        _, g_tn, g_nn = mechanics.compliance
+        free_n = free_n - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
     rests = rate + 0.5 * free_n * resolution <= 0
     return jnp.where(jnp.arange(y.shape[0]) == _n(y) + mechanics.normal, jnp.where(rests, 0.0, rate), y)
 

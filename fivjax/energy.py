@@ -25,6 +25,17 @@ Eq. 13 has no term for impacts. A re-contact changes energy at one instant, whic
 energy, or where the moving belt drags the landing structure along, may give some. What is left after all lines is the
 `residual`: the error of the computation, and a meter for it.
 
+The residual speaks of the vibration. A small one under a high load moves far less energy than the springs store at rest, and
+in a balance of totals it would be lost in the rounding of what is stored. With displacements $z = q - q_0$ measured from
+a sliding equilibrium (`contact.Rest`) the forces that hold it do no net work on the vibration, and the same balance reads
+
+$$\tfrac12 \dot z^T M \dot z + \tfrac12 z^T K z = \int (T - T_0)\, \dot z_t + (N - N_0)\, \dot z_n + (F - F_0) f \cdot \dot z
+  - \dot z^T C \dot z \; dt - \text{impacts}$$
+
+in which nothing large cancels. The lines of the table are its terms with the work of $T_0$ and $F_0$ added. Maps keep
+their books so; states of `simulate` are totals ($q_0 = 0$), with which both balances are the same. Either way a line that
+is wrong by some joules shows in the residual with as many.
+
 Work is integrated along each advance with the method's own states and to its own order: Gauss quadrature of the Taylor
 series for `EventExact`, the stages and weights of the Runge–Kutta step for `WhereSwitched`.
 """
@@ -38,8 +49,8 @@ from . import contact as physics
 from .contact import Contact, Mechanics, State, Status
 from .precision import returning_numpy
 from .scene import Scene
-from .steppers import AbstractStepper, Advance
-from .structure import Structure
+from .steppers import AbstractStepper, Advance, Within
+from .structure import Springs, Structure
 
 
 class Flows(eqx.Module):
@@ -88,7 +99,8 @@ class Ledger(eqx.Module):
     detach_time: Float[Array, "..."]  # time spent detached, s
     events: Int[Array, "..."]  # status changes, rebounds and reversals of slip
     crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity
-    start: Float[Array, "..."]  # mechanical energy at the start, J
+    beyond_rest: Float[Array, "..."]  # work of all forces but impacts beyond those at rest, J; see the module's text
+    start: Float[Array, "..."]  # mechanical energy at the start, of displacements from rest, J
     worst: Float[Array, "..."]  # largest size of the residual so far, J
 
 
@@ -144,11 +156,13 @@ class Books(eqx.Module):
     """What a scene's ledger needs of it, worked out once."""
 
     structure: Structure
+    springs: Springs
     dampers: dict[str, Float[Array, "n n"]]
     final_load: Float[Array, ""]
 
     def __init__(self, scene: Scene):
         self.structure = scene.structure
+        self.springs = Springs(scene.structure.stiffness)
         self.dampers = scene.structure.damping_parts
         self.final_load = scene.load.final
 
@@ -181,10 +195,12 @@ def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: S
 
 
 def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Flows:
-    """The flows at one instant, in W."""
-    structure = books.structure
+    """The flows at one instant, in W; where `mechanics` has a rest, of the forces beyond it, but for all of `interface`."""
+    structure, rest = books.structure, mechanics.rest
     velocity = y[structure.size :]
-    force, _ = physics.contact_forces(mechanics, contact, load, y)
+    force, _ = physics.added_forces(mechanics, contact, load, y)
+    total_force, _ = physics.contact_forces(mechanics, contact, load, y)
+    final_load = books.final_load if rest is None else books.final_load - rest.load
     from_belt = force * velocity[structure.tangential]
     none = jnp.zeros_like(from_belt)
     sliding = contact.status == Status.SLIDE
@@ -192,12 +208,38 @@ def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Arr
     return Flows(
         stick=jnp.where(contact.status == Status.STICK, from_belt, none),
         slide=jnp.where(sliding, from_belt, none),
-        interface=jnp.where(sliding, -force * physics.relative_velocity(mechanics, y), none),
+        interface=jnp.where(sliding, -total_force * physics.relative_velocity(mechanics, y), none),
         damping=_form(structure.damping, velocity),
         dampers={name: _form(part, velocity) for name, part in books.dampers.items()},
         load=load * along_load,
-        kick=(load - books.final_load) * along_load,
+        kick=(load - final_load) * along_load,
     )
+
+
+def _work(
+    books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], within: Within
+) -> tuple[Flows, Float[Array, ""]]:
+    """The flows of one advance, cumulated, and what all forces together did beyond those at rest, in J."""
+    rest = mechanics.rest
+    along = jax.vmap(lambda y: powers(books, mechanics, contact, load, y))(within.states)
+    beyond = jax.tree.map(lambda power: jnp.sum(within.weights * power), along)
+    if rest is None:
+        return beyond, beyond.mechanical
+    moved = within.weights @ within.states[:, books.structure.size :]
+    by_contact = rest.tangential_force * moved[mechanics.tangential]
+    by_load = rest.load * jnp.sum(books.structure.load_direction * moved)
+    total = eqx.tree_at(
+        lambda flows: (flows.stick, flows.slide, flows.load),
+        beyond,
+        (
+            beyond.stick + jnp.where(contact.status == Status.STICK, by_contact, 0.0),
+            beyond.slide + jnp.where(contact.status == Status.SLIDE, by_contact, 0.0),
+            beyond.load + by_load,
+        ),
+    )
+    # Of an open contact the forces at rest are missing, which no line of the table says.
+    missing = by_contact + rest.normal_force * moved[mechanics.normal]
+    return total, beyond.mechanical - jnp.where(contact.status == Status.DETACH, missing, 0.0)
 
 
 def open_ledger(books: Books, y: State) -> Ledger:
@@ -211,19 +253,31 @@ def open_ledger(books: Books, y: State) -> Ledger:
         detach_time=none,
         events=no,
         crossings=no,
-        start=mechanical_energy(books.structure, y),
+        beyond_rest=none,
+        start=_stored(books, y),
         worst=none,
     )
 
 
 def residual(books: Books, ledger: Ledger, y: State) -> Float[Array, ""]:
-    """Growth of mechanical energy that no line accounts for, in J: the error of the computation."""
-    grown = mechanical_energy(books.structure, y) - ledger.start
-    return grown - (ledger.work.mechanical - ledger.impact)
+    """Growth of mechanical energy that no line accounts for, in J: the error of the computation.
+
+    `y` is the state as the mechanics measure it with which the ledger was entered: a total, or a deviation from rest.
+    """
+    grown = _stored(books, y) - ledger.start
+    return grown - (ledger.beyond_rest - ledger.impact)
+
+
+def _stored(books: Books, y: State) -> Float[Array, ""]:
+    """Mechanical energy, free of cancellation where the structure has moved far as a whole."""
+    return kinetic_energy(books.structure, y) + books.springs.energy(y[: books.structure.size])
 
 
 def exchanged(ledger: Ledger) -> Float[Array, "..."]:
-    """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
+    """How much the lines of the balance hold together, in J: what a residual is to be measured against.
+
+    Each line counts net, so what a vibration takes up and gives back within a cycle does not.
+    """
     work = ledger.work
     return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(ledger.impact)
 
@@ -248,8 +302,7 @@ def enter(
     structure = books.structure
     n, normal, tangential = structure.size, structure.normal, structure.tangential
     within = method.within(mechanics, contact, load, y, after.h)
-    along = jax.vmap(lambda state: powers(books, mechanics, contact, load, state))(within.states)
-    work = jax.tree.map(lambda line, power: line + jnp.sum(within.weights * power), ledger.work, along)
+    work, beyond_rest = _work(books, mechanics, contact, load, within)
     # While detached, velocities jump at re-contact and at nothing else. The difference of squares, free of cancellation.
     before, behind = within.end[n:], after.y[n:]
     impulses = jnp.sum(structure.mass * (behind - before), axis=-1)
@@ -262,13 +315,14 @@ def enter(
     reversed_ = (contact.status == after.contact.status) & (contact.direction != after.contact.direction)
     reversed_ = reversed_ & (contact.status == Status.SLIDE)
     entered = Ledger(
-        work=work,
+        work=jax.tree.map(jnp.add, ledger.work, work),
         impact=ledger.impact + loss,
         impact_dissipated=ledger.impact_dissipated + dissipated,
         stick_time=ledger.stick_time + jnp.where(contact.status == Status.STICK, after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(detached, after.h, 0.0),
         events=ledger.events + ((after.contact.status != contact.status) | bounced | reversed_),
         crossings=ledger.crossings + ((y[n + tangential] < 0) & (after.y[n + tangential] >= 0)),
+        beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
         worst=ledger.worst,
     )

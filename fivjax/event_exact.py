@@ -157,16 +157,15 @@ def _series(
     _, g_tn, _ = mechanics.compliance
     none = jnp.zeros_like(load)
     states, guards, slips, friction, normal_forces = [y], [], [], [], []
-    at_rest = eqx.tree_at(lambda m: m.belt_speed, mechanics, none)
     for k in range(order + 1):
-        own, force = (mechanics, load) if k == 0 else (at_rest, none)
+        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, none)
         free = physics.free_acceleration(own, force, states[k])
         slips.append(physics.slip_speed(own, contact, states[k]))
         if k == 0:
             sliding = physics.sliding_forces(own, free, contact.direction, slips[0])
             friction.append(mechanics.friction(slips[0]))
             compliance = mechanics.normal_compliance(contact.direction, friction[0])
-            normal_forces.append(sliding[1])
+            normal_forces.append(physics.total_forces(own, *sliding)[1])
         else:
             if not mechanics.friction.constant:
                 friction.append(mechanics.friction.next_term(slips))
@@ -188,10 +187,9 @@ def _rounding(
     """What rounding leaves of the first three coefficients of the guards where they are zero."""
     eps = jnp.finfo(y.dtype).eps
     mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
-    at_rest = eqx.tree_at(lambda m: m.belt_speed, mechanics, jnp.zeros_like(load))
     sizes, found = jnp.abs(y), []
     for k in range(3):
-        own, force = (mechanics, load) if k == 0 else (at_rest, jnp.zeros_like(load))
+        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
         guards, rates = physics.magnitudes(own, contact, force, sizes)
         found.append(ROUNDINGS * eps * jnp.concatenate([guards, jnp.zeros_like(guards[:1])]))
         sizes = rates * (unit / (k + 1))

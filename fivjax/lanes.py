@@ -23,8 +23,8 @@ from . import attractor as attractors
 from . import contact as physics
 from . import orbit as orbits
 from .attractor import Approach, Attractor
-from .contact import Contact, Mechanics, State
-from .energy import Books, Ledger, enter, exchanged, open_ledger, vibration_energy
+from .contact import Contact, Mechanics, Rest, State
+from .energy import Books, Ledger, enter, exchanged, mechanical_energy, open_ledger
 from .event_exact import EventExact
 from .interrupts import noted
 from .load import AbstractLoad
@@ -80,7 +80,7 @@ class Lane(eqx.Module):
     """One trajectory on its way to a verdict."""
 
     t: Float[Array, ""]
-    y: State
+    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
     contact: Contact
     orbit: Orbit
     events: Int[Array, ""]  # status changes so far
@@ -132,10 +132,23 @@ class Batch(NamedTuple):
     pool: ThreadPoolExecutor
 
 
+def measured_from_rest(scene: Scene) -> Mechanics:
+    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
+
+    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
+    would be decided, and the balance of energy upset, by noise.
+    """
+    load = scene.load.final
+    _, normal_force = steady_sliding(scene, load)
+    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
+
+
 def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
     """A lane at the sliding equilibrium of its scene, just before anything happens."""
     q, _ = steady_sliding(scene, scene.load.force)
-    y = jnp.concatenate([q, jnp.zeros_like(q)])
+    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
+    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
     verdict = jnp.where(
         ~modes.linear.solvable,
         Verdict.PAINLEVE,
@@ -145,7 +158,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
     return Lane(
         t=jnp.zeros((), y.dtype),
         y=y,
-        contact=physics.status_from_forces(mechanics, scene.load.force, y),
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
         orbit=orbits.new_orbit(y),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
@@ -155,11 +168,11 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
     )
 
 
-def released(scene: Scene, lane: Lane, load: Float[Array, ""]) -> Lane:
+def released(scene: Scene, modes: SlidingModes, lane: Lane, load: Float[Array, ""]) -> Lane:
     """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks."""
     q, _ = steady_sliding(scene, load * scene.load.final)
-    at_rest = jnp.concatenate([q, jnp.zeros_like(q)])
-    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (at_rest, jnp.max(scene.load.jumps, initial=0.0)))
+    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
+    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (deviation, jnp.max(scene.load.jumps, initial=0.0)))
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
@@ -191,7 +204,7 @@ def follow(
 
     def step(_, lane: Lane) -> Lane:
         t = next_step_end(scene.load, lane.t, longest)
-        load = scene.load(0.5 * (lane.t + t))
+        load = scene.load(0.5 * (lane.t + t)) - scene.load.final
         after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
         y, contact, h, peak = after
         t = jnp.where(h >= t - lane.t, t, lane.t + h)
@@ -199,7 +212,7 @@ def follow(
         orbit = orbits.observe(
             lane.orbit,
             weights,
-            modes.linear.equilibrium,
+            jnp.zeros_like(y),
             structure.tangential,
             lane.y,
             y,
@@ -223,26 +236,24 @@ def follow(
 
     def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
         ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
-        rest = modes.linear.equilibrium[: structure.size]
         kick_ends = jnp.max(scene.load.jumps, initial=0.0)
         just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
-        vibration = vibration_energy(structure, rest, after.y)
+        vibration = mechanical_energy(structure, after.y)
         return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
     def look(_, carry: tuple[Lane, Bool[Array, ""]]):
         lane = jax.lax.fori_loop(0, LOOK_EVERY, step, carry[0])
-        latest = lane.orbit.latest
-        deviation = weights * (latest - modes.linear.equilibrium)
-        approach, reached = attractors.approached(lane.approach, attractor, deviation, latest)
+        approach, reached = attractors.approached(lane.approach, attractor, weights * lane.orbit.latest)
         return eqx.tree_at(lambda lane: lane.approach, lane, approach), carry[1] | reached
 
     after, reached = jax.lax.fori_loop(0, looks, look, (lane, jnp.zeros((), bool)))
     reached = reached & ~after.orbit.returned
     amplitude = jnp.where(reached, attractor.amplitude, after.orbit.amplitude)
     after = eqx.tree_at(lambda lane: lane.orbit.amplitude, after, amplitude)
-    deviation, velocity = after.y - modes.linear.equilibrium, structure.size + structure.tangential
-    yardstick = jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
-    grown = jnp.max(jnp.abs(weights * deviation)) > GROWTH * yardstick
+    equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
+    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    grown = jnp.max(jnp.abs(weights * after.y)) > GROWTH * yardstick
+    wedged = sticks_forever(wedge, mechanics.of_totals, after.contact, after.y + equilibrium)
     quiet_load = jnp.all(scene.load.jumps <= after.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(after.y)),
@@ -257,7 +268,7 @@ def follow(
                     quiet_load & (after.orbit.returned | reached),
                     Verdict.LIMIT_CYCLE,
                     jnp.where(
-                        quiet_load & (sticks_forever(wedge, mechanics, after.contact, after.y) | grown),
+                        quiet_load & (wedged | grown),
                         Verdict.UNBOUNDED,
                         Verdict.UNDECIDED,
                     ),
@@ -442,7 +453,7 @@ def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: 
         lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
         lanes = _followed(batch, shared, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
         look = attractors.blank(len(own), len(weights))
-        look.deviations[running] = weights * (lanes.orbit.latest - shared.modes.linear.equilibrium[own[running]])
+        look.deviations[running] = weights * lanes.orbit.latest
         look.peaks[running], look.times[running] = lanes.orbit.peak, lanes.t
         looks.append(look)
         at_rest[running] = lanes.verdict == Verdict.SLIDING
@@ -500,7 +511,7 @@ def _shared(batch: Batch, distinct: np.ndarray) -> Shared:
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
-        mechanics = Mechanics(own)
+        mechanics = measured_from_rest(own)
         return mechanics, method.prepare(mechanics), linear_sliding(own), wedge(own)
 
     return jax.vmap(one)(values)
@@ -533,7 +544,7 @@ def _begin(scene, names, history, energy: bool, kicked: bool, shared: Shared, co
 
         def one(row, release):
             lane = begin(_with(own, history, row), shared.mechanics, shared.modes, energy)
-            return lane if kicked else released(own, lane, release)
+            return lane if kicked else released(own, shared.modes, lane, release)
 
         return jax.vmap(one)(columns, releases)
 

@@ -59,7 +59,8 @@ def bistability_map(
       delete it when the map is saved.
     - `energy`: whether to keep each lane's energy ledger up to its verdict (see `fivjax.energy`): the works, the energy
       lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
-      error of the balance on the way, with `energy_exchanged` to measure it against. It makes a map some ten times slower.
+      error of the balance on the way, with `energy_exchanged` (the sizes of the works and the loss, net of each line) to
+      measure it against: 1e-8 of it at most, but for a lane in a thousand. It makes a map some ten times slower.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak

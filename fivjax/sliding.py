@@ -169,10 +169,12 @@ def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
     return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
 
 
-def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, y: State) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now, under its final load, never stops sliding."""
+def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State) -> Bool[Array, ""]:
+    """Whether a bound shows that a contact which slides now, under its final load, never stops sliding; from the state's
+    deviation from the equilibrium.
+    """
     linear = modes.linear
-    z = (y - linear.equilibrium)[_sliding_coordinates(y.shape[0] // 2, mechanics.normal)]
+    z = deviation[_sliding_coordinates(deviation.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
     sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
     sliding = sliding & modes.stable & linear.exists

@@ -2,7 +2,8 @@
 
     python tests/measure_extremes.py [lanes] [confirm] [energy] [table] [resume] [refusals]
 
-Each word picks one study; without any, all run. `EXTREMES_LANES` sets how many lanes are drawn (100,000 unless given).
+Each word picks one study; without any, all run. `EXTREMES_LANES` sets how many lanes are drawn (100,000 unless given),
+`EXTREMES_ASKED` of about how many of them `confirm` asks the reference (300 unless given).
 `confirm` needs no `lanes` before it; both keep what they ran in the temporary folder. The reference is `tests/oracle.py`.
 """
 
@@ -33,6 +34,7 @@ from fivjax.steppers import MOST_ADVANCES
 from fivjax.verdict import Verdict
 
 COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
+ASKED = int(os.environ.get("EXTREMES_ASKED", "300"))
 T_MAX, MAX_STEPS = 20.0, 2048
 PATIENCE = 5  # s that the oracle gets for one lane
 TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest step of its own
@@ -183,9 +185,19 @@ def same_state(lane: dict, model: oracle.Model) -> bool | None:
     ours = fj.simulate(extremes.scene(lane), t1, t1)
     length = np.max(np.abs(run.q))
     speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / extremes.slow_period(lane))
-    apart = np.max(np.abs(ours.displacement[-1] - run.q[-1])) / length
-    apart = max(apart, np.max(np.abs(ours.velocity[-1] - run.v[-1])) / speed)
-    return bool(apart <= 1e-6)
+
+    def apart(q, v):
+        return max(np.max(np.abs(q - run.q[-1])) / length, np.max(np.abs(v - run.v[-1])) / speed)
+
+    found = apart(ours.displacement[-1], ours.velocity[-1])
+    if found <= 1e-6:
+        return True
+    # A contradiction only if the reference is sure of itself: not where its own tolerance, or what rounding sets off from an
+    # unstable equilibrium that nothing kicks, moves it further.
+    again = limited(oracle.simulate, model, t1, np.array([0.0, t1]), None, 1e-11)
+    if again is None or len(again.q) < 2 or apart(again.q[-1], again.v[-1]) > found:
+        return None
+    return False
 
 
 def at_corners(lanes: dict) -> np.ndarray:
@@ -193,7 +205,7 @@ def at_corners(lanes: dict) -> np.ndarray:
     return sum(np.isin(lanes[name], extremes.CORNERS[name]).astype(int) for name in extremes.CORNERS if name in lanes)
 
 
-def confirm(count: int = 300) -> None:
+def confirm(count: int = ASKED) -> None:
     """Lanes of every status, half of each from the corners, by the independent solver."""
     (lanes, verdict, last), (falling, falling_verdict, falling_last) = drawn()
     groups = [(lanes, verdict, last, code) for code in np.unique(verdict)]
@@ -226,35 +238,26 @@ def confirm(count: int = 300) -> None:
 
 
 def energy(count: int = 8192) -> None:
-    """The residual of the balance in units of the energy exchanged, over every finished lane."""
-    lanes = extremes.draw(min(COUNT, count), seed=4)
-    outcome = decided(lanes, energy=True)
-    finished = (outcome.verdict >= 0) | (outcome.verdict == Verdict.UNDECIDED)
-    moved = finished & (outcome.energy["energy_exchanged"] > 0)
-    residual, through = outcome.energy["energy_residual"], outcome.energy["energy_exchanged"]
-    share = np.where(moved, residual / np.where(moved, through, 1.0), 0.0)
-    # What a state cannot hold: one rounding of the energy that the structure stores at rest.
-    stored = np.zeros(len(share))
-    for index in np.flatnonzero(moved):
-        model = extremes.model(extremes.row(lanes, index))
-        q, _ = oracle.sliding_equilibrium(model)
-        stored[index] = 0.5 * np.abs(q) @ np.abs(model.stiffness) @ np.abs(q)
-    floor = np.finfo(float).eps * stored
-    print(f"{int(finished.sum())} of {count} lanes finished, {int(moved.sum())} of them exchanged energy")
-    print(f"residual ≤ 1e-8 of the energy exchanged: {np.mean(share[moved] <= 1e-8):.3%}")
-    seen = moved & (through > 1e8 * floor)
-    print(
-        f"of the {int(seen.sum())} whose exchange is 1e8 roundings of the stored energy or more: "
-        f"{np.mean(share[seen] <= 1e-8):.3%}, median {np.median(share[seen]):.0e}, worst {share[seen].max():.0e}"
-    )
-    rest = moved & ~seen
-    print(
-        f"of the {int(rest.sum())} others: residual at most {np.max(residual[rest] / floor[rest]):.0f} roundings of the "
-        f"stored energy, {np.mean(residual[rest] <= 100 * floor[rest]):.3%} within 100"
-    )
-    for index in np.flatnonzero(seen & (share > 1e-8))[:20]:
-        lane = extremes.row(lanes, index)
-        print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in lane.items()})
+    """The residual of the balance in units of the energy exchanged (net, by line), over every finished lane."""
+    count = min(COUNT, count)
+    draws = {
+        "friction that does not fall": extremes.draw(count, seed=4),
+        "falling friction": extremes.draw_falling(count // 8, seed=9),
+    }
+    for name, lanes in draws.items():
+        outcome = decided(lanes, energy=True)
+        finished = (outcome.verdict >= 0) | (outcome.verdict == Verdict.UNDECIDED)
+        residual, through = outcome.energy["energy_residual"], outcome.energy["energy_exchanged"]
+        moved = finished & (through > 0)
+        share = np.where(moved, residual / np.where(moved, through, 1.0), 0.0)
+        print(
+            f"{name}: {int(finished.sum())} of {len(share)} lanes finished, {int(moved.sum())} of them exchanged energy; residual "
+            f"≤ 1e-8 of it on {np.mean(share[moved] <= 1e-8):.3%}, median {np.median(share[moved]):.0e}, worst {share.max():.0e}"
+        )
+        beyond = np.flatnonzero(share > 1e-8)
+        for index in beyond[np.argsort(-share[beyond])]:
+            lane = extremes.row(lanes, index)
+            print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in lane.items()})
 
 
 PAPER = dict(belt_speed=3.0, theta=0.01, mu=0.227, p=1.3, c1=1.0, c2=1.0, m1=0.53, m2=0.045, k1=1e5, k2=1.01e5,

@@ -61,7 +61,7 @@ def looks_until_reached(distances):
     with jax.enable_x64(True):
         attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0), jnp.asarray(True))
         approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
-        step = jax.jit(lambda approach, state: approached(approach, attractor, state, state))
+        step = jax.jit(lambda approach, state: approached(approach, attractor, state))
         for look, distance in enumerate(distances):
             approach, reached = step(approach, attractor.crossings[0] + distance * away)
             if reached:
@@ -88,7 +88,7 @@ def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
         unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0), jnp.asarray(False))
         near = Approach(jnp.zeros(2), jnp.asarray(9), jnp.asarray(0.0))
-        assert not approached(near, unknown, jnp.full(2, 1e-9), jnp.full(2, 1e-9))[1]
+        assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 
 
 def test_known_limit_cycles_change_no_verdict(paper_scene):

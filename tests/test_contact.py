@@ -10,7 +10,8 @@ import pytest
 
 import fivjax as fj
 from fivjax import contact as physics
-from fivjax.contact import Contact, Mechanics, Status
+from fivjax.contact import Contact, Mechanics, Rest, Status
+from fivjax.scene import steady_sliding
 
 # Sums of a dozen products and one small linear solve with a well-conditioned mass matrix.
 ROUNDING = 1e-12
@@ -443,6 +444,67 @@ def test_every_transition_ends_on_the_constraint_of_a_consistent_status(n):
         assert after_kind == expected[0]
         if after_kind == Status.SLIDE:
             assert after_direction == expected[1]
+
+
+# --------------------------------------------------------------------------------------- measured from a rest
+
+
+@eqx.filter_jit
+def _about_rest(scene, contact, load, y, ended):
+    """The same questions of the same state, as a deviation from steady sliding; displacements come back as totals."""
+    q, normal_force = steady_sliding(scene, scene.load.force)
+    mechanics = Mechanics(scene).about(Rest(scene, scene.load.force, normal_force), scene.structure)
+    rest = jnp.concatenate([q, jnp.zeros_like(q)])
+    beyond, excess = y - rest, load - scene.load.force
+    following, after = physics.transition(mechanics, contact, excess, beyond, ended, jnp.asarray(1e-3))
+    return (
+        physics.acceleration(mechanics, contact, excess, beyond),
+        jnp.stack(physics.contact_forces(mechanics, contact, excess, beyond)),
+        physics.guards(mechanics, contact, excess, beyond),
+        following,
+        after + rest,
+        rest,
+    )
+
+
+@pytest.mark.parametrize("law", ["coulomb", "falling"])
+def test_measured_from_a_rest_the_physics_is_the_same(law):
+    """Accelerations, forces, guards and what follows an event: totals and deviations differ by rounding only."""
+    rng, n = np.random.default_rng(17), 3
+    for k in range(60):
+        scene = random_scene(rng, n, law=law, restitution=0.4)
+        kind = Status(k % 3)
+        direction, load = float(rng.choice([-1, 1])), float(rng.normal() * 100)
+        slip = 0.0 if kind == Status.STICK else float(-direction * rng.uniform())
+        y = on_the_belt(rng, scene, slip=slip)
+        if kind == Status.DETACH:
+            y[n + scene.structure.normal] = -rng.uniform()
+        ended = [True, True] if kind == Status.DETACH else [False, True]
+        expected = motion(scene, kind, direction, load, y)
+        with jax.enable_x64(True):
+            found = _about_rest(
+                scene, as_contact(kind, direction), jnp.asarray(load), jnp.asarray(y), jnp.asarray(ended)
+            )
+        *found, following, after, rest = jax.tree.map(np.asarray, found)
+        stiffness = np.abs(np.linalg.solve(scene.structure.mass, np.asarray(scene.structure.stiffness))).max()
+        scale = stiffness * (np.abs(rest).max() + np.abs(y).max()) * np.abs(scene.structure.mass).max()
+        for mine, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * scale)
+        code, sense, behind = transition(scene, kind, direction, load, y, ended, 1e-3)
+        assert (int(following.status), float(following.direction)) == (code, sense)
+        np.testing.assert_allclose(after, behind, rtol=0, atol=1e-11 * scale)
+
+
+def test_at_rest_nothing_is_left_but_exact_zeros():
+    """Where nothing deviates nothing accelerates, and the friction cone is met on its edge: no rounding to be taken for either."""
+    scene = fj.Scene(fj.belt_oscillator(k2=1e10, m2=1e-6, c1=0.0, c2=0.0), fj.Coulomb(0.3), 1e-6, fj.ConstantLoad(1e9))
+    with jax.enable_x64(True):
+        _, normal_force = steady_sliding(scene, scene.load.force)
+        mechanics = Mechanics(scene).about(Rest(scene, scene.load.force, normal_force), scene.structure)
+        still, none = jnp.zeros(6), jnp.zeros(())
+        assert np.all(np.asarray(physics.acceleration(mechanics, as_contact(Status.SLIDE), none, still)) == 0)
+        margins = np.asarray(physics.guards(mechanics, as_contact(Status.STICK), none, still.at[3].set(1e-6)))
+        assert margins[0] == 0 and margins[1] > 1e8
 
 
 # --------------------------------------------------------------------------------------------- impacts

@@ -4,10 +4,12 @@ import math
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.structure import Springs
 
 # A few products and sums of double-precision numbers; anything wrong in a formula is off by many orders more.
 ROUNDING = 1e-14
@@ -341,3 +343,33 @@ def test_default_indices_do_not_fit_two_coordinates():
     """Were the default gap index 2 wrapped round for two coordinates, the contact would be on the wrong one."""
     with pytest.raises(ValueError, match=r"`normal` must be between 0 and 1, but is 2"):
         fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1])
+
+
+@pytest.mark.parametrize("k2", [0.1, 1e5, 1e10])
+@pytest.mark.parametrize("theta", [0.0, 0.3, -1.2])
+def test_springs_are_the_stiffness_and_none_where_the_structure_is_free(theta, k2):
+    """Lifted off the belt as a whole, the oscillator stretches no spring: its energy is of second order in rounding."""
+    with jax.enable_x64(True):
+        structure = fj.belt_oscillator(theta=theta, k2=k2)
+        springs = Springs(structure.stiffness)
+        stretch, rates = np.asarray(springs.stretch), np.asarray(springs.rates)
+        stiffness = np.asarray(structure.stiffness)
+        np.testing.assert_allclose(stretch.T * rates @ stretch, stiffness, rtol=0, atol=ROUNDING * abs(stiffness).max())
+        assert np.sum(rates == 0) == 1
+        whole = np.array([math.sin(theta), 1.0, math.cos(theta)])
+        rounding = 1e-15 * rates.max()
+        assert float(springs.energy(whole)) <= rounding**2 / rates[rates > 0].min()
+        q = np.random.default_rng(1).normal(size=3)
+        assert float(springs.energy(q)) == pytest.approx(0.5 * q @ stiffness @ q, rel=1e-12)
+
+
+def test_springs_of_any_stiffness():
+    """Definite, of lower rank, or none at all."""
+    rng = np.random.default_rng(2)
+    for rank in (5, 3, 0):
+        root = rng.normal(size=(5, rank))
+        with jax.enable_x64(True):
+            springs = Springs(jnp.asarray(root @ root.T))
+            stretch, rates = np.asarray(springs.stretch), np.asarray(springs.rates)
+        assert np.sum(rates > 0) == rank and np.all(rates >= 0)
+        np.testing.assert_allclose(stretch.T * rates @ stretch, root @ root.T, atol=1e-13)
