@@ -84,49 +84,60 @@ def harmonics(
     # From the middle the frequency and the phases do not depend on each other.
     t = dt * (np.arange(len(means)) - 0.5 * (len(means) - 1))
     weight = taper(len(means))
-    orders = np.arange(1, count + 1)
     frequency = _strongest(means / sigma, dt, lowest, highest)
+    fit = _lines(t, means, sigma, weight, frequency, count)
     for _ in range(REFINEMENTS):
-        waves = _waves(t, frequency, count)
-        # Over several periods the columns are nearly orthogonal, so the normal equations lose nothing.
-        onto = np.linalg.solve((waves.T * weight) @ waves, waves.T * weight)
-        shares = onto @ means
-        found = shares[1 : count + 1] - 1j * shares[count + 1 :]
-        # How the signals change with the frequency, other than by what the lines themselves can follow.
-        turning = 2 * np.pi * t[:, None] * (waves[:, 1 : count + 1] + 1j * waves[:, count + 1 :]) * 1j
-        along = (turning * orders) @ found
-        along = along.real - waves @ (onto @ along.real)
-        towards = weight[:, None] * along / sigma**2
-        curvature = np.sum(towards * along)
-        if not curvature > 0:
-            break
-        step = np.sum(towards * (means - waves @ shares)) / curvature
-        frequency = float(np.clip(frequency + step, lowest, highest))
-    else:
-        waves = _waves(t, frequency, count)
+        frequency = float(np.clip(frequency + fit.step, lowest, highest))
+        fit = _lines(t, means, sigma, weight, frequency, count)
     # Each number as a sum over samples: first the frequency, then the lines, which follow it.
-    channels = range(means.shape[1])
-    to_frequency = towards / curvature if curvature > 0 else np.zeros_like(means)
-    slope = onto @ ((turning * orders) @ found).real
-    variance = np.sum((to_frequency * sigma) ** 2)
+    variance = np.sum((fit.to_frequency * sigma) ** 2)
     errors = np.zeros((1 + 2 * count * means.shape[1],) * 2)
     errors[0, 0] = variance
-    columns = [slice(1 + 2 * count * k, 1 + 2 * count * (k + 1)) for k in channels]
-    for k in channels:
-        shared = onto[1:] @ (to_frequency[:, k] * sigma[k] ** 2)
-        errors[0, columns[k]] = errors[columns[k], 0] = shared - slope[1:, k] * variance
-        for j in channels:
-            other = onto[1:] @ (to_frequency[:, j] * sigma[j] ** 2)
-            block = np.outer(slope[1:, k], slope[1:, j]) * variance
-            block -= np.outer(shared, slope[1:, j]) + np.outer(slope[1:, k], other)
+    columns = [slice(1 + 2 * count * k, 1 + 2 * count * (k + 1)) for k in range(means.shape[1])]
+    shared = [fit.to_lines @ (fit.to_frequency[:, k] * sigma[k] ** 2) for k in range(means.shape[1])]
+    for k, own in enumerate(columns):
+        errors[0, own] = errors[own, 0] = shared[k] - fit.follow[:, k] * variance
+        for j, other in enumerate(columns):
+            block = np.outer(fit.follow[:, k], fit.follow[:, j]) * variance
+            block -= np.outer(shared[k], fit.follow[:, j]) + np.outer(fit.follow[:, k], shared[j])
             if j == k:
-                block += sigma[k] ** 2 * (onto[1:] @ onto[1:].T)
-            errors[columns[k], columns[j]] = block
-    values, slopes = referred(frequency, found, with_slopes=True)
+                block += sigma[k] ** 2 * (fit.to_lines @ fit.to_lines.T)
+            errors[own, other] = block
+    values, slopes = referred(frequency, fit.found)
     return Harmonics(frequency, values, slopes @ errors @ slopes.T)
 
 
-def referred(frequency: float, found: Complex[np.ndarray, "count k"], with_slopes: bool = False):
+class _Lines(NamedTuple):
+    """Lines at one frequency, by weighted least squares, and how they and a better frequency depend on the samples."""
+
+    found: Complex[np.ndarray, "count k"]
+    step: float  # Gauss–Newton's, of the frequency, Hz
+    to_frequency: Float[np.ndarray, "B k"]
+    to_lines: Float[np.ndarray, "m B"]  # cosines, then sines, of every channel
+    follow: Float[np.ndarray, "m k"]  # by how much less they are where the frequency is higher
+
+
+def _lines(t, means, sigma, weight, frequency: float, count: int) -> _Lines:
+    waves = _waves(t, frequency, count)
+    # Over several periods the columns are nearly orthogonal, so the normal equations lose nothing.
+    onto = np.linalg.solve((waves.T * weight) @ waves, waves.T * weight)
+    shares = onto @ means
+    found = shares[1 : count + 1] - 1j * shares[count + 1 :]
+    turning = 2j * np.pi * t[:, None] * np.arange(1, count + 1) * (waves[:, 1 : count + 1] + 1j * waves[:, count + 1 :])
+    # How the signals change with the frequency, other than by what the lines themselves can follow.
+    along = (turning @ found).real
+    follow = onto @ along
+    along = along - waves @ follow
+    towards = weight[:, None] * along / sigma**2
+    curvature = np.sum(towards * along)
+    to_frequency = towards / curvature if curvature > 0 else np.zeros_like(towards)
+    step = float(np.sum(to_frequency * (means - waves @ shares)))
+    return _Lines(found, step, to_frequency, onto[1:], follow[1:])
+
+
+def referred(
+    frequency: float, found: Complex[np.ndarray, "count k"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m j"]]:
     """Frequency (Hz), then the amplitude of the first channel's fundamental, then the real and imaginary parts of all other
     lines, turned so that this fundamental has phase zero.
 
@@ -138,8 +149,6 @@ def referred(frequency: float, found: Complex[np.ndarray, "count k"], with_slope
     phase = found[0, 0] / size if size > 0 else 1.0
     turned = found * np.conj(phase) ** orders
     values = _in_order(frequency, size, turned)
-    if not with_slopes:
-        return values
     slopes = np.zeros((len(values), 1 + 2 * found.size))
     slopes[0, 0] = 1.0
     for k, sine, h in np.ndindex(channels, 2, count):
