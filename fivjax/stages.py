@@ -342,8 +342,10 @@ def _growth(system: Float[np.ndarray, "2n 2n"], where: int) -> float:
     # A disturbed state comes back later; the period is what brings the tangential velocity back.
     period = system[:, where]
     carried = (system + np.eye(len(system)))[:, rest]
-    returned = carried - np.outer(period, carried[where] / period[where])
-    return float(np.max(np.abs(np.linalg.eigvals(returned[rest]))))
+    with np.errstate(all="ignore"):
+        returned = (carried - np.outer(period, carried[where] / period[where]))[rest]
+    # Where no cycle was closed, none lasts.
+    return float(np.max(np.abs(np.linalg.eigvals(returned)))) if np.all(np.isfinite(returned)) else np.inf
 
 
 @eqx.filter_jit
