@@ -7,8 +7,8 @@ Least squares in stages, so that no start ends a period beside the truth:
 3. waveforms over windows that grow, and all harmonics of limit cycles, from the best few;
 4. once the noise is known from what is left, the last fit again.
 
-Every stage is a Levenberg–Marquardt minimisation by optimistix with forward-mode Jacobians, exact through contact events,
-all starts in one batch. The covariance is $(J^T J)^{-1}$ at the end, J the Jacobian of the residuals in units of the
+Every stage (`stages`) is a Levenberg–Marquardt minimisation with forward-mode Jacobians, exact through contact events, all
+starts in one batch. The covariance is $(J^T J)^{-1}$ at the end, J the Jacobian of the residuals in units of the
 noise. Its singular values say which combinations of parameters the data tell: a parameter whose standard deviation
 exceeds a stated share of itself is reported as *not identifiable*, not as a number.
 """
@@ -20,42 +20,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import xarray as xr
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 from tqdm.auto import tqdm
 
 from . import arguments
+from .cycle_misfit import BEATS, CycleMisfit, cycle_misfit, cycle_rate
 from .event_exact import EventExact
-from .misfit import OFFSET_UNIT, AbstractMisfit, CycleMisfit, KickMisfit, cycle_rate, misfit
+from .misfit import OFFSET_UNIT, misfit
 from .parameters import FreeParameters
 from .precision import in_double_precision
 from .results import labelled
 from .scene import Scene, sliding_equilibrium
-from .signals import Recording, averaged
+from .signals import Averaged, Recording, averaged
 from .sliding import linear_sliding
+from .stages import Problem, Stages
+from .starts import hypercube, vibrating
 from .steppers import AbstractStepper
 
-# Scenes looked at, without derivatives, for one that vibrates much as the limit cycle that was measured.
+# Scenes looked at for one that vibrates much as the limit cycle that was measured.
 SCREENED = 32
 # Blocks per period of the highest sliding mode of the scene that the fit starts from.
 BLOCKS_PER_PERIOD = 16
-# Starts that go on from the features to the waveform; with time offsets to try, two with three each.
-KEPT = 4
-KEPT_WITH_OFFSETS = 6
-WINDOWS = (0.15, 0.4, 1.0)
-# Shares of the recording below this are far from the answer.
-FAR = 1.0
-# Where a fit stops: changes of every residual, in standard deviations of the noise, and of the parameters' logarithms.
-EARLY_TOLERANCE, FINAL_TOLERANCE, ANY = 1e-2, 1e-5, 1e30
-MOST_STEPS = 40
-# How far the features may pull a parameter from its start, as a factor of e: what they do not tell stays where it was.
-LEASH = 0.7
 # A signal counts if it carries more than so much energy per fitted number, in units of the noise.
 SIGNIFICANT = 25.0
 # Residuals this much alike from one block to the next are not noise.
 STRUCTURE = 0.25
-OFFSETS_PER_BLOCK = 4
+# Disturbances of a cycle that grow by more than this a period: it would not last.
+UNSTABLE = 1.001
 
 
 class Outcome(enum.StrEnum):
@@ -64,6 +56,14 @@ class Outcome(enum.StrEnum):
     CONVERGED = "converged"
     NOT_CONVERGED = "not converged: the last fit ran out of steps; start closer, free fewer parameters or set bounds"
     NO_SIGNAL = "no signal: what was recorded does not stand out of the noise, so it tells nothing about the parameters"
+    BEATS = (
+        "not fitted: a recording of a limit cycle does not repeat, it beats or has not settled, so it has no harmonics to "
+        "compare; record it later or with a slower belt, or record how it starts, as a kick or as sliding"
+    )
+    UNSTABLE = (
+        "not stable: the limit cycle that fits best would not last in this scene, so it is not what was measured; start "
+        "closer, or free what differs from the scene"
+    )
     STRUCTURE_LEFT = "converged, but what is left is not noise: the scene cannot explain all of the recording"
 
 
@@ -187,7 +187,8 @@ def calibrate(
     - `data`: a `Recording`, or several with what is known of each run.
     - `free`: names of parameters, any of `scene.parameters`.
     - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may be anything).
-    - `starts`: how many, the scene's own first, the others within `spread` (relative) around it, drawn with `seed`.
+    - `starts`: how many, the scene's own first, the others within `spread` (relative) around it, drawn with `seed`; for
+      limit cycles 32 at least, with sliding modes at the measured frequency.
     - `rate`: blocks per second that recordings are averaged over before they are compared; 16 per period of the scene's
       highest sliding mode unless given, 28 to 48 per period of a limit cycle. The model is averaged over the
       same blocks, exactly.
@@ -239,325 +240,137 @@ def calibrate(
     moved = tuple(r.regime == "kick" and r.offset[0] < r.offset[1] for r in recordings)
     references = jnp.array([r.offset[0] for r in recordings])
     cycles = all(r.regime == "limit cycle" for r in recordings)
-    begins = _starts(parameters, scene, max(int(starts), SCREENED) if cycles else int(starts), float(spread), seed)
     kicked = any(r.regime == "kick" for r in recordings)
     # A response to a kick is first taken to slide throughout, which is quick to try and checked afterwards.
     for uneventful in (True, False) if kicked and scene.friction.constant else (False,):
-        misfits = tuple(misfit(r, b, method, scene, uneventful) for r, b in zip(recordings, blocks, strict=True))
-        fit = _Fit(_Problem(scene, parameters, misfits, references, moved), begins, recordings)
-        with tqdm(total=fit.stages, desc="calibrate", disable=None if progress else True) as bar:
-            for stage in fit.run():
+        misfits = tuple(
+            cycle_misfit(r, b, method, scene) if r.regime == "limit cycle" else misfit(r, b, method, scene, uneventful)
+            for r, b in zip(recordings, blocks, strict=True)
+        )
+        problem = Problem(scene, parameters, misfits, references, moved)
+        if any(cycle.beating > BEATS for cycle in problem.cycles):
+            return _not_tried(problem, recordings, blocks, Outcome.BEATS)
+        if cycles:
+            frequencies = [float(cycle.frequency) for cycle in problem.cycles]
+            begins = vibrating(parameters, scene, frequencies, max(int(starts), SCREENED), float(spread), seed)
+        else:
+            begins = hypercube(parameters, scene, int(starts), float(spread), seed)
+        stages = Stages(problem, begins, recordings)
+        with tqdm(total=stages.count, desc="calibrate", disable=None if progress else True) as bar:
+            for stage in stages.run():
                 bar.set_postfix_str(stage)
                 bar.update()
-        result = fit.result(blocks, float(identifiable_within))
+        result = _result(stages, blocks, float(identifiable_within))
         # Noise alone is not explained any better by contact events.
         if not uneventful or result.outcome is Outcome.NO_SIGNAL:
             break
-        if result.outcome is not Outcome.STRUCTURE_LEFT and fit.slid_throughout():
+        if result.outcome is not Outcome.STRUCTURE_LEFT and stages.slid_throughout():
             break
     return result
 
 
-class _Problem(eqx.Module):
-    """Everything that the residuals of one fit need; all but names and shapes are arrays, so it compiles once."""
-
-    scene: Scene
-    parameters: FreeParameters
-    misfits: tuple[AbstractMisfit, ...]
-    references: Float[Array, " r"]  # time offsets that the moved ones are measured from, s
-    moved: tuple[bool, ...] = eqx.field(static=True)
-
-    @property
-    def size(self) -> int:
-        return len(self.parameters.names)
-
-    def offsets(self, x) -> list:
-        """Time offsets of all recordings, in s."""
-        found, at = [], self.size
-        for k, moved in enumerate(self.moved):
-            found.append(self.references[k] + OFFSET_UNIT * x[at] if moved else self.references[k])
-            at += moved
-        return found
-
-    def coarse(self, u, u0):
-        scene = self.parameters.scene(self.scene, u)
-        return jnp.concatenate([*(m.coarse(scene) for m in self.misfits), (u - u0) / LEASH]), []
-
-    def residual(self, x, x0, share):
-        scene = self.parameters.scene(self.scene, x[: self.size])
-        found = [m.residual(scene, offset, share) for m, offset in zip(self.misfits, self.offsets(x), strict=True)]
-        # Far from the answer the features of a limit cycle alone may leave a parameter untold.
-        leash = jnp.where(share < FAR, (x - x0)[: self.size] / LEASH, 0.0)
-        return jnp.concatenate([*(residual for residual, _ in found), leash]), [model for _, model in found]
-
-
-@eqx.filter_custom_jvp
-def _coarse(u, problem: _Problem, u0):
-    return problem.coarse(u, u0)
-
-
-@_coarse.def_jvp
-def _(primals, tangents):
-    u, problem, u0 = primals
-    found, models, along = _with_dense_jacobian(lambda u: problem.coarse(u, u0), u, tangents[0])
-    return (found, models), (along, models)
-
-
-@eqx.filter_custom_jvp
-def _waveform(x, problem: _Problem, x0, share):
-    return problem.residual(x, x0, share)
-
-
-@_waveform.def_jvp
-def _(primals, tangents):
-    x, problem, x0, share = primals
-    found, models, along = _with_dense_jacobian(lambda x: problem.residual(x, x0, share), x, tangents[0])
-    # Models are looked at, not fitted.
-    return (found, models), (along, jax.tree.map(jnp.zeros_like, models))
-
-
-def _with_dense_jacobian(function, x, tangent):
-    """Residuals, models, and the residuals' derivative along `tangent`, by way of the whole Jacobian.
-
-    The optimiser linearises the residuals and applies that to each unit vector. Left to itself JAX would keep what a
-    linearisation needs of every step of the simulation; pure forward mode keeps nothing, and compiles four times faster.
-    """
-
-    def twice(x):
-        found, models = function(x)
-        return found, (found, models)
-
-    jacobian, (found, models) = jax.jacfwd(twice, has_aux=True)(x)
-    return found, models, jacobian @ tangent
-
-
-class _Minimum(eqx.Module):
-    """Where a minimisation ended, with everything that is wanted there, so that nothing is computed or compiled anew."""
-
-    x: Float[Array, " j"]
-    cost: Float[Array, ""]
-    residual: Float[Array, " r"]
-    jacobian: Float[Array, "r j"]
-    models: list[Float[Array, "B k"]]
-    arrived: Bool[Array, ""]
-    steps: Int[Array, ""]
-
-
-def _minimise(function, start, *args, tolerance) -> _Minimum:
-    def with_models(x, args):
-        residual, models = function(x, *args)
-        return residual, jax.lax.stop_gradient(models)
-
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    solution = optx.least_squares(with_models, solver, start, args, has_aux=True, max_steps=MOST_STEPS, throw=False)
-    there = solution.state.f_info
-    return _Minimum(
-        x=solution.value,
-        cost=jnp.sum(there.residual**2),
-        residual=there.residual,
-        jacobian=there.jac.as_matrix(),
-        models=solution.aux,
-        arrived=solution.result == optx.RESULTS.successful,
-        steps=solution.stats["num_steps"],
+def _result(stages: Stages, blocks, identifiable_within: float) -> Calibration:
+    problem, best, size = stages.problem, stages.best, stages.problem.size
+    # Without the rows of the leash, which is let go by then.
+    found, jacobian = best.residual[:-size], best.jacobian[:-size]
+    u = jnp.asarray(best.x[:size])
+    estimates, slope = map(np.asarray, _values_and_slopes(problem.parameters, u))
+    # In whole parameters, so that singular values compare: a change of 100 %, or of a millisecond of offset.
+    whole = np.where(estimates == 0, problem.parameters.size, np.abs(estimates))
+    scales = np.concatenate([whole / slope, np.ones(len(best.x) - size)])
+    deviations, correlation, singular = _covariance(jacobian * scales)
+    means = [np.asarray(block.means)[: len(model)] for block, model in zip(blocks, best.models, strict=True)]
+    signal = _stands_out(stages)
+    freedom = max(len(found) - len(best.x) - sum(m.fitted_by_elimination for m in problem.misfits), 1)
+    misfit = float(found @ found) / freedom
+    if not signal:
+        outcome = Outcome.NO_SIGNAL
+    elif not best.arrived:
+        outcome = Outcome.NOT_CONVERGED
+    elif best.growth > UNSTABLE:
+        outcome = Outcome.UNSTABLE
+    elif _structure_left(stages, means, misfit):
+        outcome = Outcome.STRUCTURE_LEFT
+    else:
+        outcome = Outcome.CONVERGED
+    offsets, at = [], size
+    for moved, offset in zip(problem.moved, problem.offsets(best.x), strict=True):
+        offsets.append((float(offset), float(OFFSET_UNIT * deviations[at])) if moved else None)
+        at += moved
+    return Calibration(
+        scene=problem.at(u),
+        names=problem.parameters.names,
+        estimates=estimates,
+        deviations=deviations[:size] * whole,
+        identified=(deviations[:size] <= identifiable_within) & signal,
+        correlation=correlation[:size, :size],
+        singular_values=singular,
+        offsets=tuple(offsets),
+        recordings=stages.recordings,
+        t=tuple(_middles(block)[: len(model)] for block, model in zip(blocks, best.models, strict=True)),
+        measured=tuple(means),
+        fitted=tuple(best.models),
+        noise=tuple(np.asarray(m.sigma) for m in problem.misfits),
+        misfit=misfit,
+        steps=stages.steps,
+        outcome=outcome,
     )
 
 
-@eqx.filter_jit
-def _fit_features(problem: _Problem, starts: Float[Array, "s k"]):
-    found = jax.vmap(lambda u0: _minimise(_coarse, u0, problem, u0, tolerance=1e-3))(starts)
-    return found.x, found.cost, found.steps
+def _not_tried(problem: Problem, recordings, blocks, outcome: Outcome) -> Calibration:
+    """The result of a fit that would mean nothing: no parameter is told."""
+    size = problem.size
+    return Calibration(
+        scene=problem.scene,
+        names=problem.parameters.names,
+        estimates=np.array([float(problem.scene.parameters[name]) for name in problem.parameters.names]),
+        deviations=np.full(size, np.inf),
+        identified=np.zeros(size, bool),
+        correlation=np.eye(size),
+        singular_values=np.zeros(size + sum(problem.moved)),
+        offsets=tuple((float("nan"), float("inf")) if moved else None for moved in problem.moved),
+        recordings=recordings,
+        t=tuple(_middles(block) for block in blocks),
+        measured=tuple(block.means for block in blocks),
+        fitted=tuple(np.full_like(block.means, np.nan) for block in blocks),
+        noise=tuple(np.asarray(m.sigma) for m in problem.misfits),
+        misfit=float("nan"),
+        steps=0,
+        outcome=outcome,
+    )
 
 
-@eqx.filter_jit
-def _fit_waveform(problem: _Problem, starts: Float[Array, "s j"], share: Float[Array, ""], tolerance: Float[Array, ""]):
-    return jax.vmap(lambda x0: _minimise(_waveform, x0, problem, x0, share, tolerance=tolerance))(starts)
+def _middles(block: Averaged) -> np.ndarray:
+    return 0.5 * (block.edges[1:] + block.edges[:-1])
 
 
-@eqx.filter_jit
-def _integrals(problem: _Problem, which: int, u: Float[Array, "s k"], instants: Float[Array, " b"], eventful=False):
-    mine = problem.misfits[which]
-    return jax.vmap(lambda u: mine.integrals(problem.parameters.scene(problem.scene, u), instants, eventful))(u)
-
-
-class _Fit:
-    """The stages, one after the other."""
-
-    def __init__(self, problem: _Problem, starts: np.ndarray, recordings: tuple[Recording, ...]):
-        self.problem, self.starts, self.recordings = problem, starts, recordings
-        # Limit cycles have no window that grows: their features are compared first roughly, then to the noise.
-        self.cycles = all(isinstance(m, CycleMisfit) for m in problem.misfits)
-        self.windows = (WINDOWS[0], WINDOWS[-1]) if self.cycles else WINDOWS
-        self.stages = len(self.windows) + 3
-        self.steps = 0
-
-    def run(self):
-        """Yields the name of each stage before it begins."""
-        yield "features"
-        candidates = self._screened() if self.cycles else self._from_features()
-        yield "time offsets"
-        candidates = self._with_offsets(candidates)
-        for share in self.windows:
-            yield f"waveform, {100 * share:.0f} %"
-            candidates = self._waveform(candidates, share, EARLY_TOLERANCE if share < FAR else FINAL_TOLERANCE)
-        yield "noise and uncertainties"
-        if self._estimate_noise():
-            self._waveform(candidates[:1], 1.0, FINAL_TOLERANCE)
-
-    def _screened(self) -> np.ndarray:
-        """The starts that come closest to the limit cycles. Far off, a scene may have none, and no derivative leads there."""
-        # A fit that may stop at once, so that nothing new is compiled.
-        return self._waveform(self.starts, self.windows[0], ANY)
-
-    def _from_features(self) -> np.ndarray:
-        found, cost, steps = map(np.asarray, _fit_features(self.problem, jnp.asarray(self.starts)))
-        self.steps += int(steps.max())
-        best_first = found[np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")]
-        return _distinct(np.concatenate([best_first, self.starts]))[:KEPT]
-
-    def _with_offsets(self, candidates: np.ndarray) -> np.ndarray:
-        """The candidates with the time offsets at which each agrees best over all of the recording, or its beginning."""
-        if not any(self.problem.moved):
-            return candidates
-        chosen = candidates[: KEPT_WITH_OFFSETS // len(WINDOWS)]
-        offsets = np.stack(
-            [self._offsets(k, chosen) for k, moved in enumerate(self.problem.moved) if moved], axis=-1
-        )  # (candidate, window, recording)
-        every = np.repeat(chosen[:, None, :], len(WINDOWS), axis=1)
-        return np.concatenate([every, offsets], axis=-1).reshape(-1, chosen.shape[1] + offsets.shape[-1])
-
-    def _offsets(self, k: int, chosen: np.ndarray) -> np.ndarray:
-        """For each candidate and window the best offset of recording k, in units of the problem."""
-        mine, (low, high) = self.problem.misfits[k], self.recordings[k].offset
-        edges, means, sigma = map(np.asarray, (mine.edges, mine.means, mine.sigma))
-        step = (edges[1] - edges[0]) / OFFSETS_PER_BLOCK
-        shifts = int(np.ceil((high - low) / step)) + 1
-        instants = low + edges[0] + step * np.arange(shifts + OFFSETS_PER_BLOCK * len(means))
-        found = np.asarray(_integrals(self.problem, k, jnp.asarray(chosen), jnp.asarray(instants)))
-        cost = np.empty((len(chosen), len(WINDOWS), shifts))
-        ends = [max(1, int(share * len(means))) for share in WINDOWS[::-1]]
-        for i, shift in np.ndindex(len(chosen), shifts):
-            model = np.diff(found[i, shift::OFFSETS_PER_BLOCK][: len(edges)], axis=0) / (edges[1] - edges[0])
-            squares = np.cumsum(np.sum(((means - model) / sigma) ** 2, axis=1))
-            cost[i, :, shift] = squares[[end - 1 for end in ends]]
-        best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
-        return np.minimum(step * best, high - low) / OFFSET_UNIT
-
-    def _waveform(self, candidates: np.ndarray, share: float, tolerance: float) -> np.ndarray:
-        # Always as many at a time, so that it compiles once.
-        count = KEPT_WITH_OFFSETS if any(self.problem.moved) else KEPT
-        found = []
-        for begin in range(0, len(candidates), count):
-            padded = jnp.asarray(np.resize(candidates[begin : begin + count], (count, candidates.shape[1])))
-            batch = _fit_waveform(self.problem, padded, jnp.asarray(share), jnp.asarray(tolerance))
-            self.steps += int(batch.steps.max())
-            found.append(jax.tree.map(np.asarray, batch))
-        found = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-        order = np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf), kind="stable")
-        self.best = jax.tree.map(lambda leaf: leaf[order[0]], found)
-        return found.x[order][:count]
-
-    def _estimate_noise(self) -> bool:
-        """Puts the noise that is left in place of the assumed one; whether that changed anything."""
-        models = self.best.models
-        changed = False
-        for k, (recording, model) in enumerate(zip(self.recordings, models, strict=True)):
-            mine = self.problem.misfits[k]
-            if recording.noise is not None or isinstance(mine, CycleMisfit):
-                continue
-            left = np.asarray(mine.means) - np.asarray(model)
-            # Every fitted number takes its share of the noise away with it; the amplitudes of a small motion count.
-            free = len(self.best.x) / len(models) + (len(model) > 0) * mine.fitted_by_elimination
-            sigma = np.sqrt(np.sum(left**2, axis=0) / max(len(left) - free / left.shape[1], 1.0))
-            sigma = np.where(np.isfinite(sigma) & (sigma > 0), sigma, np.asarray(mine.sigma))
-            self.problem = eqx.tree_at(lambda p, k=k: p.misfits[k].sigma, self.problem, jnp.asarray(sigma))
-            changed = True
-        return changed
-
-    def result(self, blocks, identifiable_within: float) -> Calibration:
-        problem, size = self.problem, self.problem.size
-        # Without the rows of the leash, which is let go by then.
-        found, jacobian, models = self.best.residual[:-size], self.best.jacobian[:-size], self.best.models
-        u = jnp.asarray(self.best.x[:size])
-        estimates, slope = map(np.asarray, _values_and_slopes(problem.parameters, u))
-        # In whole parameters, so that singular values compare: a change of 100 %, or of a millisecond of offset.
-        whole = np.where(estimates == 0, problem.parameters.size, np.abs(estimates))
-        scales = np.concatenate([whole / slope, np.ones(len(self.best.x) - size)])
-        deviations, correlation, singular = _covariance(jacobian * scales)
-        means = [np.asarray(block.means)[: len(model)] for block, model in zip(blocks, models, strict=True)]
-        signal = self._stands_out(models)
-        identified = (deviations[:size] <= identifiable_within) & signal
-        freedom = max(len(found) - len(self.best.x) - sum(m.fitted_by_elimination for m in problem.misfits), 1)
-        misfit = float(found @ found) / freedom
-        if not signal:
-            outcome = Outcome.NO_SIGNAL
-        elif not self.best.arrived:
-            outcome = Outcome.NOT_CONVERGED
-        elif self._structure_left(means, models, misfit):
-            outcome = Outcome.STRUCTURE_LEFT
+def _stands_out(stages: Stages) -> bool:
+    """Whether any recording explains more energy than fitting noise would."""
+    for mine, model in zip(stages.problem.misfits, stages.best.models, strict=True):
+        if isinstance(mine, CycleMisfit):
+            measured = np.asarray(mine.whitening @ mine.measured)
+            explained = float(measured @ measured)
         else:
-            outcome = Outcome.CONVERGED
-        offsets, at = [], size
-        for moved, offset in zip(problem.moved, problem.offsets(self.best.x), strict=True):
-            offsets.append((float(offset), float(OFFSET_UNIT * deviations[at])) if moved else None)
-            at += moved
-        return Calibration(
-            scene=problem.parameters.scene(problem.scene, u),
-            names=problem.parameters.names,
-            estimates=estimates,
-            deviations=deviations[:size] * whole,
-            identified=identified,
-            correlation=correlation[:size, :size],
-            singular_values=singular,
-            offsets=tuple(offsets),
-            recordings=self.recordings,
-            t=tuple(0.5 * (b.edges[1:] + b.edges[:-1])[: len(m)] for b, m in zip(blocks, models, strict=True)),
-            measured=tuple(means),
-            fitted=tuple(models),
-            noise=tuple(np.asarray(m.sigma) for m in problem.misfits),
-            misfit=misfit,
-            steps=self.steps,
-            outcome=outcome,
-        )
+            means, sigma = np.asarray(mine.means), np.asarray(mine.sigma)
+            explained = np.sum((means / sigma) ** 2) - np.sum(((means - model) / sigma) ** 2)
+        if explained > SIGNIFICANT * (len(stages.best.x) + mine.fitted_by_elimination):
+            return True
+    return False
 
-    def slid_throughout(self) -> bool:
-        """Whether the fitted responses are the same when contact events are looked for."""
-        problem = self.problem
-        for k, mine in enumerate(problem.misfits):
-            if isinstance(mine, KickMisfit):
-                instants = mine.edges + problem.offsets(self.best.x)[k]
-                u = jnp.asarray(self.best.x[None, : problem.size])
-                width = float(mine.edges[1] - mine.edges[0])
-                found = np.diff(np.asarray(_integrals(problem, k, u, instants, eventful=True))[0], axis=0) / width
-                # Rounding of both ways; an event leaves a trace that is larger by far.
-                if not np.allclose(found, self.best.models[k], rtol=0, atol=1e-6 * np.ptp(found)):
-                    return False
-        return True
 
-    def _stands_out(self, models) -> bool:
-        """Whether any recording explains more energy than fitting noise would."""
-        for mine, model in zip(self.problem.misfits, models, strict=True):
-            if isinstance(mine, CycleMisfit):
-                measured = np.asarray(mine.whitening @ mine.measured)
-                explained = float(measured @ measured)
-            else:
-                means, sigma = np.asarray(mine.means), np.asarray(mine.sigma)
-                explained = np.sum((means / sigma) ** 2) - np.sum(((means - model) / sigma) ** 2)
-            if explained > SIGNIFICANT * (len(self.best.x) + mine.fitted_by_elimination):
-                return True
-        return False
-
-    def _structure_left(self, means, models, misfit: float) -> bool:
-        for mine, measured, model in zip(self.problem.misfits, means, models, strict=True):
-            if isinstance(mine, CycleMisfit):
-                continue
-            left = measured - model
-            alike = np.sum(left[1:] * left[:-1], axis=0) / np.maximum(np.sum(left**2, axis=0), 1e-300)
-            if np.any(np.abs(alike) > STRUCTURE):
-                return True
-        # With a stated noise, or features of known error, the size of what is left says it as well.
-        pairs = zip(self.recordings, self.problem.misfits, strict=True)
-        stated = any(r.noise is not None or isinstance(m, CycleMisfit) for r, m in pairs)
-        return stated and misfit > 2.0
+def _structure_left(stages: Stages, means, misfit: float) -> bool:
+    misfits = stages.problem.misfits
+    for mine, measured, model in zip(misfits, means, stages.best.models, strict=True):
+        if isinstance(mine, CycleMisfit):
+            continue
+        left = measured - model
+        alike = np.sum(left[1:] * left[:-1], axis=0) / np.maximum(np.sum(left**2, axis=0), 1e-300)
+        if np.any(np.abs(alike) > STRUCTURE):
+            return True
+    # With a stated noise, or features of known error, the size of what is left says it as well.
+    pairs = zip(stages.recordings, misfits, strict=True)
+    stated = any(r.noise is not None or isinstance(m, CycleMisfit) for r, m in pairs)
+    return stated and misfit > 2.0
 
 
 @eqx.filter_jit
@@ -579,29 +392,11 @@ def _covariance(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return deviations, correlation, singular
 
 
-def _distinct(candidates: np.ndarray) -> np.ndarray:
-    """Without those that repeat one before them."""
-    kept = []
-    for candidate in candidates:
-        if not any(np.allclose(candidate, other, atol=1e-2) for other in kept):
-            kept.append(candidate)
-    return np.array(kept)
-
-
 def _rate(scene: Scene, recording: Recording) -> float:
     """Blocks per second that tell what the scene can do."""
     frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
     rate = BLOCKS_PER_PERIOD * float(frequencies.max())
     return cycle_rate(recording, scene) if recording.regime == "limit cycle" else rate
-
-
-def _starts(parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int) -> np.ndarray:
-    """The scene's own values, then others around them: a Latin hypercube."""
-    own = np.array([float(scene.parameters[name]) for name in parameters.names])
-    rng = np.random.default_rng(seed)
-    strata = np.stack([rng.permutation(count - 1) for _ in own], axis=1) + rng.random((count - 1, len(own)))
-    factors = 1 + spread * (2 * strata / max(count - 1, 1) - 1)
-    return np.array([parameters.unbounded(values) for values in (own, *(own * factors))])
 
 
 def _check_recording(scene: Scene, recording: Recording, k: int) -> None:

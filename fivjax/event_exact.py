@@ -129,9 +129,10 @@ class EventExact(AbstractStepper):
         unit = _time_unit(mechanics)
         states, _ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
-        inside, _ = _value_and_slope([state[None] for state in states], (0.5 * (points[:, None] + 1.0)) * (h / unit))
+        times = 0.5 * (points + 1.0) * h
+        inside, _ = _value_and_slope([state[None] for state in states], times[:, None] / unit)
         end, _ = _value_and_slope(states, h / unit)
-        return Within(inside, 0.5 * h * weights, end)
+        return Within(inside, 0.5 * h * weights, times, end)
 
 
 def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:

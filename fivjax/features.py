@@ -5,14 +5,13 @@ Features know no phase, so a fit to them has no false minima a period apart.
 - A small motion is a sum of $a\,φ\,e^{λt}$: `poles` finds λ (growth rate and frequency) and φ (mode shape) by shift
   invariance of the signal's subspace (ESPRIT; Roy and Kailath 1989), all channels together.
 - A limit cycle is a Fourier series: `harmonics` finds its frequency and its coefficients, referred to the phase of the
-  first channel's fundamental.
+  first channel's fundamental, and how they err; `between_lines` says whether it is one at all.
 """
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 # Rows of the Hankel matrix: long enough to part two modes that beat within the recording, short enough to be quick.
 MOST_ROWS = 240
@@ -57,19 +56,146 @@ def poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> Poles:
     return Poles(upper[order], (shares[: len(upper)] * size)[order], 1.0 - float(np.mean(left**2)))
 
 
-def lines(means: Float[Array, "B k"], dt: float, frequency: Float[Array, ""], count: int) -> Complex[Array, "count k"]:
-    r"""Complex amplitudes $c_h$ of $\mathrm{Re}\, c_h e^{2πi h f t}$ for h = 1 … `count`, by weighted least squares.
+class Harmonics(NamedTuple):
+    """A signal that repeats, by numbers that know no phase; see `referred`."""
 
-    Where the contact closes, accelerations have lines without end. Those above `count`, and what sampling folds down of
-    them between the lines, would leak into the fitted ones; a tapered weight keeps them out.
+    frequency: float  # Hz
+    values: Float[np.ndarray, " m"]
+    covariance: Float[np.ndarray, "m m"]
+
+
+def harmonics(
+    means: Float[np.ndarray, "B k"],
+    dt: float,
+    count: int,
+    lowest: float,
+    highest: float,
+    sigma: Float[np.ndarray, " k"],
+) -> Harmonics:
+    r"""Frequency and `count` lines of evenly spaced signals, `dt` s apart, with white noise of `sigma` by channel.
+
+    The frequency is sought between `lowest` and `highest` (Hz). Then frequency, means and lines of all channels are
+    fitted together, by least squares with a tapered weight (Gauss–Newton). Where the contact closes, accelerations have
+    lines without end; those above `count`, and what sampling folds down of them between the lines, would leak into the
+    fitted ones, and the taper keeps them out. The covariance is what the noise of every sample makes of every number, to
+    first order.
     """
-    t = dt * jnp.arange(means.shape[0])
-    turns = 2 * jnp.pi * frequency * t[:, None] * jnp.arange(1, count + 1)
-    waves = jnp.concatenate([jnp.ones_like(t)[:, None], jnp.cos(turns), jnp.sin(turns)], axis=1)
-    weighted = waves.T * taper(means.shape[0])
+    sigma = np.where(sigma > 0, sigma, 1.0)
+    # From the middle the frequency and the phases do not depend on each other.
+    t = dt * (np.arange(len(means)) - 0.5 * (len(means) - 1))
+    weight = taper(len(means))
+    frequency = _strongest(means / sigma, dt, lowest, highest)
+    fit = _lines(t, means, sigma, weight, frequency, count)
+    for _ in range(REFINEMENTS):
+        frequency = float(np.clip(frequency + fit.step, lowest, highest))
+        fit = _lines(t, means, sigma, weight, frequency, count)
+    # Each number as a sum over samples: first the frequency, then the lines, which follow it.
+    variance = np.sum((fit.to_frequency * sigma) ** 2)
+    errors = np.zeros((1 + 2 * count * means.shape[1],) * 2)
+    errors[0, 0] = variance
+    columns = [slice(1 + 2 * count * k, 1 + 2 * count * (k + 1)) for k in range(means.shape[1])]
+    shared = [fit.to_lines @ (fit.to_frequency[:, k] * sigma[k] ** 2) for k in range(means.shape[1])]
+    for k, own in enumerate(columns):
+        errors[0, own] = errors[own, 0] = shared[k] - fit.follow[:, k] * variance
+        for j, other in enumerate(columns):
+            block = np.outer(fit.follow[:, k], fit.follow[:, j]) * variance
+            block -= np.outer(shared[k], fit.follow[:, j]) + np.outer(fit.follow[:, k], shared[j])
+            if j == k:
+                block += sigma[k] ** 2 * (fit.to_lines @ fit.to_lines.T)
+            errors[own, other] = block
+    values, slopes = referred(frequency, fit.found)
+    return Harmonics(frequency, values, slopes @ errors @ slopes.T)
+
+
+class _Lines(NamedTuple):
+    """Lines at one frequency, by weighted least squares, and how they and a better frequency depend on the samples."""
+
+    found: Complex[np.ndarray, "count k"]
+    step: float  # Gauss–Newton's, of the frequency, Hz
+    to_frequency: Float[np.ndarray, "B k"]
+    to_lines: Float[np.ndarray, "m B"]  # cosines, then sines, of every channel
+    follow: Float[np.ndarray, "m k"]  # by how much less they are where the frequency is higher
+
+
+def _lines(t, means, sigma, weight, frequency: float, count: int) -> _Lines:
+    waves = _waves(t, frequency, count)
     # Over several periods the columns are nearly orthogonal, so the normal equations lose nothing.
-    shares = jnp.linalg.solve(weighted @ waves, weighted @ means)
-    return shares[1 : count + 1] - 1j * shares[count + 1 :]
+    onto = np.linalg.solve((waves.T * weight) @ waves, waves.T * weight)
+    shares = onto @ means
+    found = shares[1 : count + 1] - 1j * shares[count + 1 :]
+    turning = 2j * np.pi * t[:, None] * np.arange(1, count + 1) * (waves[:, 1 : count + 1] + 1j * waves[:, count + 1 :])
+    # How the signals change with the frequency, other than by what the lines themselves can follow.
+    along = (turning @ found).real
+    follow = onto @ along
+    along = along - waves @ follow
+    towards = weight[:, None] * along / sigma**2
+    curvature = np.sum(towards * along)
+    to_frequency = towards / curvature if curvature > 0 else np.zeros_like(towards)
+    step = float(np.sum(to_frequency * (means - waves @ shares)))
+    return _Lines(found, step, to_frequency, onto[1:], follow[1:])
+
+
+def referred(
+    frequency: float, found: Complex[np.ndarray, "count k"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m j"]]:
+    """Frequency (Hz), then the amplitude of the first channel's fundamental, then the real and imaginary parts of all other
+    lines, turned so that this fundamental has phase zero.
+
+    And how these change with the frequency and with the cosines and sines of the lines, channel after channel.
+    """
+    count, channels = found.shape
+    orders = np.arange(1, count + 1)[:, None]
+    size = np.abs(found[0, 0])
+    phase = found[0, 0] / size if size > 0 else 1.0
+    turned = found * np.conj(phase) ** orders
+    values = _in_order(frequency, size, turned)
+    slopes = np.zeros((len(values), 1 + 2 * found.size))
+    slopes[0, 0] = 1.0
+    for k, sine, h in np.ndindex(channels, 2, count):
+        change = np.zeros_like(found)
+        # A line's amplitude is its cosine less i times its sine.
+        change[h, k] = -1j if sine else 1.0
+        relative = change[0, 0] / found[0, 0] if size > 0 else 0.0
+        moved = (change - 1j * orders * found * np.imag(relative)) * np.conj(phase) ** orders
+        slopes[:, 1 + (k * 2 + sine) * count + h] = _in_order(0.0, size * np.real(relative), moved)
+    return values, slopes
+
+
+def _in_order(frequency, size, turned):
+    rest = turned.ravel()[1:]
+    return np.concatenate([[frequency, size], rest.real, rest.imag])
+
+
+def between_lines(
+    signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigma: Float[np.ndarray, " k"]
+) -> float:
+    """How much a vibration beats: the size of what lies about its fundamental without being part of it, relative to that.
+
+    Everything below one and a half times the `frequency` (Hz) that a constant and two harmonics leave, without the noise of
+    `sigma` by channel. Sidebands belong to a vibration whose amplitude or frequency comes and goes. The samples should be
+    dense: impacts have lines without end, and what is folded down from far up looks like sidebands.
+    """
+    t = dt * (np.arange(len(signals)) - 0.5 * (len(signals) - 1))
+    waves, weight = _waves(t, frequency, 2), taper(len(signals))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    shares = np.linalg.solve((waves.T * weight) @ waves, (waves.T * weight) @ (signals / scale))
+    left = signals / scale - waves @ shares
+    spectrum = np.abs(np.fft.rfft(left * weight[:, None], axis=0)) ** 2
+    low = np.fft.rfftfreq(len(signals), dt) < 1.5 * frequency
+    # Half of the power of a real signal is at the negative frequencies.
+    noise = np.sum(low) * np.sum(weight**2) * signals.shape[1]
+    beating = max(np.sum(spectrum[low]) - 2 * noise, 0.0) / (0.5 * len(signals) * np.sum(weight**2))
+    fundamental = np.sum(0.5 * (shares[1] ** 2 + shares[3] ** 2))
+    return float(np.sqrt(beating / fundamental)) if fundamental > 0 else 0.0
+
+
+def without_lines(
+    means: Float[np.ndarray, "B k"], dt: float, frequency: float, count: int
+) -> tuple[Float[np.ndarray, "B k"], Complex[np.ndarray, "count k"]]:
+    """What a constant and `count` harmonics of this frequency (Hz) leave, by least squares; and these, as they begin."""
+    waves = _waves(dt * np.arange(len(means)), frequency, count)
+    shares = np.linalg.lstsq(waves, means, rcond=None)[0]
+    return means - waves @ shares, shares[1 : count + 1] - 1j * shares[count + 1 :]
 
 
 def taper(count: int) -> Float[np.ndarray, " count"]:
@@ -77,38 +203,20 @@ def taper(count: int) -> Float[np.ndarray, " count"]:
     return np.hanning(count) ** 2
 
 
-def fundamental(means: Float[Array, "B k"], dt: float, count: int, lowest: float, highest: float) -> Float[Array, ""]:
-    """The frequency (Hz) of which the signals are harmonics: the phase that the fundamental gains between two halves.
-
-    Sought between `lowest` and `highest`; exact for a signal of `count` harmonics.
-    """
-    half = means.shape[0] // 2
-    scale = jnp.sqrt(jnp.mean(means**2, axis=0))
-    signals = means / jnp.where(scale > 0, scale, 1.0)
-    padded = 4 * means.shape[0]
-    window = jnp.hanning(means.shape[0])[:, None]
-    spectrum = jnp.sum(jnp.abs(jnp.fft.rfft(signals * window, padded, axis=0)) ** 2, axis=1)
-    candidates = jnp.arange(spectrum.shape[0]) / (padded * dt)
-    allowed = (candidates >= lowest) & (candidates <= highest)
-    frequency = candidates[jnp.argmax(jnp.where(allowed, spectrum, -1.0))]
-    for _ in range(REFINEMENTS):
-        first = lines(signals[:half], dt, frequency, count)[0]
-        second = lines(signals[half : 2 * half], dt, frequency, count)[0]
-        turned = jnp.sum(second * first.conj())
-        gained = jnp.angle(turned * jnp.exp(-2j * jnp.pi * frequency * half * dt))
-        frequency = frequency + gained / (2 * jnp.pi * half * dt)
-    return frequency
+def _waves(t, frequency: float, count: int) -> Float[np.ndarray, "B 1+2*count"]:
+    turns = 2 * np.pi * frequency * t[:, None] * np.arange(1, count + 1)
+    return np.concatenate([np.ones((len(t), 1)), np.cos(turns), np.sin(turns)], axis=1)
 
 
-def harmonics(
-    means: Float[Array, "B k"], dt: float, count: int, lowest: float, highest: float
-) -> Float[Array, " 2*count*k"]:
-    """Frequency (Hz), then the amplitude of the first channel's fundamental, then the real and imaginary parts of all other
-    lines, turned so that this fundamental has phase zero."""
-    frequency = fundamental(means, dt, count, lowest, highest)
-    found = lines(means, dt, frequency, count)
-    size = jnp.abs(found[0, 0])
-    phase = found[0, 0] / jnp.where(size > 0, size, 1.0)
-    turned = found * (phase.conj() ** jnp.arange(1, count + 1))[:, None]
-    rest = turned.ravel()[1:]
-    return jnp.concatenate([jnp.stack([frequency, size]), rest.real, rest.imag])
+def _strongest(signals, dt: float, lowest: float, highest: float) -> float:
+    """Where between two frequencies the spectrum is highest, by the parabola through its top."""
+    padded = 4 * len(signals)
+    spectrum = np.abs(np.fft.rfft(signals * np.hanning(len(signals))[:, None], padded, axis=0)) ** 2
+    power, candidates = np.sum(spectrum, axis=1), np.fft.rfftfreq(padded, dt)
+    top = int(np.argmax(np.where((candidates >= lowest) & (candidates <= highest), power, -1.0)))
+    if not 0 < top < len(power) - 1:
+        return float(candidates[top])
+    before, here, after = power[top - 1 : top + 2]
+    bend = before - 2 * here + after
+    aside = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return float(np.clip(candidates[top] + np.clip(aside, -0.5, 0.5) * candidates[1], lowest, highest))

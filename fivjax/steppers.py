@@ -65,6 +65,7 @@ class Within(NamedTuple):
 
     states: Float[Array, "k 2n"]
     weights: Float[Array, " k"]  # s
+    times: Float[Array, " k"]  # s after its start
     end: State  # where the status's own motion ends, before anything that follows from its end
 
 

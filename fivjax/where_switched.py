@@ -86,7 +86,8 @@ class WhereSwitched(AbstractStepper):
         tableau = self.solver.tableau
         states, stages = self._stages(mechanics, contact, load, y, h)
         weights = h * jnp.asarray(tableau.b_sol, y.dtype)
-        return Within(jnp.stack(states), weights, y + h * _weighted(tableau.b_sol, stages))
+        times = h * jnp.asarray([0.0, *tableau.c], y.dtype)
+        return Within(jnp.stack(states), weights, times, y + h * _weighted(tableau.b_sol, stages))
 
     def _smooth_step(self, mechanics, contact, load, y, h) -> tuple[State, State]:
         """The status's own field integrated over the step, and diffrax's error estimate of it."""

@@ -12,10 +12,12 @@ from recordings import FREE, case, clean, noisy, off, paper, recording, times
 import fivjax as fj
 from fivjax import cli, features
 from fivjax.calibrate import Outcome, _covariance
-from fivjax.misfit import cycle_rate
+from fivjax.cycle_misfit import BEATS, cycle_misfit, cycle_rate
+from fivjax.least_squares import Evaluated, minimise
 from fivjax.parameters import FreeParameters
 from fivjax.plot_calibration import calibration
 from fivjax.signals import averaged
+from fivjax.stages import Problem, _Comparison
 
 
 def scores(fit, scene):
@@ -137,13 +139,123 @@ def test_lines_of_a_train_of_pulses_do_not_depend_on_where_they_are_looked_at():
         blocks = averaged(data, cycle_rate(data, paper()))
         width = float(np.diff(blocks.edges[:2])[0])
         whole, part = (
-            np.asarray(features.harmonics(blocks.means[begin:end], width, 8, 50.0, 90.0))
+            features.harmonics(blocks.means[begin:end], width, 8, 50.0, 90.0, np.ones(1)).values
             for begin, end in ((0, None), (301, 301 + int(30 / 67.456 / width)))
         )
     assert whole[0] == pytest.approx(67.456, rel=1e-5)
     # The whole recording, and thirty periods out of its middle. At 1 % noise a line is good to some 1e-3 of the largest;
     # at eight samples to a block, which would be as good a choice otherwise, this is 1.6e-3.
     np.testing.assert_allclose(part[1:], whole[1:], rtol=0, atol=1e-3 * whole[1])
+
+
+def harmonic(rng, frequency, dt, count=600, channels=2):
+    """Signals of eight harmonics, and their complex amplitudes at the middle instant."""
+    lines = (rng.normal(size=(8, channels)) + 1j * rng.normal(size=(8, channels))) / np.arange(1, 9)[:, None]
+    t = dt * (np.arange(count) - 0.5 * (count - 1))
+    waves = np.exp(2j * np.pi * frequency * t[:, None] * np.arange(1, 9))
+    return (waves @ lines).real, lines
+
+
+def test_harmonics_err_as_they_are_said_to():
+    """Were the covariance of frequency and lines too small, or their correlation lost, so would be the parameters'."""
+    rng = np.random.default_rng(0)
+    signals, lines = harmonic(rng, 67.456, 4.4e-4)
+    sigma = np.array([0.05, 0.02])
+    exact = features.harmonics(signals, 4.4e-4, 8, 50.0, 90.0, sigma)
+    np.testing.assert_allclose(exact.values, features.referred(67.456, lines)[0], atol=1e-12)
+    found = [
+        features.harmonics(signals + sigma * rng.normal(size=signals.shape), 4.4e-4, 8, 50.0, 90.0, sigma).values
+        for _ in range(400)
+    ]
+    whitened = np.linalg.solve(np.linalg.cholesky(exact.covariance), (found - exact.values).T)
+    # Each of 32 means is good to 0.05, their squares to 0.07, and eigenvalues of the covariance lie in (1 ± √(32/400))².
+    assert np.abs(whitened.mean(axis=1)).max() < 0.2
+    eigenvalues = np.linalg.eigvalsh(np.cov(whitened))
+    assert eigenvalues.min() > 0.45 and eigenvalues.max() < 1.75
+
+
+def test_minimum_of_a_valley_from_several_starts():
+    """Rosenbrock's valley in units of noise, and a start from which nothing can be evaluated."""
+
+    def evaluate(x, about):
+        a, b = x.T
+        residual = np.stack([100.0 * (b - a**2), 1.0 - a, 3.0 + 0 * a], axis=1)
+        none = np.zeros_like(a)
+        rows = [np.stack([-200.0 * a, none + 100.0], 1), np.stack([none - 1.0, none], 1), np.zeros((len(a), 2))]
+        residual[a > 10] = np.inf
+        return Evaluated(residual, np.stack(rows, axis=1), {"seen": a})
+
+    found = minimise(evaluate, np.array([[-1.2, 1.0], [0.5, -2.0], [20.0, 1.0]]), None, 1e-6, 100)
+    np.testing.assert_allclose(found.x[:2], 1.0, atol=1e-5)
+    np.testing.assert_allclose(found.at.about["seen"][:2], 1.0, atol=1e-5)
+    np.testing.assert_array_equal(found.arrived, [True, True, False])
+    np.testing.assert_allclose(found.at.cost[:2], 9.0)
+
+
+def test_a_combination_that_is_not_told_does_not_keep_a_fit_from_ending():
+    """Only the sum is told; the slope along the difference is far below the noise, but not zero."""
+
+    def evaluate(x, about):
+        jacobian = np.broadcast_to([[50.0, 50.0], [1e-3, -1e-3]], (len(x), 2, 2))
+        return Evaluated(np.einsum("srj,sj->sr", jacobian, x) - [50.0, 1.0], jacobian, None)
+
+    found = minimise(evaluate, np.array([[0.0, 0.0]]), None, 1e-6, 100)
+    assert found.arrived[0] and found.steps < 20
+    assert found.x[0].sum() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_limit_cycle_that_beats_is_not_fitted():
+    """Its harmonics are not those of any one cycle; numbers fitted to them would be wrong by more than they say."""
+    rng = np.random.default_rng(1)
+    signals, _ = harmonic(rng, 67.456, 1 / 25e3, 25_000)
+    t = np.arange(25_000) / 25e3
+    for beats, depth in ((False, 0.0), (True, 0.1)):
+        beating = signals * (1 + depth * np.cos(2 * np.pi * 4.8 * t))[:, None]
+        noise = 0.05 * signals.std(axis=0) * rng.normal(size=signals.shape)
+        size = features.between_lines(beating + noise, 1 / 25e3, 67.456, 0.05 * signals.std(axis=0))
+        # Two sidebands of half the depth each.
+        assert size == pytest.approx(depth / np.sqrt(2), abs=0.005)
+        assert (size > BEATS) is beats
+    fit = fj.calibrate(paper(mu=0.3), recording(beating + noise, "limit cycle"), FREE[3], progress=False)
+    assert fit.outcome is Outcome.BEATS and not fit.converged
+    assert not any(fit.identifiable.values())
+    assert np.isnan(fit.values["mu"])
+    assert "beats" in str(fit) and "slower belt" in str(fit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed", "beats"), [(1.0, False), (2.0, True)])
+def test_the_papers_limit_cycle_beats_above_a_speed(speed, beats):
+    scene = paper(mu=0.3, belt_speed=speed)
+    accelerations = clean(scene, 2.0, 3.0, (fj.sliding_equilibrium(scene), [-0.9 * speed, 0.0, 0.0]))
+    data = recording(noisy(accelerations, 0.05, 0), "limit cycle")
+    with jax.enable_x64(True):
+        found = cycle_misfit(data, averaged(data, cycle_rate(data, scene)), fj.EventExact(), scene)
+    assert (float(found.beating) > BEATS) is beats
+
+
+@pytest.mark.slow
+def test_a_closed_cycle_is_the_one_that_a_run_settles_on():
+    """Its frequency and lines as in a run, its fractions of time as counted there, its slopes as those of differences."""
+    scene, accelerations, _ = case("limit cycle")
+    counted = {status: (value, 1e-3) for status, value in times(scene).items()}
+    data = recording(accelerations, "limit cycle", noise={"a0": 1.0, "a1": 1.0}, **counted)
+    with jax.enable_x64(True):
+        mine = cycle_misfit(data, averaged(data, cycle_rate(data, scene)), fj.EventExact(), scene)
+        problem = Problem(scene, FreeParameters(scene, ["mu"]), (mine,), np.zeros(1), (False,))
+        step = 1e-5
+        u = np.array([[0.0], [step], [-step]])
+        found = _Comparison(problem, u, 1.0)(u, None)
+        residual, jacobian = found.residual, found.jacobian[0, :, 0]
+        lines = np.linalg.solve(np.asarray(mine.whitening), residual[0, : len(mine.measured)])
+        frequency, size = np.asarray(mine.measured)[:2]
+    assert abs(lines[0]) < 1e-5 * frequency
+    # What sampling folds down of the lines far up is left.
+    assert np.abs(lines[1:]).max() < 1e-4 * size
+    # Counted in steps of 2e-5 s, of 67 periods.
+    assert np.abs(residual[0, len(lines) : len(lines) + 2]).max() < 0.3
+    numeric = (residual[1] - residual[2]) / (2 * step)
+    np.testing.assert_allclose(jacobian, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("regime", ["sliding", pytest.param("kick", marks=pytest.mark.slow)])
