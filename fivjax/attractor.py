@@ -12,6 +12,7 @@ not recede. A crossing is one of the tangential velocity through zero, upwards.
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -21,12 +22,12 @@ from .orbit import DECAYED
 
 # Loads that the ensemble is released from, in final loads.
 RELEASES = np.linspace(1.5, 6.0, 16)
-# When an ensemble is asked whether it has met, in rounds of its method; later ones are not waited for.
-TESTS = (18, 21, 25, 31, 37, 44, 53, 64)
+# When an ensemble is asked whether it has met, in looks, two in each round of its method; later ones are not waited for.
+TESTS = (36, 42, 50, 62, 74, 88, 106, 128)
 # Members that have to meet.
 LEAST_MEMBERS = 6
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
-KEPT = 128
+KEPT = 192
 # This close, relative to the own distance from equilibrium, it is the same limit cycle.
 REACHED = 0.02
 # Distances between crossing states and the nearest that are kept scatter by this much where the states lie on one torus.
@@ -48,6 +49,7 @@ class Approach(eqx.Module):
     """How near a lane has been to the known limit cycle lately."""
 
     seen: State  # the crossing state that was looked at last
+    before: State  # and the one before it
     near: Int[Array, ""]  # crossing states in a row that were close
     first: Float[Array, ""]  # relative distance of the first of these
 
@@ -82,7 +84,8 @@ def unknown(groups: int, size: int) -> Attractor:
 
 
 def no_approach(y: State) -> Approach:
-    return Approach(jnp.full_like(y, jnp.nan), jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
+    none = jnp.full_like(y, jnp.nan)
+    return Approach(none, none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
 
 
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
@@ -128,5 +131,5 @@ def approached(approach: Approach, attractor: Attractor, crossing: State) -> tup
     near = jnp.where(close, approach.near + 1, 0)
     reached = (near >= LOOKS_NEAR) & (distance <= jnp.maximum(first, SCATTER))
     fresh = jnp.any(crossing != approach.seen)
-    look = Approach(crossing, jnp.where(fresh, near, approach.near), jnp.where(fresh, first, approach.first))
-    return look, fresh & reached
+    look = Approach(crossing, approach.seen, near, first)
+    return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), look, approach), fresh & reached

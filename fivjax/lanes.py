@@ -29,6 +29,7 @@ from .event_exact import EventExact
 from .interrupts import noted
 from .load import AbstractLoad
 from .orbit import Orbit
+from .packed import Packed, packed
 from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
@@ -411,9 +412,10 @@ def _run_block(
     distinct, group = _groups(values)
     shared = _shared(batch, distinct)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in batch.history)], axis=-1)[:, 1:]
+    together = packed(shared)
     # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
-    lanes = _begun(batch, shared, group[pending], columns[pending])
+    lanes = _begun(batch, together, group[pending], columns[pending])
     done = 0
     while True:
         verdict, t = lanes.verdict, lanes.t
@@ -431,11 +433,11 @@ def _run_block(
             many = pending[company[pending] >= WORTH_KNOWING]
             groups, first = np.unique(group[many], return_index=True)
             if len(groups):
-                shared = _with_attractors(batch, shared, groups, columns[many[first]], report)
+                together = packed(_with_attractors(batch, shared, groups, columns[many[first]], report))
         # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // LOOK_EVERY)
-        lanes = _followed(batch, shared, group[pending], columns[pending], lanes, looks)
+        lanes = _followed(batch, together, group[pending], columns[pending], lanes, looks)
         done += looks * LOOK_EVERY
 
 
@@ -446,16 +448,17 @@ def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: 
     found = attractors.unknown(len(shared.values), 2 * structure.size)
     own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
     running, at_rest = np.arange(len(own)), np.zeros(len(own), bool)
-    lanes = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
+    together = packed(shared)
+    lanes = _begun(batch, together, own, columns, np.tile(attractors.RELEASES, len(groups)))
     looks = []
     while len(running) and len(looks) < max(attractors.TESTS):
         report(0)
         lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
-        lanes = _followed(batch, shared, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
-        look = attractors.blank(len(own), len(weights))
-        look.deviations[running] = weights * lanes.orbit.latest
-        look.peaks[running], look.times[running] = lanes.orbit.peak, lanes.t
-        looks.append(look)
+        lanes = _followed(batch, together, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
+        for crossing in (lanes.approach.before, lanes.approach.seen):
+            look = attractors.blank(len(own), len(weights))
+            look.deviations[running], look.peaks[running], look.times[running] = crossing, lanes.orbit.peak, lanes.t
+            looks.append(look)
         at_rest[running] = lanes.verdict == Verdict.SLIDING
         over = (lanes.verdict != Verdict.UNDECIDED) & (lanes.verdict != Verdict.LIMIT_CYCLE)
         if len(looks) in attractors.TESTS:
@@ -517,7 +520,7 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
     return jax.vmap(one)(values)
 
 
-def _begun(batch: Batch, shared: Shared, group: np.ndarray, columns: np.ndarray, releases=None) -> Lane:
+def _begun(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, releases=None) -> Lane:
     """Lanes at their beginning; those that are released (from these multiples of their final load) after all kicks."""
     kicked = releases is None
     releases = np.ones(len(group)) if kicked else releases
@@ -525,20 +528,20 @@ def _begun(batch: Batch, shared: Shared, group: np.ndarray, columns: np.ndarray,
     def function(*tile):
         return _begin(batch.scene, batch.names, batch.history, batch.energy, kicked, *tile)
 
-    return in_tiles(function, shared, group, (columns, releases), batch.width, batch.pool)
+    return in_tiles(function, shared, group, packed((columns, releases)), batch.width, batch.pool).tree
 
 
-def _followed(batch: Batch, shared: Shared, group: np.ndarray, columns: np.ndarray, lanes: Lane, looks: int) -> Lane:
+def _followed(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, lanes: Lane, looks: int) -> Lane:
     """Lanes `looks` looks further."""
 
     def function(*tile):
         return _follow(batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *tile)
 
-    return in_tiles(function, shared, group, (columns, lanes), batch.width, batch.pool)
+    return in_tiles(function, shared, group, packed((columns, lanes)), batch.width, batch.pool).tree
 
 
 @eqx.filter_jit
-def _begin(scene, names, history, energy: bool, kicked: bool, shared: Shared, columns, releases):
+def _begin(scene, names, history, energy: bool, kicked: bool, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, releases):
         own = _with(scene, names, shared.values)
 
@@ -548,11 +551,11 @@ def _begin(scene, names, history, energy: bool, kicked: bool, shared: Shared, co
 
         return jax.vmap(one)(columns, releases)
 
-    return jax.vmap(group)(shared, columns, releases)
+    return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
 
 
 @eqx.filter_jit
-def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, looks, shared: Shared, columns, lanes):
+def _follow(scene, method, resolution, names, history, looks, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
@@ -563,7 +566,7 @@ def _follow(scene: Scene, method: AbstractStepper, resolution, names, history, l
 
         return jax.vmap(one)(columns, lanes)
 
-    return jax.vmap(group)(shared, columns, lanes)
+    return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
 
 
 def _with(scene: Scene, names: tuple[str, ...], row) -> Scene:

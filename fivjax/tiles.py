@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
+from .packed import Packed
+
 # Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
 TILE_ON_CPU = 128
 LARGE_TILE_ON_CPU = 512
@@ -25,8 +27,13 @@ def workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def in_tiles(function, shared, group: np.ndarray, inputs: tuple, width: int, pool: ThreadPoolExecutor):
-    """`function(shared, *inputs)` over all lanes, in tiles of one size, so that a scene is compiled once for any map."""
+def in_tiles(
+    function, shared: Packed, group: np.ndarray, lanes: Packed, width: int, pool: ThreadPoolExecutor
+) -> Packed:
+    """`function(shared, lanes)` of all lanes, in tiles of one size, so that a scene is compiled once for any map.
+
+    `group` says which row of `shared` is each lane's. In a tile, `shared` has an axis of rows, `lanes` one more.
+    """
     slots, filled = _side_by_side(group, width)
     size = TILE_ELSEWHERE
     if jax.default_backend() == "cpu":
@@ -39,13 +46,13 @@ def in_tiles(function, shared, group: np.ndarray, inputs: tuple, width: int, poo
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
         place = slots[np.where(chosen < len(slots), chosen, start)]
         with jax.enable_x64(True):  # the setting is a thread's own
-            own = jax.tree.map(lambda leaf: leaf[group[place[:, 0]]], shared)
-            result = function(own, *jax.tree.map(lambda leaf: leaf[place], inputs))
-            return place[real], jax.tree.map(lambda leaf: np.asarray(leaf)[real], result)
+            own = Packed(shared.numbers[group[place[:, 0]]], shared.form)
+            result = function(own, Packed(lanes.numbers[place], lanes.form))
+            return place[real], np.asarray(result.numbers)[real], result.form
 
-    places, results = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
+    places, numbers, forms = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
     back = np.argsort(np.concatenate(places))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[back], *results)
+    return Packed(np.concatenate(numbers)[back], forms[0])
 
 
 def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,47 @@
+"""A tree of arrays as one array of numbers, one row per lane: a call that takes few arrays starts faster than one of many."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+
+class Packed(eqx.Module):
+    """The leaves of a tree side by side; they are real, complex, whole or truth values, which double precision holds."""
+
+    numbers: Float[Array, "*rows m"]
+    form: tuple = eqx.field(static=True)  # the tree's structure, and of each leaf its shape in one row and its type
+
+    @property
+    def tree(self) -> PyTree:
+        """The tree again."""
+        structure, shapes, types = self.form
+        leaves, start, rows = [], 0, self.numbers.shape[:-1]
+        for shape, kind in zip(shapes, types, strict=True):
+            is_complex = np.issubdtype(kind, np.complexfloating)
+            size = math.prod(shape) * (2 if is_complex else 1)
+            part = self.numbers[..., start : start + size]
+            if is_complex:
+                part = part.reshape(*rows, -1, 2)
+                part = part[..., 0] + 1j * part[..., 1]
+            leaves.append(part.reshape(*rows, *shape).astype(kind))
+            start += size
+        return jax.tree.unflatten(structure, leaves)
+
+
+def packed(tree: PyTree, row_axes: int = 1) -> Packed:
+    """A tree whose leaves have this many leading axes in common."""
+    leaves, structure = jax.tree.flatten(tree)
+    xp = np if all(isinstance(leaf, np.ndarray) for leaf in leaves) else jnp
+
+    def flat(leaf):
+        if np.issubdtype(leaf.dtype, np.complexfloating):
+            leaf = xp.stack([leaf.real, leaf.imag], axis=-1)
+        return leaf.reshape(*leaf.shape[:row_axes], -1).astype(np.float64)
+
+    shapes = tuple(leaf.shape[row_axes:] for leaf in leaves)
+    types = tuple(np.dtype(leaf.dtype).name for leaf in leaves)
+    return Packed(xp.concatenate([flat(leaf) for leaf in leaves], axis=-1), (structure, shapes, types))
