@@ -39,7 +39,7 @@ LOOKS_NEAR = 4
 class Attractor(eqx.Module):
     """A limit cycle that is known: what lanes are compared with."""
 
-    # Deviations from equilibrium at crossings, weighted as in `lanes.follow`.
+    # Deviations from equilibrium at crossings, weighted as in `lane.follow`.
     crossings: Float[Array, "s 2n"]
     amplitude: Float[Array, ""]  # its largest tangential speed, m/s
     known: Bool[Array, ""]
@@ -60,7 +60,7 @@ class Ensemble(NamedTuple):
     deviations: Float[np.ndarray, "*k e 2n"]  # weighted
     peaks: Float[np.ndarray, "*k e"]  # largest tangential speed since the look before, m/s
     times: Float[np.ndarray, "*k e"]  # s
-    moving: Bool[np.ndarray, " e"]  # members that have not come to rest
+    moving: Bool[np.ndarray, " e"]  # members that are still followed: without another verdict
 
 
 def blank(members: int, size: int) -> Ensemble:

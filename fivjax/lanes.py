@@ -1,9 +1,10 @@
 """Many trajectories, each followed until its verdict is known.
 
-A *lane* is one trajectory of a batch. `follow` is written for one lane and a fixed number of steps; `jax.vmap` makes it
-a group of lanes that differ in the history of their load only and share everything else, and a second `jax.vmap` makes
-that a tile of groups. After each round of steps the decided lanes leave, the others close ranks, and the tiles are
-filled anew: work is spent only where the verdict is open.
+A *lane* is one trajectory of a batch (`lane`). `jax.vmap` makes of it a group of lanes that differ in the history of their
+load only and share everything else, and a second `jax.vmap` makes that a tile of groups. After each round of steps the
+decided lanes leave, the others close ranks, and the tiles are filled anew: work is spent only where the verdict is open.
+
+Where many lanes share a structure, an ensemble finds the limit cycle that they may come to (`attractor`).
 """
 
 import time
@@ -14,44 +15,38 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
 from . import attractor as attractors
-from . import contact as physics
 from . import orbit as orbits
-from .attractor import Approach, Attractor
-from .contact import Contact, Mechanics, Rest, State
-from .energy import Books, Ledger, enter, exchanged, mechanical_energy, open_ledger
+from .attractor import Attractor
+from .contact import Mechanics
+from .energy import exchanged
 from .event_exact import EventExact
 from .interrupts import noted
-from .load import AbstractLoad
-from .orbit import Orbit
+from .lane import LOOK_EVERY, Lane, begin, follow, measured_from_rest, released, weights_of
 from .packed import Packed, packed
 from .propagators import MATRIX_ROWS, Windowed
-from .scene import Scene, steady_sliding
-from .sliding import SlidingModes, linear_sliding, slides_forever, sliding_modes
-from .steppers import AbstractStepper, Advance
-from .structure import Structure
+from .scene import Scene
+from .sliding import SlidingModes, linear_sliding, sliding_modes
+from .steppers import AbstractStepper
 from .tiles import in_tiles, workers
 from .verdict import Verdict
-from .wedging import Wedge, sticks_forever, wedge
+from .wedging import Wedge, wedge
 
 # Lanes of a group that stand side by side in a tile: enough to fill a vector unit and to make matrix products pay.
 SIDE_BY_SIDE = 16
 # What a lane that shares nothing costs, in lanes that stand side by side.
 COST_OF_STANDING_ALONE = 4
-# Steps between two looks at how near a lane is to a known limit cycle: about a cycle for the fastest method.
-LOOK_EVERY = 8
 # Rounds after which lanes want to know their limit cycle, and lanes of a group for which it is worth the work.
 KNOWN_FROM = 4
 WORTH_KNOWING = 32
+# Ensembles that are followed at once: what is kept of them takes memory, some 0.1 MB each.
+ENSEMBLES = 128
 # Looks at a lane's verdict while its time grows e-fold.
 LOOKS = 8
-# The longest advance that a ledger is asked to enter, s.
-LONGEST_ENTRY = 1.0
 # What a ledger leaves of a lane, see `energy`; `kick_energy` is that of the vibration when the kick ends.
 ENERGIES = (
     "stick_work",
@@ -67,35 +62,12 @@ ENERGIES = (
 )
 # Lanes taken from a grid are not that close to a boundary; they need not be watched as long.
 SPAN_SHARE = 4
-# A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
-GROWTH = 1e9
 # Steps that a lane may take: 10⁵ cycles with their events, and some hours of work for a map of them.
 MOST_STEPS = 2**21
 # How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
 KEEP_EVERY = 2.0
 # Parameters that lanes of one group may differ in: the load's history, which leaves the mechanics alone.
 HISTORY = ("p", "duration", "start")
-
-
-class Lane(eqx.Module):
-    """One trajectory on its way to a verdict."""
-
-    t: Float[Array, ""]
-    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
-    contact: Contact
-    orbit: Orbit
-    events: Int[Array, ""]  # status changes so far
-    last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
-    approach: Approach
-    verdict: Int[Array, ""]
-    account: "Account | None" = None  # where its energy went, when asked for
-
-
-class Account(eqx.Module):
-    """Where the energy of one lane went."""
-
-    ledger: Ledger
-    vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
 
 
 class Shared(eqx.Module):
@@ -131,158 +103,6 @@ class Batch(NamedTuple):
     energy: bool
     width: int  # lanes of a group side by side
     pool: ThreadPoolExecutor
-
-
-def measured_from_rest(scene: Scene) -> Mechanics:
-    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
-
-    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
-    would be decided, and the balance of energy upset, by noise.
-    """
-    load = scene.load.final
-    _, normal_force = steady_sliding(scene, load)
-    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
-
-
-def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
-    """A lane at the sliding equilibrium of its scene, just before anything happens."""
-    q, _ = steady_sliding(scene, scene.load.force)
-    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
-    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
-    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
-    verdict = jnp.where(
-        ~modes.linear.solvable,
-        Verdict.PAINLEVE,
-        jnp.where(modes.linear.exists, Verdict.UNDECIDED, Verdict.NO_EQUILIBRIUM),
-    )
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
-    return Lane(
-        t=jnp.zeros((), y.dtype),
-        y=y,
-        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
-        orbit=orbits.new_orbit(y),
-        events=jnp.zeros((), jnp.int32),
-        last_event=jnp.full((), jnp.nan, y.dtype),
-        approach=attractors.no_approach(y),
-        verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
-        account=Account(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
-    )
-
-
-def released(scene: Scene, modes: SlidingModes, lane: Lane, load: Float[Array, ""]) -> Lane:
-    """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks."""
-    q, _ = steady_sliding(scene, load * scene.load.final)
-    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
-    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (deviation, jnp.max(scene.load.jumps, initial=0.0)))
-
-
-def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
-    """The end of a step from `t`: at most `dt` on, never across a jump of the load, and exactly on it when one is reached."""
-    ahead = load.jumps > t
-    jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
-    # Equal steps up to the jump; the allowance keeps rounding from adding one more, vanishingly short.
-    steps = jnp.ceil((jump - t) / dt - 1e-6)
-    return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
-
-
-def follow(
-    scene: Scene,
-    method: AbstractStepper | Windowed,
-    resolution: orbits.Resolution,
-    mechanics: Mechanics,
-    prepared,
-    modes: SlidingModes,
-    wedge: Wedge,
-    attractor: Attractor,
-    lane: Lane,
-    looks,
-) -> Lane:
-    """One lane, `looks` times `LOOK_EVERY` steps further, with the verdict if it can be proved by then."""
-    structure = scene.structure
-    weights = _weights(structure)
-    # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
-    longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
-
-    def step(_, lane: Lane) -> Lane:
-        t = next_step_end(scene.load, lane.t, longest)
-        load = scene.load(0.5 * (lane.t + t)) - scene.load.final
-        after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
-        y, contact, h, peak = after
-        t = jnp.where(h >= t - lane.t, t, lane.t + h)
-        changed = contact.status != lane.contact.status
-        orbit = orbits.observe(
-            lane.orbit,
-            weights,
-            jnp.zeros_like(y),
-            structure.tangential,
-            lane.y,
-            y,
-            changed,
-            peak,
-            t,
-            modes.slowest_decay,
-            resolution,
-        )
-        return Lane(
-            t=t,
-            y=y,
-            contact=contact,
-            orbit=orbit,
-            events=lane.events + changed,
-            last_event=jnp.where(changed, t, lane.last_event),
-            approach=lane.approach,
-            verdict=lane.verdict,
-            account=None if lane.account is None else entered(lane.account, lane, load, after, t),
-        )
-
-    def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
-        ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
-        kick_ends = jnp.max(scene.load.jumps, initial=0.0)
-        just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
-        vibration = mechanical_energy(structure, after.y)
-        return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
-
-    def look(_, carry: tuple[Lane, Bool[Array, ""]]):
-        lane = jax.lax.fori_loop(0, LOOK_EVERY, step, carry[0])
-        approach, reached = attractors.approached(lane.approach, attractor, weights * lane.orbit.latest)
-        return eqx.tree_at(lambda lane: lane.approach, lane, approach), carry[1] | reached
-
-    after, reached = jax.lax.fori_loop(0, looks, look, (lane, jnp.zeros((), bool)))
-    reached = reached & ~after.orbit.returned
-    amplitude = jnp.where(reached, attractor.amplitude, after.orbit.amplitude)
-    after = eqx.tree_at(lambda lane: lane.orbit.amplitude, after, amplitude)
-    equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
-    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
-    grown = jnp.max(jnp.abs(weights * after.y)) > GROWTH * yardstick
-    wedged = sticks_forever(wedge, mechanics.of_totals, after.contact, after.y + equilibrium)
-    quiet_load = jnp.all(scene.load.jumps <= after.t)
-    verdict = jnp.where(
-        ~jnp.all(jnp.isfinite(after.y)),
-        Verdict.NOT_FINITE,
-        jnp.where(
-            after.t <= lane.t,
-            Verdict.TOO_MANY_EVENTS,
-            jnp.where(
-                quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
-                Verdict.SLIDING,
-                jnp.where(
-                    quiet_load & (after.orbit.returned | reached),
-                    Verdict.LIMIT_CYCLE,
-                    jnp.where(
-                        quiet_load & (wedged | grown),
-                        Verdict.UNBOUNDED,
-                        Verdict.UNDECIDED,
-                    ),
-                ),
-            ),
-        ),
-    )
-    return eqx.tree_at(lambda lane: lane.verdict, after, verdict.astype(jnp.int8))
-
-
-def _weights(structure: Structure) -> Float[Array, " 2n"]:
-    # The square roots of the diagonals make squares of displacements and velocities comparable energies.
-    return jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
 
 
 def run_to_verdict(
@@ -386,10 +206,11 @@ def bytes_per_lane(scene: Scene, sharing: float) -> int:
     """Memory that a lane takes where `sharing` lanes make a group, its part of a step's intermediate results included."""
     n = scene.structure.size
     m = 2 * (n - 1)
-    state_and_orbit = 8 * (2 * 2 * n + 20)
+    state_and_orbit = 8 * (5 * 2 * n + 30)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
-    return int(3 * (state_and_orbit + (modes + prepared) / sharing))
+    attractor = 8 * attractors.KEPT * 2 * n
+    return int(3 * (state_and_orbit + (modes + prepared + attractor) / sharing))
 
 
 def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -432,8 +253,10 @@ def _run_block(
         if done == KNOWN_FROM * batch.method.round:
             many = pending[company[pending] >= WORTH_KNOWING]
             groups, first = np.unique(group[many], return_index=True)
-            if len(groups):
-                together = packed(_with_attractors(batch, shared, groups, columns[many[first]], report))
+            for start in range(0, len(groups), ENSEMBLES):
+                part = slice(start, start + ENSEMBLES)
+                shared = _with_attractors(batch, shared, groups[part], columns[many[first[part]]], report)
+            together = packed(shared)
         # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // LOOK_EVERY)
@@ -444,10 +267,10 @@ def _run_block(
 def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: np.ndarray, report) -> Shared:
     """`shared` with the limit cycles of these groups, where their ensembles meet on one; `columns` of any lane of each."""
     structure = batch.scene.structure
-    members, weights = len(attractors.RELEASES), np.asarray(_weights(structure))
-    found = attractors.unknown(len(shared.values), 2 * structure.size)
+    members, weights = len(attractors.RELEASES), np.asarray(weights_of(structure))
+    found = jax.tree.map(np.array, shared.attractor)
     own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
-    running, at_rest = np.arange(len(own)), np.zeros(len(own), bool)
+    running, moving = np.arange(len(own)), np.ones(len(own), bool)
     together = packed(shared)
     lanes = _begun(batch, together, own, columns, np.tile(attractors.RELEASES, len(groups)))
     looks = []
@@ -459,10 +282,10 @@ def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: 
             look = attractors.blank(len(own), len(weights))
             look.deviations[running], look.peaks[running], look.times[running] = crossing, lanes.orbit.peak, lanes.t
             looks.append(look)
-        at_rest[running] = lanes.verdict == Verdict.SLIDING
-        over = (lanes.verdict != Verdict.UNDECIDED) & (lanes.verdict != Verdict.LIMIT_CYCLE)
+        moving[running] = (lanes.verdict == Verdict.UNDECIDED) | (lanes.verdict == Verdict.LIMIT_CYCLE)
+        over = ~moving[running]
         if len(looks) in attractors.TESTS:
-            ensembles = attractors.in_ensembles(looks, ~at_rest, members)
+            ensembles = attractors.in_ensembles(looks, moving, members)
             for k in np.unique(running // members):
                 cycle = attractors.met(ensembles[k], shared.modes.slowest_decay[groups[k]])
                 if cycle is not None:

@@ -29,7 +29,7 @@ class Ending(enum.IntEnum):
 
 MEANING = {
     Verdict.SLIDING: "returns to steady sliding: a bound shows that no contact event can happen again",
-    Verdict.LIMIT_CYCLE: "stays on an orbit with contact events that was seen to return",
+    Verdict.LIMIT_CYCLE: "stays on an orbit with contact events that was seen to return, or that many others have met on",
     Verdict.UNDECIDED: "neither was proved before the time limit; raise `t_max`, or look at the lane with `simulate`",
     Verdict.NOT_FINITE: "the state stopped being finite; take a smaller step or check the parameters",
     Verdict.NO_EQUILIBRIUM: "no steady sliding to start from; change the load or the friction",

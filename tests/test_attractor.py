@@ -91,10 +91,11 @@ def test_nothing_known_is_never_reached():
         assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 
 
-def test_known_limit_cycles_change_no_verdict(paper_scene):
+def test_known_limit_cycles_change_no_verdict(paper_scene, monkeypatch):
     """A map with lanes enough to be worth an ensemble, and its halves, whose lanes see their own orbits return."""
     axes = {"mu": [0.1, 0.16, 0.22], "p": np.linspace(1.05, 3.9, 36)}
     assert len(axes["p"]) // 2 < lanes.WORTH_KNOWING <= len(axes["p"])
+    monkeypatch.setattr(lanes, "ENSEMBLES", 2)  # the three are not followed at once
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
     halves = [fj.bistability_map(paper_scene, progress=False, mu=axes["mu"], p=axes["p"][k::2]) for k in (0, 1)]
     verdict, amplitude, when = (

@@ -16,7 +16,8 @@ import fivjax as fj
 from fivjax import energy as accounts
 from fivjax import plot_energy
 from fivjax.contact import Mechanics, Status
-from fivjax.lanes import measured_from_rest, run_to_verdict
+from fivjax.lane import measured_from_rest
+from fivjax.lanes import run_to_verdict
 from fivjax.verdict import Verdict
 
 # What the issue of this ledger asks for is 1e-10 of the energy exchanged; rounding over some 10⁴ advances is this.

@@ -10,7 +10,7 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
-from fivjax.lanes import next_step_end
+from fivjax.lane import next_step_end
 from fivjax.propagators import Windowed, propagators
 from fivjax.scene import steady_sliding
 

@@ -1,0 +1,206 @@
+"""One trajectory on its way to a verdict.
+
+`follow` is written for one lane and a fixed number of steps; `lanes` makes many of it. States are deviations from the
+sliding equilibrium under the final load: crossing states, kicks and events are then as exact as they are small.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from . import attractor as attractors
+from . import contact as physics
+from . import orbit as orbits
+from .attractor import Approach, Attractor
+from .contact import Contact, Mechanics, Rest, State
+from .energy import Books, Ledger, enter, mechanical_energy, open_ledger
+from .load import AbstractLoad
+from .orbit import Orbit
+from .propagators import Windowed
+from .scene import Scene, steady_sliding
+from .sliding import SlidingModes, slides_forever
+from .steppers import AbstractStepper, Advance
+from .structure import Structure
+from .verdict import Verdict
+from .wedging import Wedge, sticks_forever
+
+# Steps between two looks at how near a lane is to a known limit cycle: about a cycle for the fastest method.
+LOOK_EVERY = 8
+# The longest advance that a ledger is asked to enter, s.
+LONGEST_ENTRY = 1.0
+# A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
+GROWTH = 1e9
+
+
+class Lane(eqx.Module):
+    """One trajectory on its way to a verdict."""
+
+    t: Float[Array, ""]
+    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
+    contact: Contact
+    orbit: Orbit
+    events: Int[Array, ""]  # status changes so far
+    last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
+    approach: Approach
+    verdict: Int[Array, ""]
+    account: "Account | None" = None  # where its energy went, when asked for
+
+
+class Account(eqx.Module):
+    """Where the energy of one lane went."""
+
+    ledger: Ledger
+    vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
+
+
+def measured_from_rest(scene: Scene) -> Mechanics:
+    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
+
+    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
+    would be decided, and the balance of energy upset, by noise.
+    """
+    load = scene.load.final
+    _, normal_force = steady_sliding(scene, load)
+    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
+
+
+def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Lane:
+    """A lane at the sliding equilibrium of its scene, just before anything happens."""
+    q, _ = steady_sliding(scene, scene.load.force)
+    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
+    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
+    verdict = jnp.where(
+        ~modes.linear.solvable,
+        Verdict.PAINLEVE,
+        jnp.where(modes.linear.exists, Verdict.UNDECIDED, Verdict.NO_EQUILIBRIUM),
+    )
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
+    return Lane(
+        t=jnp.zeros((), y.dtype),
+        y=y,
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
+        orbit=orbits.new_orbit(y),
+        events=jnp.zeros((), jnp.int32),
+        last_event=jnp.full((), jnp.nan, y.dtype),
+        approach=attractors.no_approach(y),
+        verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
+        account=Account(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
+    )
+
+
+def released(scene: Scene, modes: SlidingModes, lane: Lane, load: Float[Array, ""]) -> Lane:
+    """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks."""
+    q, _ = steady_sliding(scene, load * scene.load.final)
+    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
+    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (deviation, jnp.max(scene.load.jumps, initial=0.0)))
+
+
+def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
+    """The end of a step from `t`: at most `dt` on, never across a jump of the load, and exactly on it when one is reached."""
+    ahead = load.jumps > t
+    jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
+    # Equal steps up to the jump; the allowance keeps rounding from adding one more, vanishingly short.
+    steps = jnp.ceil((jump - t) / dt - 1e-6)
+    return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
+
+
+def follow(
+    scene: Scene,
+    method: AbstractStepper | Windowed,
+    resolution: orbits.Resolution,
+    mechanics: Mechanics,
+    prepared,
+    modes: SlidingModes,
+    wedge: Wedge,
+    attractor: Attractor,
+    lane: Lane,
+    looks,
+) -> Lane:
+    """One lane, `looks` times `LOOK_EVERY` steps further, with the verdict if it can be proved by then."""
+    structure = scene.structure
+    weights = weights_of(structure)
+    # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
+    longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
+
+    def step(_, lane: Lane) -> Lane:
+        t = next_step_end(scene.load, lane.t, longest)
+        load = scene.load(0.5 * (lane.t + t)) - scene.load.final
+        after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
+        y, contact, h, peak = after
+        t = jnp.where(h >= t - lane.t, t, lane.t + h)
+        changed = contact.status != lane.contact.status
+        orbit = orbits.observe(
+            lane.orbit,
+            weights,
+            jnp.zeros_like(y),
+            structure.tangential,
+            lane.y,
+            y,
+            changed,
+            peak,
+            t,
+            modes.slowest_decay,
+            resolution,
+        )
+        return Lane(
+            t=t,
+            y=y,
+            contact=contact,
+            orbit=orbit,
+            events=lane.events + changed,
+            last_event=jnp.where(changed, t, lane.last_event),
+            approach=lane.approach,
+            verdict=lane.verdict,
+            account=None if lane.account is None else entered(lane.account, lane, load, after, t),
+        )
+
+    def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
+        ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
+        kick_ends = jnp.max(scene.load.jumps, initial=0.0)
+        just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
+        vibration = mechanical_energy(structure, after.y)
+        return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
+
+    def look(_, carry: tuple[Lane, Bool[Array, ""]]):
+        lane = jax.lax.fori_loop(0, LOOK_EVERY, step, carry[0])
+        approach, reached = attractors.approached(lane.approach, attractor, weights * lane.orbit.latest)
+        return eqx.tree_at(lambda lane: lane.approach, lane, approach), carry[1] | reached
+
+    after, reached = jax.lax.fori_loop(0, looks, look, (lane, jnp.zeros((), bool)))
+    reached = reached & ~after.orbit.returned
+    amplitude = jnp.where(reached, attractor.amplitude, after.orbit.amplitude)
+    after = eqx.tree_at(lambda lane: lane.orbit.amplitude, after, amplitude)
+    equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
+    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    grown = jnp.max(jnp.abs(weights * after.y)) > GROWTH * yardstick
+    wedged = sticks_forever(wedge, mechanics.of_totals, after.contact, after.y + equilibrium)
+    quiet_load = jnp.all(scene.load.jumps <= after.t)
+    verdict = jnp.where(
+        ~jnp.all(jnp.isfinite(after.y)),
+        Verdict.NOT_FINITE,
+        jnp.where(
+            after.t <= lane.t,
+            Verdict.TOO_MANY_EVENTS,
+            jnp.where(
+                quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
+                Verdict.SLIDING,
+                jnp.where(
+                    quiet_load & (after.orbit.returned | reached),
+                    Verdict.LIMIT_CYCLE,
+                    jnp.where(
+                        quiet_load & (wedged | grown),
+                        Verdict.UNBOUNDED,
+                        Verdict.UNDECIDED,
+                    ),
+                ),
+            ),
+        ),
+    )
+    return eqx.tree_at(lambda lane: lane.verdict, after, verdict.astype(jnp.int8))
+
+
+def weights_of(structure: Structure) -> Float[Array, " 2n"]:
+    # The square roots of the diagonals make squares of displacements and velocities comparable energies.
+    return jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))
