@@ -50,9 +50,12 @@ def in_tiles(
             result = function(own, Packed(lanes.numbers[place], lanes.form))
             return place[real], np.asarray(result.numbers)[real], result.form
 
-    places, numbers, forms = zip(*pool.map(run, range(0, len(slots), rows)), strict=True)
-    back = np.argsort(np.concatenate(places))
-    return Packed(np.concatenate(numbers)[back], forms[0])
+    numbers = form = None
+    for places, part, its_form in pool.map(run, range(0, len(slots), rows)):
+        # Into place at once, so that not all parts are kept beside the whole.
+        numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers
+        numbers[places], form = part, its_form
+    return Packed(numbers, form)
 
 
 def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
