@@ -44,7 +44,7 @@ MUST_SHOW = {
 
 
 # Compiled for minutes, however small: five methods with all their parts, and a fit.
-SLOW = ("04_speed_and_accuracy", "05_calibration")
+SLOW = ("03_linear_theory", "04_speed_and_accuracy", "05_calibration")
 
 
 @pytest.mark.parametrize(
