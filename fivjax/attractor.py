@@ -39,7 +39,7 @@ LOOKS_NEAR = 4
 class Attractor(eqx.Module):
     """A limit cycle that is known: what lanes are compared with."""
 
-    # Deviations from equilibrium at crossings, weighted as in `lane.follow`.
+    # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
     crossings: Float[Array, "s 2n"]
     amplitude: Float[Array, ""]  # its largest tangential speed, m/s
     known: Bool[Array, ""]
@@ -57,25 +57,10 @@ class Approach(eqx.Module):
 class Ensemble(NamedTuple):
     """The last crossing states of `e` members, look by look; NaN where a member was not followed any more."""
 
-    deviations: Float[np.ndarray, "*k e 2n"]  # weighted
-    peaks: Float[np.ndarray, "*k e"]  # largest tangential speed since the look before, m/s
-    times: Float[np.ndarray, "*k e"]  # s
+    deviations: Float[np.ndarray, "k e 2n"]  # weighted
+    peaks: Float[np.ndarray, "k e"]  # largest tangential speed since the look before, m/s
+    times: Float[np.ndarray, "k e"]  # s
     moving: Bool[np.ndarray, " e"]  # members that are still followed: without another verdict
-
-
-def blank(members: int, size: int) -> Ensemble:
-    """One look at members with states of this size, to be filled in."""
-    one = np.full(members, np.nan)
-    return Ensemble(np.full((members, size), np.nan), one.copy(), one, np.ones(members, bool))
-
-
-def in_ensembles(looks: list[Ensemble], moving: Bool[np.ndarray, " e"], members: int) -> list[Ensemble]:
-    """Looks at the members of several ensembles, ensemble by ensemble."""
-    deviations, peaks, times, _ = (np.array(part) for part in zip(*looks, strict=True))
-    return [
-        Ensemble(deviations[:, own], peaks[:, own], times[:, own], moving[own])
-        for own in (slice(k, k + members) for k in range(0, len(moving), members))
-    ]
 
 
 def unknown(groups: int, size: int) -> Attractor:

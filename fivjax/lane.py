@@ -21,7 +21,6 @@ from .propagators import Windowed
 from .scene import Scene, steady_sliding
 from .sliding import SlidingModes, slides_forever
 from .steppers import AbstractStepper, Advance
-from .structure import Structure
 from .verdict import Verdict
 from .wedging import Wedge, sticks_forever
 
@@ -120,7 +119,7 @@ def follow(
 ) -> Lane:
     """One lane, `looks` times `LOOK_EVERY` steps further, with the verdict if it can be proved by then."""
     structure = scene.structure
-    weights = weights_of(structure)
+    weights = structure.weights
     # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
     longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
 
@@ -199,8 +198,3 @@ def follow(
         ),
     )
     return eqx.tree_at(lambda lane: lane.verdict, after, verdict.astype(jnp.int8))
-
-
-def weights_of(structure: Structure) -> Float[Array, " 2n"]:
-    # The square roots of the diagonals make squares of displacements and velocities comparable energies.
-    return jnp.sqrt(jnp.concatenate([jnp.diag(structure.stiffness), jnp.diag(structure.mass)]))

@@ -26,7 +26,7 @@ from .contact import Mechanics
 from .energy import exchanged
 from .event_exact import EventExact
 from .interrupts import noted
-from .lane import LOOK_EVERY, Lane, begin, follow, measured_from_rest, released, weights_of
+from .lane import LOOK_EVERY, Lane, begin, follow, measured_from_rest, released
 from .packed import Packed, packed
 from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene
@@ -255,8 +255,9 @@ def _run_block(
             groups, first = np.unique(group[many], return_index=True)
             for start in range(0, len(groups), ENSEMBLES):
                 part = slice(start, start + ENSEMBLES)
-                shared = _with_attractors(batch, shared, groups[part], columns[many[first[part]]], report)
-            together = packed(shared)
+                shared = _with_attractors(batch, shared, together, groups[part], columns[many[first[part]]], report)
+            if len(groups):
+                together = packed(shared)
         # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // LOOK_EVERY)
@@ -264,33 +265,41 @@ def _run_block(
         done += looks * LOOK_EVERY
 
 
-def _with_attractors(batch: Batch, shared: Shared, groups: np.ndarray, columns: np.ndarray, report) -> Shared:
-    """`shared` with the limit cycles of these groups, where their ensembles meet on one; `columns` of any lane of each."""
-    structure = batch.scene.structure
-    members, weights = len(attractors.RELEASES), np.asarray(weights_of(structure))
+def _with_attractors(
+    batch: Batch, shared: Shared, together: Packed, groups: np.ndarray, columns: np.ndarray, report
+) -> Shared:
+    """`shared` with the limit cycles of these groups, where their ensembles meet on one.
+
+    `together` is what lanes share, packed, in which these are not known; `columns` are those of any lane of each group.
+    """
+    structure, members = batch.scene.structure, len(attractors.RELEASES)
     found = jax.tree.map(np.array, shared.attractor)
     own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
     running, moving = np.arange(len(own)), np.ones(len(own), bool)
-    together = packed(shared)
     lanes = _begun(batch, together, own, columns, np.tile(attractors.RELEASES, len(groups)))
-    looks = []
-    while len(running) and len(looks) < max(attractors.TESTS):
+    most = max(attractors.TESTS)
+    deviations = np.full((most, len(own), 2 * structure.size), np.nan)
+    peaks, times = np.full((most, len(own)), np.nan), np.full((most, len(own)), np.nan)
+    looks = 0
+    while len(running) and looks < most:
         report(0)
         lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
         lanes = _followed(batch, together, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
         for crossing in (lanes.approach.before, lanes.approach.seen):
-            look = attractors.blank(len(own), len(weights))
-            look.deviations[running], look.peaks[running], look.times[running] = crossing, lanes.orbit.peak, lanes.t
-            looks.append(look)
+            deviations[looks, running] = crossing
+            peaks[looks, running], times[looks, running] = lanes.orbit.peak, lanes.t
+            looks += 1
         moving[running] = (lanes.verdict == Verdict.UNDECIDED) | (lanes.verdict == Verdict.LIMIT_CYCLE)
         over = ~moving[running]
-        if len(looks) in attractors.TESTS:
-            ensembles = attractors.in_ensembles(looks, moving, members)
+        if looks in attractors.TESTS:
             for k in np.unique(running // members):
-                cycle = attractors.met(ensembles[k], shared.modes.slowest_decay[groups[k]])
+                mine = slice(k * members, (k + 1) * members)
+                seen = deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine]
+                group = groups[k]
+                cycle = attractors.met(attractors.Ensemble(*seen, moving[mine]), shared.modes.slowest_decay[group])
                 if cycle is not None:
-                    found.crossings[groups[k]], found.amplitude[groups[k]] = cycle
-                    found.known[groups[k]] = True
+                    found.crossings[group], found.amplitude[group] = cycle
+                    found.known[group] = True
             over |= found.known[own[running]]
         running, lanes = running[~over], jax.tree.map(lambda leaf, over=over: leaf[~over], lanes)
     return eqx.tree_at(lambda shared: shared.attractor, shared, found)

@@ -82,8 +82,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
     begin = jnp.argmax(rises) + 1
     y = states[begin]
-    weights = jnp.sqrt(jnp.concatenate([jnp.diag(scene.structure.stiffness), jnp.diag(scene.structure.mass)]))
-    apart = jnp.sum((weights * (states - y)) ** 2, axis=1)
+    apart = jnp.sum((scene.structure.weights * (states - y)) ** 2, axis=1)
     later = jnp.arange(states.shape[0]) - begin
     tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS)
     back = jnp.argmin(jnp.where(tried & jnp.isfinite(apart), apart, jnp.inf))

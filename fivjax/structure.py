@@ -134,6 +134,11 @@ class Structure(eqx.Module):
         """Number of degrees of freedom of the free structure."""
         return self.mass.shape[0]
 
+    @property
+    def weights(self) -> Float[Array, " 2n"]:
+        """What makes the squares of displacements and velocities comparable energies: the square roots of the diagonals."""
+        return jnp.sqrt(jnp.concatenate([jnp.diag(self.stiffness), jnp.diag(self.mass)]))
+
     def replace(self, **changes) -> "Structure":
         """The structure rebuilt with other values of the parameters that made it: `structure.replace(k1=90e3)`.
 

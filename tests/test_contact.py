@@ -137,6 +137,16 @@ def on_the_belt(rng, scene, *, slip):
     return y
 
 
+def at_an_event(rng, scene, kind):
+    """A status with a direction, a load, a state at which it ends, and which of its guards have run out."""
+    direction, load = float(rng.choice([-1, 1])), float(rng.normal() * 100)
+    slip = 0.0 if kind == Status.STICK else float(-direction * rng.uniform())
+    y = on_the_belt(rng, scene, slip=slip)
+    if kind == Status.DETACH:
+        y[scene.structure.size + scene.structure.normal] = -rng.uniform()
+    return kind, direction, load, y, [True, True] if kind == Status.DETACH else [False, True]
+
+
 # ------------------------------------------------------------------------------- the paper's equations
 
 
@@ -427,13 +437,7 @@ def test_every_transition_ends_on_the_constraint_of_a_consistent_status(n):
     rng = np.random.default_rng(80 + n)
     for k in range(40):
         scene = random_scene(rng, n, restitution=0.0 if k % 2 else 0.6)
-        kind = Status(k % 3)
-        direction, load = float(rng.choice([-1, 1])), float(rng.normal() * 100)
-        slip = 0.0 if kind == Status.STICK else float(-direction * rng.uniform())
-        y = on_the_belt(rng, scene, slip=slip)
-        if kind == Status.DETACH:
-            y[n + scene.structure.normal] = -rng.uniform()
-        ended = [True, True] if kind == Status.DETACH else [False, True]
+        kind, direction, load, y, ended = at_an_event(rng, scene, Status(k % 3))
         after_kind, after_direction, after = transition(scene, kind, direction, load, y, ended)
         assert after[scene.structure.normal] == 0.0
         if after_kind != Status.DETACH:
@@ -473,13 +477,7 @@ def test_measured_from_a_rest_the_physics_is_the_same(law):
     rng, n = np.random.default_rng(17), 3
     for k in range(60):
         scene = random_scene(rng, n, law=law, restitution=0.4)
-        kind = Status(k % 3)
-        direction, load = float(rng.choice([-1, 1])), float(rng.normal() * 100)
-        slip = 0.0 if kind == Status.STICK else float(-direction * rng.uniform())
-        y = on_the_belt(rng, scene, slip=slip)
-        if kind == Status.DETACH:
-            y[n + scene.structure.normal] = -rng.uniform()
-        ended = [True, True] if kind == Status.DETACH else [False, True]
+        kind, direction, load, y, ended = at_an_event(rng, scene, Status(k % 3))
         expected = motion(scene, kind, direction, load, y)
         with jax.enable_x64(True):
             found = _about_rest(
