@@ -1,9 +1,9 @@
 """The stages of a calibration: from starts far off to the minimum, and everything that is wanted there.
 
 What is compiled is one function of a batch of starts for each kind of residual (`_features`, `_compared`), with its whole
-Jacobian in forward mode; `least_squares` moves the starts. A limit cycle brings unknowns of its own, a state on it and its
-period, and as many equations, that it closes. Newton's method solves them at every step, from where they were at the
-last one, and the Jacobian follows them.
+Jacobian in forward mode; optimistix moves the starts (`least_squares`). A limit cycle brings unknowns of its own, a state
+on it and its period, and as many equations, that it closes. Newton's method solves them at every step, from where they
+were at the last one, and the Jacobian follows them.
 """
 
 from typing import NamedTuple
