@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from tqdm.auto import tqdm
 
 from . import arguments
+from .compiling import compiled
 from .cycle_misfit import BEATS, CycleMisfit, cycle_misfit, cycle_rate
 from .event_exact import EventExact
 from .misfit import OFFSET_UNIT, misfit
@@ -373,7 +374,7 @@ def _structure_left(stages: Stages, means, misfit: float) -> bool:
     return stated and misfit > 2.0
 
 
-@eqx.filter_jit
+@compiled
 def _values_and_slopes(parameters: FreeParameters, u: Float[Array, " k"]):
     return parameters.values(u), jnp.diagonal(jax.jacfwd(parameters.values)(u))
 

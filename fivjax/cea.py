@@ -19,6 +19,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from . import arguments
+from .compiling import compiled
 from .critical import Coalescence as Coalescence
 from .critical import Mechanism as Mechanism
 from .critical import Outcome as Outcome
@@ -61,7 +62,7 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
     return _matrix(_checked(system, mu, direction))
 
 
-_matrix = eqx.filter_jit(lambda scene: linear_sliding(scene).matrix)
+_matrix = compiled(lambda scene: linear_sliding(scene).matrix)
 
 
 def _checked(system, mu, direction) -> Scene:
@@ -102,20 +103,18 @@ def _check_frictions(mu) -> None:
             raise ValueError(f"Argument `mu` must be non-negative and finite, but holds {bad[0]:g}.")
 
 
-@eqx.filter_jit
+@compiled
 def _eigenvalues(scene):
     found = jnp.linalg.eigvals(linear_sliding(scene).matrix)
     return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
 
 
-@eqx.filter_jit
+@compiled
 def _eigenvalues_over(structure, mu, direction):
     return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
 
 
-_growth_rate = eqx.filter_jit(
-    with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(linear_sliding(scene).matrix).real))
-)
+_growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(linear_sliding(scene).matrix).real)))
 
 
 @returning_numpy
@@ -199,7 +198,7 @@ class _Sampler:
         return middle, self.many(np.array([middle]))[0]
 
 
-@eqx.filter_jit
+@compiled
 def _matrices(scene, name, values):
     def at(value):
         point = scene.replace(**{name: value})
@@ -408,7 +407,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     return Sensitivity(labelled(dataset, scene, analysis="sensitivity of mu_crit", mechanism=limit.mechanism.value))
 
 
-@eqx.filter_jit
+@compiled
 def _slopes(structure: Structure, direction):
     """dμ_crit/dp and dC/dp by name of parameter."""
     values, build = _named_parameters(structure)

@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from . import arguments
+from .compiling import compiled
 from .elimination import inverse, solve
 from .precision import in_double_precision, returning_numpy
 from .scene import Scene, steady_sliding
@@ -389,7 +390,7 @@ def _friction_limit(structure, direction):
     return _first_limit(friction_loop(structure, direction)[0]).gain
 
 
-_critical_friction = eqx.filter_jit(with_own_gradient(_friction_limit, _is_a_limit))
+_critical_friction = compiled(with_own_gradient(_friction_limit, _is_a_limit))
 
 
 @returning_numpy
@@ -415,7 +416,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     return _critical_friction(_bare(structure), jnp.asarray(float(direction)))
 
 
-@eqx.filter_jit
+@compiled
 def _stability_limit(structure, direction):
     loop, scale = friction_loop(structure, direction)
     limit = _first_limit(loop)
@@ -440,7 +441,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
 HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
 
 
-@eqx.filter_jit
+@compiled
 def _coalescence(structure, direction):
     undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
     loop, scale = friction_loop(undamped, direction)
@@ -498,7 +499,7 @@ def _slope_limit(scene):
     return -_first_limit(loop).gain / normal_force
 
 
-_critical_slope = eqx.filter_jit(with_own_gradient(_slope_limit, _is_a_limit))
+_critical_slope = compiled(with_own_gradient(_slope_limit, _is_a_limit))
 
 
 @returning_numpy

@@ -8,7 +8,6 @@ energies and durations are those of the instant itself. The same is done for con
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float
 
 from . import arguments
 from . import energy as accounts
+from .compiling import compiled
 from .contact import Contact, Mechanics, State
 from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
@@ -149,7 +149,7 @@ def _power_of_4(count: int) -> int:
     return 4 ** -(-(count - 1).bit_length() // 2)
 
 
-@eqx.filter_jit
+@compiled
 def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Callable, most: int):
     """The first `most` instants after each start at which the count goes up, not beyond each end."""
     mechanics, books, method = Mechanics(scene), Books(scene), EventExact()

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import arguments
 from . import contact as physics
+from .compiling import compiled
 from .contact import Contact, Mechanics, Status
 from .event_exact import EventExact
 from .precision import in_double_precision, known_to_numpy
@@ -140,7 +141,7 @@ def derivatives(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
     def of(values):
         value = functional(simulate(scene.replace(**values), t1, dt_save, method, y0=y0, derivatives=mode))
@@ -236,7 +237,7 @@ class _Look(eqx.Module):
     ]  # how clearly what follows was decided at the end, relative; infinite if it was not asked
 
 
-@eqx.filter_jit
+@compiled
 def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     after = method.advance(mechanics, contact, load, y, h)
     # Just short of the end the status is still the same.

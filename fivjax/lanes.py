@@ -22,6 +22,7 @@ from tqdm.auto import tqdm
 from . import attractor as attractors
 from . import orbit as orbits
 from .attractor import Attractor
+from .compiling import compiled
 from .contact import Mechanics
 from .energy import exchanged
 from .event_exact import EventExact
@@ -32,7 +33,7 @@ from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene
 from .sliding import SlidingModes, linear_sliding, sliding_modes
 from .steppers import AbstractStepper
-from .tiles import in_tiles, workers
+from .tiles import MANY, in_tiles, workers
 from .verdict import Verdict
 from .wedging import Wedge, wedge
 
@@ -102,6 +103,7 @@ class Batch(NamedTuple):
     history: tuple[str, ...]  # those of the load's history
     energy: bool
     width: int  # lanes of a group side by side
+    many: bool  # so many that code which runs faster repays what it takes to compile
     pool: ThreadPoolExecutor
 
 
@@ -176,6 +178,7 @@ def run_to_verdict(
         history=tuple(name for name in values if name in HISTORY),
         energy=energy,
         width=width,
+        many=total >= MANY,
         pool=ThreadPoolExecutor(max_workers=workers()),
     )
     with noted() as signals, bar, batch.pool:
@@ -342,7 +345,7 @@ def _shared(batch: Batch, distinct: np.ndarray) -> Shared:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = _with(scene, names, row)
@@ -366,13 +369,17 @@ def _begun(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray,
 def _followed(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, lanes: Lane, looks: int) -> Lane:
     """Lanes `looks` looks further."""
 
+    follow_tile = _follow_many if batch.many else _follow
+
     def function(*tile):
-        return _follow(batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *tile)
+        return follow_tile(
+            batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *tile
+        )
 
     return in_tiles(function, shared, group, packed((columns, lanes)), batch.width, batch.pool).tree
 
 
-@eqx.filter_jit
+@compiled
 def _begin(scene, names, history, energy: bool, kicked: bool, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, releases):
         own = _with(scene, names, shared.values)
@@ -386,8 +393,7 @@ def _begin(scene, names, history, energy: bool, kicked: bool, shared: Packed, la
     return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
 
 
-@eqx.filter_jit
-def _follow(scene, method, resolution, names, history, looks, shared: Packed, lanes: Packed) -> Packed:
+def _follow_tile(scene, method, resolution, names, history, looks, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, lanes):
         own = _with(scene, names, shared.values)
 
@@ -399,6 +405,9 @@ def _follow(scene, method, resolution, names, history, looks, shared: Packed, la
         return jax.vmap(one)(columns, lanes)
 
     return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
+
+
+_follow, _follow_many = compiled(_follow_tile), eqx.filter_jit(_follow_tile)
 
 
 def _with(scene: Scene, names: tuple[str, ...], row) -> Scene:

@@ -19,6 +19,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from .compiling import compiled
 from .precision import in_double_precision
 
 # Damping relative to the slopes at the start: where it begins, and where nothing can be gained any more.
@@ -122,7 +123,7 @@ def _tangent(z, args):
     return residual + jacobian @ (z - point), None
 
 
-@eqx.filter_jit
+@compiled
 def _begun(z: Float[Array, "s j"]):
     """The solver's state before it knows anything of these points."""
     size = z.shape[1]
@@ -136,7 +137,7 @@ def _begun(z: Float[Array, "s j"]):
     return jax.vmap(one)(z)
 
 
-@eqx.filter_jit
+@compiled
 def _stepped(z: Float[Array, "s j"], tangents: _Tangents, state):
     """The solver's state once it knows the residuals where it wanted to; `z` are the best points so far."""
 

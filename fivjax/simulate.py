@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
+from .compiling import compiled
 from .contact import Contact, Mechanics, State, Status
 from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
@@ -24,6 +25,8 @@ from .verdict import ENDING, Ending
 
 # Rows that a trajectory may have: some 20 GB of them.
 MOST_ROWS = 10**8
+# Trajectories up to the second are compiled for the next power of four of rows, none for fewer than the first.
+LEAST_ROWS, MOST_REPEATED = 64, 4**8
 
 
 class Trajectory(eqx.Module):
@@ -127,12 +130,20 @@ def simulate(
     y0 = start_state(scene, y0)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
-    saved = jnp.minimum(dt_save * jnp.arange(rows + 1), t1).at[-1].set(t1)
-    # What is known has no derivatives.
-    if all(map(is_known, jax.tree.leaves((scene, method, y0, saved)))):
-        derivatives = "forward"
-    rows = jax.tree.map(known_to_numpy, _simulate(scene, method, y0, saved, most, bool(energy), derivatives))
-    return Trajectory(**rows, scene=scene, outcome=_ending(scene, method, rows, most))
+    count = rows + 1
+    # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled.
+    if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
+        derivatives, count = "forward", _compiled_rows(rows + 1)
+    instants = jnp.arange(count)
+    saved = jnp.where(instants < rows, jnp.minimum(dt_save * instants, t1), t1)
+    found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
+    found = jax.tree.map(lambda leaf: known_to_numpy(leaf[: rows + 1]), found)
+    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most))
+
+
+def _compiled_rows(count: int) -> int:
+    """The number of rows that is compiled for so many. Where these are many, compiling is little beside them."""
+    return max(LEAST_ROWS, 4 ** math.ceil(math.log(count, 4))) if count <= MOST_REPEATED else count
 
 
 def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:
@@ -152,7 +163,7 @@ def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Arr
     return np.int8(Ending.TOO_MANY_EVENTS if 2 * int(events) > most else Ending.STEP_FAILURE)
 
 
-@eqx.filter_jit
+@compiled
 def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: int):
     """How many of the next `most` advances end in an event, and the state after them."""
     mechanics = Mechanics(scene)
@@ -169,7 +180,7 @@ def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: 
     return events, y
 
 
-@eqx.filter_jit
+@compiled
 def _simulate(
     scene: Scene,
     method: AbstractStepper,

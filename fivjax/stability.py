@@ -9,7 +9,6 @@ eigenvalues go through LAPACK point by point (and are not to be had on every acc
 Time is measured in $1/ω_0$, $ω_0$ a mean of the structure's own frequencies, so that the coefficients are of order one.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ import xarray as xr
 from jaxtyping import Array, Complex, Float
 
 from . import arguments
+from .compiling import compiled
 from .elimination import solve
 from .friction import Coulomb
 from .load import ConstantLoad
@@ -160,7 +160,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     return _margin(structure, real(mu), real(direction))
 
 
-@eqx.filter_jit
+@compiled
 def _margin(structure, mu, direction):
     scale = time_scale(structure)
     mass, damping, stiffness = sliding_matrices(structure, mu, direction, jnp.zeros_like(mu))
@@ -324,7 +324,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> xr.
     return labelled(dataset, scene, analysis="stability chart", method="characteristic polynomial, Routh-Hurwitz")
 
 
-@eqx.filter_jit
+@compiled
 def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))

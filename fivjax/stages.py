@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .compiling import compiled
 from .contact import Contact, Status
 from .cycle_misfit import CycleMisfit
 from .least_squares import Evaluated, minimise
@@ -253,7 +254,7 @@ class _Compared(NamedTuple):
     about: _About
 
 
-@eqx.filter_jit
+@compiled
 def _compared(problem: Problem, x: Float[Array, "s j"], x0, share, cycles: tuple[Cycle, ...]) -> _Compared:
     return jax.vmap(lambda x, x0, cycles: _compared_one(problem, x, x0, share, cycles))(x, x0, cycles)
 
@@ -317,12 +318,12 @@ def _corrected(problem: Problem, cycle: Cycle, step, gap, contact: Contact) -> t
     return chosen, jnp.where(astray & ~changed, jnp.nan, moved)
 
 
-@eqx.filter_jit
+@compiled
 def _settled(problem: Problem, x: Float[Array, "s j"]) -> tuple[Cycle, ...]:
     return jax.vmap(lambda x: tuple(m.settled(problem.at(x[: problem.size])) for m in problem.cycles))(x)
 
 
-@eqx.filter_jit
+@compiled
 def _predicted(problem: Problem, x: Float[Array, "s j"], about: _About) -> tuple[Cycle, ...]:
     tangential = problem.scene.structure.tangential
 
@@ -348,7 +349,7 @@ def _growth(system: Float[np.ndarray, "2n 2n"], where: int) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(returned)))) if np.all(np.isfinite(returned)) else np.inf
 
 
-@eqx.filter_jit
+@compiled
 def _features(problem: Problem, u: Float[Array, "s k"], u0: Float[Array, "s k"]):
     def coarse(u, u0):
         scene = problem.at(u)
@@ -359,7 +360,7 @@ def _features(problem: Problem, u: Float[Array, "s k"], u0: Float[Array, "s k"])
     return residual, jacobian
 
 
-@eqx.filter_jit
+@compiled
 def _integrals(problem: Problem, which: int, u: Float[Array, "s k"], instants: Float[Array, " b"], eventful=False):
     mine = problem.misfits[which]
     return jax.vmap(lambda u: mine.integrals(problem.at(u), instants, eventful))(u)

@@ -1,11 +1,11 @@
 """Where fits set out from: a scene's own parameters, and others around them."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .compiling import compiled
 from .parameters import FreeParameters
 from .scene import Scene
 from .sliding import linear_sliding
@@ -50,6 +50,6 @@ def vibrating(
     return np.concatenate([parameters.unbounded(own)[None], tried[order]])
 
 
-@eqx.filter_jit
+@compiled
 def _matrices(parameters: FreeParameters, scene: Scene, u: Float[Array, "s k"]):
     return jax.vmap(lambda u: linear_sliding(parameters.scene(scene, u)).matrix)(u)

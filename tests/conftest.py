@@ -2,24 +2,12 @@
 
 import os
 
-import jax
 import pytest
 
+# What tests compile for themselves is compiled as fivjax compiles its own, see `fivjax.compiling`; JAX looks when it starts.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
+
 import fivjax as fj
-
-
-def pytest_configure(config):
-    """Most of the suite's time goes into compiling. What one worker, a process that a test starts, or the last run has
-    compiled, the others read."""
-    settings = {
-        "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.2,
-        # With a largest size, one process at a time reads and writes.
-        "jax_compilation_cache_max_size": 2**30,
-    }
-    for name, value in settings.items():
-        jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)
 
 
 @pytest.fixture

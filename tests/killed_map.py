@@ -16,13 +16,13 @@ from pathlib import Path
 AXES = ["--x", "mu=0.05:0.228:12", "--y", "p=1.02:4:16", "--t-max", "8"]
 
 
-def run(folder: Path, name: str = "none", delay: float = 0.0) -> subprocess.CompletedProcess:
-    """One such process."""
+def run(folder: Path, name: str = "none", delay: float = 0.0, cache: Path | None = None) -> subprocess.CompletedProcess:
+    """One such process; a common `cache` of compiled code makes the second one start faster."""
     import fivjax
 
     # The same package as the caller's, wherever that comes from.
     package = Path(fivjax.__file__).parents[1]
-    environment = {**os.environ, "PYTHONPATH": str(package)}
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache or folder), "PYTHONPATH": str(package)}
     command = [sys.executable, __file__, str(folder), name, str(delay)]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
 

@@ -381,20 +381,18 @@ def resume(times: int = 20) -> None:
     """kill -9 at random instants, then the same command again: the maps, byte for byte."""
     same = 0
     with tempfile.TemporaryDirectory() as folder:
-        # What the first process compiles, the others read.
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(folder) / "cache")
-        whole = Path(folder) / "whole"
+        cache, whole = Path(folder) / "cache", Path(folder) / "whole"
         whole.mkdir()
-        assert killed_map.run(whole).returncode == 0
+        assert killed_map.run(whole, cache=cache).returncode == 0
         expected = xr.load_dataset(whole / "map.nc", engine="h5netcdf")
         rng = random.Random(5)
         for k in range(times):
             own = Path(folder) / f"killed{k}"
             own.mkdir()
             delay = rng.uniform(0.0, 0.6)
-            killed = killed_map.run(own, "SIGKILL", delay)
+            killed = killed_map.run(own, "SIGKILL", delay, cache)
             left = sorted(path.name for path in own.iterdir() if not path.name.startswith("."))
-            finished = killed_map.run(own)
+            finished = killed_map.run(own, cache=cache)
             found = xr.load_dataset(own / "map.nc", engine="h5netcdf")
             equal = all(found[name].values.tobytes() == expected[name].values.tobytes() for name in expected.data_vars)
             same += equal

@@ -12,6 +12,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -117,12 +118,24 @@ def start() -> None:
 
 
 def memory() -> None:
-    """What a map adds to the memory of the process at its highest, per lane."""
-    paper_map(16)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """What a map adds to the memory of a process that has compiled all it needs, at its highest, per lane."""
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    paper_map(128)
+    before, highest, over = resident(), [0], threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.02):
+            highest[0] = max(highest[0], resident())
+
+    watching = threading.Thread(target=watch)
+    watching.start()
     paper_map(256)
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(f"{(after - before) / 256**2:.2f} kB per lane, 65,536 lanes")
+    over.set()
+    watching.join()
+    print(f"{(highest[0] - before) / 1e3 / 256**2:.2f} kB per lane, 65,536 lanes")
 
 
 def paper_map(points: int):

@@ -7,17 +7,17 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from recordings import FREE, case, clean, noisy, off, paper, recording, times
+from recordings import FREE, RATE, case, clean, noisy, off, paper, recording, times
 
 import fivjax as fj
 from fivjax import cli, features
-from fivjax.calibrate import Outcome, _covariance
+from fivjax.calibrate import UNSTABLE, Outcome, _covariance
 from fivjax.cycle_misfit import BEATS, cycle_misfit, cycle_rate
 from fivjax.least_squares import Evaluated, minimise
 from fivjax.parameters import FreeParameters
 from fivjax.plot_calibration import calibration
 from fivjax.signals import averaged
-from fivjax.stages import Problem, _Comparison
+from fivjax.stages import Problem, _Comparison, _growth
 
 
 def scores(fit, scene):
@@ -234,19 +234,31 @@ def test_the_papers_limit_cycle_beats_above_a_speed(speed, beats):
     assert (float(found.beating) > BEATS) is beats
 
 
-@pytest.mark.slow
-def test_a_closed_cycle_is_the_one_that_a_run_settles_on():
-    """Its frequency and lines as in a run, its fractions of time as counted there, its slopes as those of differences."""
+@pytest.fixture(scope="module")
+def closed():
+    """A function: how a limit cycle at a belt speed differs from the recorded one at 1 m/s, at three frictions."""
     scene, accelerations, _ = case("limit cycle")
     counted = {status: (value, 1e-3) for status, value in times(scene).items()}
     data = recording(accelerations, "limit cycle", noise={"a0": 1.0, "a1": 1.0}, **counted)
+    step = 1e-5
+
+    def at(belt_speed):
+        with jax.enable_x64(True):
+            mine = cycle_misfit(data, averaged(data, cycle_rate(data, scene)), fj.EventExact(), scene)
+            own = scene.replace(belt_speed=belt_speed)
+            problem = Problem(own, FreeParameters(own, ["mu"]), (mine,), np.zeros(1), (False,))
+            u = np.array([[0.0], [step], [-step]])
+            return own, mine, _Comparison(problem, u, 1.0)(u, None), step
+
+    return at
+
+
+@pytest.mark.slow
+def test_a_closed_cycle_is_the_one_that_a_run_settles_on(closed):
+    """Its frequency and lines as in a run, its fractions of time as counted there, its slopes as those of differences."""
+    _, mine, found, step = closed(1.0)
+    residual, jacobian = found.residual, found.jacobian[0, :, 0]
     with jax.enable_x64(True):
-        mine = cycle_misfit(data, averaged(data, cycle_rate(data, scene)), fj.EventExact(), scene)
-        problem = Problem(scene, FreeParameters(scene, ["mu"]), (mine,), np.zeros(1), (False,))
-        step = 1e-5
-        u = np.array([[0.0], [step], [-step]])
-        found = _Comparison(problem, u, 1.0)(u, None)
-        residual, jacobian = found.residual, found.jacobian[0, :, 0]
         lines = np.linalg.solve(np.asarray(mine.whitening), residual[0, : len(mine.measured)])
         frequency, size = np.asarray(mine.measured)[:2]
     assert abs(lines[0]) < 1e-5 * frequency
@@ -256,6 +268,42 @@ def test_a_closed_cycle_is_the_one_that_a_run_settles_on():
     assert np.abs(residual[0, len(lines) : len(lines) + 2]).max() < 0.3
     numeric = (residual[1] - residual[2]) / (2 * step)
     np.testing.assert_allclose(jacobian, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("belt_speed", "lasts"), [(1.0, True), (2.0, False)])
+def test_disturbances_of_a_closed_cycle_grow_as_its_multipliers_say(closed, belt_speed, lasts):
+    """Against two runs, one from a state beside the cycle."""
+    scene, _, found, _ = closed(belt_speed)
+    cycle = jax.tree.map(lambda leaf: leaf[0], found.about.cycles[0])
+    growth = _growth(found.about.systems[0][0], 3)
+    assert (growth < UNSTABLE) is lasts
+    beside = cycle.y + 1e-7 * np.abs(cycle.y).max() * np.array([1, 1, 0, 0, 0, 0])
+    runs = [fj.simulate(scene, 60 * cycle.period, cycle.period, y0=y) for y in (cycle.y, beside)]
+    apart = np.concatenate([runs[1].displacement - runs[0].displacement, runs[1].velocity - runs[0].velocity], axis=1)
+    # What lies along the cycle stays as it is; from one period to the next it is gone.
+    with jax.enable_x64(True):
+        weights = np.asarray(scene.structure.weights)
+    sizes = np.linalg.norm(weights * np.diff(apart, axis=0), axis=1)
+    slope = np.polyfit(np.arange(15, 60), np.log(sizes[15:]), 1)[0]
+    print(growth, slope, np.log(growth))
+    assert slope == pytest.approx(np.log(growth), abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_cycle_that_would_not_last_is_said_to_be_unstable(closed):
+    """A second of exactly an unstable cycle, which no run would stay with for as long."""
+    scene, _, found, _ = closed(2.0)
+    cycle = jax.tree.map(lambda leaf: leaf[0], found.about.cycles[0])
+    once = fj.simulate(scene, cycle.period, cycle.period / 8192, y0=cycle.y)
+    instants = np.arange(RATE + 1) / RATE
+    velocities = [np.interp(instants, once.t, once.velocity[:, k], period=cycle.period) for k in range(2)]
+    accelerations = np.diff(np.transpose(velocities), axis=0) * RATE
+    fit = fj.calibrate(
+        scene.replace(mu=0.303), recording(noisy(accelerations, 0.01, 0), "limit cycle"), ["mu"], progress=False
+    )
+    assert fit.outcome is Outcome.UNSTABLE and not fit.converged
+    assert "would not last" in str(fit)
 
 
 @pytest.mark.parametrize("regime", ["sliding", pytest.param("kick", marks=pytest.mark.slow)])

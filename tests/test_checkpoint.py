@@ -160,18 +160,19 @@ def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, mon
 
 def test_a_killed_command_is_resumed_bit_for_bit(tmp_path):
     """kill -9 at an instant of its own choosing, then SIGTERM, then to the end: the same map as without."""
+    cache = tmp_path / "cache"
     folders = {name: tmp_path / name for name in ("whole", "killed")}
     for folder in folders.values():
         folder.mkdir()
-    assert killed_map.run(folders["whole"]).returncode == 0
+    assert killed_map.run(folders["whole"], cache=cache).returncode == 0
     assert {path.name for path in folders["whole"].iterdir()} == {"map.nc", "map.png"}
-    assert killed_map.run(folders["killed"], "SIGKILL", 0.05).returncode == -9
+    assert killed_map.run(folders["killed"], "SIGKILL", 0.05, cache).returncode == -9
     assert not (folders["killed"] / "map.nc").exists()
-    ended = killed_map.run(folders["killed"], "SIGTERM", 0.05)
+    ended = killed_map.run(folders["killed"], "SIGTERM", 0.05, cache)
     assert ended.returncode == 130, ended.stderr
     assert "--resume" in ended.stderr and "Traceback" not in ended.stderr
     assert not (folders["killed"] / "map.nc").exists()
-    assert killed_map.run(folders["killed"]).returncode == 0
+    assert killed_map.run(folders["killed"], cache=cache).returncode == 0
     maps = [xr.open_dataset(folder / "map.nc", engine="h5netcdf").load() for folder in folders.values()]
     assert same(*maps)
     assert json.loads(maps[0].attrs["counts"])["not_run"] == 0
