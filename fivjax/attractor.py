@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .contact import State
-from .orbit import DECAYED
+from .orbit import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
 RELEASES = np.linspace(1.5, 6.0, 16)
@@ -78,7 +78,7 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
 
     Members have met when the last third of their crossing states are all close to states that *others* were in during the
     third before. In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its
-    slowest rate in 1/s); theirs has not.
+    slowest rate in 1/s); theirs has changed in size by no more than a tenth of that.
     """
     looks = len(ensemble.times)
     earlier, later = slice(looks // 3, 2 * looks // 3), slice(2 * looks // 3, looks)
@@ -94,7 +94,7 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
         return None
     lasting = decay * (np.mean(ensemble.times[later, members]) - np.mean(ensemble.times[earlier, members]))
     sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]
-    if lasting < DECAYED or sizes[1] < (1 - DECAYED / 4) * sizes[0]:
+    if lasting < DECAYED or abs(np.log(sizes[1] / sizes[0])) > SUSTAINED * lasting:
         return None
     states = ensemble.deviations[later][:, members].reshape(-1, ensemble.deviations.shape[-1])
     chosen = np.linspace(0, len(states) - 1, KEPT).round().astype(int)

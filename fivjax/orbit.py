@@ -31,6 +31,8 @@ LOOSE_SPAN = 16
 ROOM = 1.5
 # Loose returns go on for so long that what is not sustained would have decayed by this much: more than they may be apart.
 DECAYED = 0.2
+# And what is sustained does not change in size by more than this share of what it would have decayed by.
+SUSTAINED = 0.1
 # Loose returns each this much further than the one before drift off; on a torus they scatter, or stay the same.
 DRIFT = 0.02
 
@@ -60,6 +62,7 @@ class Orbit(eqx.Module):
     rising: Bool[Array, ""]  # each of them further than the one before
     excursion: Float[Array, ""]  # largest distance from the anchor since it was set, relative
     peak: Float[Array, ""]  # largest tangential speed since the anchor was set, m/s
+    first_peak: Float[Array, ""]  # the same over the first of these returns
     amplitude: Float[Array, ""]  # the same over the returns in a row
     returned: Bool[Array, ""]  # seen to return: a limit cycle
 
@@ -82,6 +85,7 @@ def new_orbit(y: State) -> Orbit:
         rising=jnp.zeros((), bool),
         excursion=zero,
         peak=zero,
+        first_peak=zero,
         amplitude=zero,
         returned=jnp.zeros((), bool),
     )
@@ -135,7 +139,9 @@ def observe(
     span = jnp.where(loose, LOOSE_SPAN, resolution.span)
     needed = jnp.maximum(LEAST_RETURNS, -(-span // jnp.maximum(lag, 1)))
     # A vibration that merely decays slowly comes back loosely, too.
-    sustained = (t - orbit.since) * decay >= DECAYED
+    faded = (t - orbit.since) * decay
+    change = jnp.abs(jnp.log(peak / jnp.where(orbit.first_peak > 0, orbit.first_peak, 1.0)))
+    sustained = (faded >= DECAYED) & (change <= SUSTAINED * faded)
     complete = again & (returns >= needed) & (~loose | sustained)
     # Below a hundredth of the method's error there is nothing left to drift.
     further = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
@@ -164,6 +170,7 @@ def observe(
         rising=restart | rising,
         excursion=jnp.where(new_anchor, 0.0, excursion),
         peak=jnp.where(new_anchor, 0.0, peak),
+        first_peak=jnp.where(restart, peak, orbit.first_peak),
         amplitude=amplitude,
         returned=orbit.returned | (complete & ~drifting),
     )
