@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 
 import fivjax as fj
@@ -165,3 +166,19 @@ def test_impacts_that_die_out_in_a_structure_hardly_damped_are_no_limit_cycle():
     scene = fj.Scene(structure, fj.Coulomb(0.0), 1e4, fj.Pulse(0.506638, 18.2095, 0.00180242), restitution=0.265366)
     m = fj.bistability_map(scene, p=[18.2095], t_max=40.0, progress=False)
     assert int(m["verdict"][0]) == fj.Verdict.SLIDING and float(m["last_event"][0]) > 10
+
+
+def test_stick_slip_that_fades_slowly_is_no_limit_cycle():
+    """It comes back closely, for as long as one likes to wait, but a tenth smaller every second or two. The oracle's end."""
+    structure = fj.belt_oscillator(theta=0.457228, m2=0.04505, k2=427.852, c1=3.71337, c2=0.070815)
+    scene = fj.Scene(structure, fj.Coulomb(1.25492), 146.778, fj.Pulse(1.54572e8, 9.22951, 1.39212e-4), restitution=1.0)
+    m = fj.bistability_map(scene, p=[9.22951], t_max=60.0, progress=False)
+    assert int(m["verdict"][0]) == fj.Verdict.SLIDING
+    theirs = oracle.paper_model(
+        mu=1.25492, belt_speed=146.778, p=9.22951, force=1.54572e8, duration=1.39212e-4, restitution=1.0,
+        theta=0.457228, m2=0.04505, k2=427.852, c1=3.71337, c2=0.070815,
+    )  # fmt: skip
+    found = oracle.verdict(theirs, 60.0)
+    assert found.kind == "sliding"
+    assert float(m["last_event"][0]) == pytest.approx(found.last_event, rel=1e-6)
+    assert int(m["contact_events"][0]) == found.events
