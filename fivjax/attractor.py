@@ -21,11 +21,11 @@ from .contact import State
 from .orbit import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
-RELEASES = np.linspace(1.5, 6.0, 16)
+RELEASES = np.linspace(1.5, 6.0, 10)
 # When an ensemble is asked whether it has met, in looks, two in each round of its method; later ones are not waited for.
 TESTS = (36, 42, 50, 62, 74, 88, 106, 128)
 # Members that have to meet.
-LEAST_MEMBERS = 6
+LEAST_MEMBERS = 5
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
 KEPT = 192
 # This close, relative to the own distance from equilibrium, it is the same limit cycle.
