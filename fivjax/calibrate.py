@@ -68,6 +68,10 @@ class Outcome(enum.StrEnum):
     STRUCTURE_LEFT = "converged, but what is left is not noise: the scene cannot explain all of the recording"
 
 
+# Outcomes that end at a minimum; of the others no parameter is told.
+FITTED = (Outcome.CONVERGED, Outcome.STRUCTURE_LEFT)
+
+
 class Calibration(eqx.Module):
     """A fitted scene, and how far to trust it.
 
@@ -96,11 +100,11 @@ class Calibration(eqx.Module):
     @property
     def converged(self) -> bool:
         """Whether the optimiser arrived."""
-        return self.outcome in (Outcome.CONVERGED, Outcome.STRUCTURE_LEFT)
+        return self.outcome in FITTED
 
     @property
     def values(self) -> dict[str, float]:
-        """The parameters, NaN where they are not identifiable."""
+        """The parameters, NaN where they are not identifiable, and all of them where no fit was found."""
         return self._by_name(self.estimates)
 
     @property
@@ -126,11 +130,12 @@ class Calibration(eqx.Module):
 
     def __str__(self) -> str:
         said = [f"{self.outcome}; misfit {self.misfit:.3g} per degree of freedom"]
+        untold = "not identifiable" if self.converged or self.outcome is Outcome.NO_SIGNAL else "not told"
         for name in self.names:
             if self.identifiable[name]:
                 said.append(f"  {name:<12}{self.values[name]:>14.6g} ± {self.uncertainty[name]:.2g}")
             else:
-                said.append(f"  {name:<12}{'not identifiable':>16}")
+                said.append(f"  {name:<12}{untold:>16}")
         for k, offset in enumerate(self.offsets):
             if offset is not None:
                 said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {offset[1]:.2g} s")
@@ -303,7 +308,8 @@ def _result(stages: Stages, blocks, identifiable_within: float) -> Calibration:
         names=problem.parameters.names,
         estimates=estimates,
         deviations=deviations[:size] * whole,
-        identified=(deviations[:size] <= identifiable_within) & signal,
+        # Deviations are those about a minimum; elsewhere they would promise what nobody has found.
+        identified=(deviations[:size] <= identifiable_within) & (outcome in FITTED),
         correlation=correlation[:size, :size],
         singular_values=singular,
         offsets=tuple(offsets),
