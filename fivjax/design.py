@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from . import arguments
 from .cea import growth_rate
-from .compiling import compiled
 from .critical import Outcome, critical_friction, significant_growth
 from .precision import in_double_precision, is_known, real
 from .results import labelled
@@ -150,7 +149,8 @@ def search_critical_friction(
     return Search(mu if found else np.nan, outcome, steps, float(start), route)
 
 
-@compiled
+# Not `compiling.compiled`: at the root the sign is rounding, and how that falls decides between ten steps and fifty.
+@eqx.filter_jit
 def _searched(structure, start, route, highest, direction, max_steps):
     def instability(mu, structure):
         if route == "eigenvalues":

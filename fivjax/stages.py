@@ -23,6 +23,7 @@ from .parameters import FreeParameters
 from .scene import Scene
 from .shooting import Cycle
 from .signals import Recording
+from .sliding import linear_sliding
 
 # Starts that go on from the features to the waveform; with time offsets to try, two with three each.
 KEPT = 4
@@ -37,6 +38,9 @@ MOST_STEPS = 60
 # How far the features may pull a parameter from its start, as a factor of e: what they do not tell stays where it was.
 LEASH = 0.7
 OFFSETS_PER_BLOCK = 4
+# Periods by which the time offset of what fits best is tried again, and how often it may move on from there.
+WHOLE_PERIODS = (-2, -1, 1, 2)
+MOST_ROUNDS = 4
 # A cycle is closed when its next correction is this small, relative to its size: the one after that is rounding.
 CLOSED = 1e-7
 MOST_NEWTON_STEPS = 10
@@ -92,7 +96,7 @@ class Stages:
         # Limit cycles have no window that grows: their features are compared first roughly, then to the noise.
         self.cycles_only = len(problem.cycles) == len(problem.misfits)
         self.windows = (WINDOWS[0], WINDOWS[-1]) if self.cycles_only else WINDOWS
-        self.count = len(self.windows) + 3
+        self.count = len(self.windows) + 4
         self.steps = 0
 
     def run(self):
@@ -104,9 +108,11 @@ class Stages:
         for share in self.windows:
             yield f"waveform, {100 * share:.0f} %"
             candidates = self._waveform(candidates, share, EARLY_TOLERANCE if share < FAR else FINAL_TOLERANCE)
+        yield "whole periods"
+        self._other_periods()
         yield "noise and uncertainties"
         if self._estimate_noise():
-            self._waveform(candidates[:1], 1.0, FINAL_TOLERANCE)
+            self._waveform(self.best.x[None], 1.0, FINAL_TOLERANCE)
 
     def _screened(self) -> np.ndarray:
         """The starts that come closest to the limit cycles. Far off, a scene may have none, and no derivative leads there."""
@@ -180,6 +186,24 @@ class Stages:
             growth=growth,
         )
         return _distinct(found.x[order])
+
+    def _other_periods(self) -> None:
+        """Whether the recordings fit better some periods earlier or later: a vibration is much like itself a period on."""
+        problem = self.problem
+        for k in np.flatnonzero(problem.moved):
+            place = problem.size + int(np.sum(problem.moved[:k]))
+            low, high = self.recordings[k].offset
+            for _ in range(MOST_ROUNDS):
+                x = self.best.x
+                period = _period(problem.at(jnp.asarray(x[: problem.size])))
+                shifted = np.repeat(x[None], len(WHOLE_PERIODS) + 1, axis=0)
+                shifted[1:, place] += period / OFFSET_UNIT * np.array(WHOLE_PERIODS)
+                inside = low <= (offsets := problem.references[k] + OFFSET_UNIT * shifted[:, place])
+                # The best one stays among them, so it never gets worse.
+                inside = (inside & (offsets <= high)) | (np.arange(len(shifted)) == 0)
+                self._waveform(shifted[inside], 1.0, FINAL_TOLERANCE)
+                if abs(self.best.x[place] - x[place]) < 0.5 * period / OFFSET_UNIT:
+                    break
 
     def _estimate_noise(self) -> bool:
         """Puts the noise that is left in place of the assumed one; whether that changed anything."""
@@ -335,6 +359,16 @@ def _predicted(problem: Problem, x: Float[Array, "s j"], about: _About) -> tuple
         )
 
     return jax.vmap(followed)(x, about)
+
+
+_sliding_matrix = compiled(lambda scene: linear_sliding(scene).matrix)
+
+
+def _period(scene: Scene) -> float:
+    """Of the least damped vibration of steady sliding, s."""
+    eigenvalues = np.linalg.eigvals(np.asarray(_sliding_matrix(scene)))
+    vibrating = eigenvalues[eigenvalues.imag > 0]
+    return 2 * np.pi / float(vibrating[np.argmax(vibrating.real)].imag) if len(vibrating) else 0.0
 
 
 def _growth(system: Float[np.ndarray, "2n 2n"], where: int) -> float:

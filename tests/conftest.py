@@ -1,11 +1,6 @@
 """Scenes that many tests share. Nothing here turns double precision on: the library does that for itself."""
 
-import os
-
 import pytest
-
-# What tests compile for themselves is compiled as fivjax compiles its own, see `fivjax.compiling`; JAX looks when it starts.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
 
 import fivjax as fj
 

@@ -58,6 +58,17 @@ def test_decaying_response_from_thirty_per_cent_off(decay, decay_fit):
 
 
 @pytest.mark.slow
+def test_a_fit_whole_periods_off_is_found_out():
+    """From this start the waveform fits almost as well two periods off, with all five parameters wrong."""
+    scene, accelerations, regime = case("decaying response")
+    data = recording(noisy(accelerations, 0.0184, 4), regime)
+    fit = fj.calibrate(off(scene, FREE[5], 4), data, FREE[5], starts=4, seed=4, progress=False)
+    assert fit.outcome is Outcome.CONVERGED
+    assert fit.offsets[0][0] == pytest.approx(0.03714, abs=1e-4)
+    assert max(scores(fit, scene).values()) < 3
+
+
+@pytest.mark.slow
 def test_linear_phase_of_unknown_origin_tells_ratios_only():
     """Whatever set a growing vibration off, all masses, springs and dampers could be twice as large: none is told."""
     scene, accelerations, regime = case("linear phase")
