@@ -122,6 +122,11 @@ class Calibration(eqx.Module):
         """Measured less fitted block means, by recording."""
         return tuple(m - f for m, f in zip(self.measured, self.fitted, strict=True))
 
+    @property
+    def untold(self) -> str:
+        """What stands in place of a parameter without a value."""
+        return "not identifiable" if self.converged or self.outcome is Outcome.NO_SIGNAL else "not told"
+
     def _by_name(self, array):
         return {
             name: float(value) if told else float("nan")
@@ -130,12 +135,11 @@ class Calibration(eqx.Module):
 
     def __str__(self) -> str:
         said = [f"{self.outcome}; misfit {self.misfit:.3g} per degree of freedom"]
-        untold = "not identifiable" if self.converged or self.outcome is Outcome.NO_SIGNAL else "not told"
         for name in self.names:
             if self.identifiable[name]:
                 said.append(f"  {name:<12}{self.values[name]:>14.6g} ± {self.uncertainty[name]:.2g}")
             else:
-                said.append(f"  {name:<12}{untold:>16}")
+                said.append(f"  {name:<12}{self.untold:>16}")
         for k, offset in enumerate(self.offsets):
             if offset is not None:
                 said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {offset[1]:.2g} s")

@@ -42,6 +42,11 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
+def power_of_4(count: int) -> int:
+    """The next one at or above a count: arrays filled up to it have few sizes, so not each of them is compiled."""
+    return 4 ** -(-(count - 1).bit_length() // 2)
+
+
 def _transformed(arguments) -> bool:
     # Inside `jit`, what is computed of known numbers is not known either.
     return not (is_known(jnp.add(1, 1)) and all(map(is_known, jax.tree.leaves(arguments))))
@@ -52,10 +57,10 @@ def _options() -> dict[str, int | bool]:
     """What of `LESS_THOUGHT` this machine's compiler knows, and the user has not set."""
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in LESS_THOUGHT.items() if _is_known(name, value)}
+    return {name: value for name, value in LESS_THOUGHT.items() if _is_free(name, value)}
 
 
-def _is_known(name: str, value: int | bool) -> bool:
+def _is_free(name: str, value: int | bool) -> bool:
     if name in os.environ.get("XLA_FLAGS", ""):
         return False
     try:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from . import arguments
 from . import energy as accounts
-from .compiling import compiled
+from .compiling import compiled, power_of_4
 from .contact import Contact, Mechanics, State
 from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
@@ -134,19 +134,14 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
     rising = np.diff(counted) * finite[1:]
     chosen = np.flatnonzero(rising)
     # One of few shapes, so that not every trajectory compiles anew; surplus lanes repeat the first row and are dropped.
-    most = _power_of_4(max(int(rising.max(initial=1)), 4))
-    lanes = _power_of_4(max(len(chosen), 4096 // most, 64))
+    most = power_of_4(max(int(rising.max(initial=1)), 4))
+    lanes = power_of_4(max(len(chosen), 4096 // most, 64))
     padded = np.concatenate([chosen, np.zeros(lanes - len(chosen), int)])
     starts = jax.tree.map(lambda leaf: leaf[padded], rows)
     found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
     wanted = np.zeros((lanes, most), bool)
     wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
-
-
-def _power_of_4(count: int) -> int:
-    """The next one at or above a count."""
-    return 4 ** -(-(count - 1).bit_length() // 2)
 
 
 @compiled

@@ -41,7 +41,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
         unit = QUANTITIES.get(name, ("", "1"))[1]
         unit = "" if unit == "1" else f" {unit}"
         told = fit.identifiable[name]
-        value = f"{fit.values[name]:.6g} ± {fit.uncertainty[name]:.2g}{unit}" if told else "not identifiable"
+        value = f"{fit.values[name]:.6g} ± {fit.uncertainty[name]:.2g}{unit}" if told else fit.untold
         lines.append(f"{name} = {value}")
     figure.suptitle("\n".join([str(fit.outcome).split(":")[0], *lines]), ha="left", x=0.02, fontsize="small")
     return figure

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from . import arguments
 from . import contact as physics
 from . import energy as accounts
-from .compiling import compiled
+from .compiling import compiled, power_of_4
 from .contact import Contact, Mechanics, State, Status
 from .energy import Books, Energy, Ledger
 from .event_exact import EventExact
@@ -137,13 +137,14 @@ def simulate(
     instants = jnp.arange(count)
     saved = jnp.where(instants < rows, jnp.minimum(dt_save * instants, t1), t1)
     found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
-    found = jax.tree.map(lambda leaf: known_to_numpy(leaf[: rows + 1]), found)
+    # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
+    found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
     return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most))
 
 
 def _compiled_rows(count: int) -> int:
     """The number of rows that is compiled for so many. Where these are many, compiling is little beside them."""
-    return max(LEAST_ROWS, 4 ** math.ceil(math.log(count, 4))) if count <= MOST_REPEATED else count
+    return power_of_4(max(count, LEAST_ROWS)) if count <= MOST_REPEATED else count
 
 
 def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:

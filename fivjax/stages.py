@@ -23,7 +23,7 @@ from .parameters import FreeParameters
 from .scene import Scene
 from .shooting import Cycle
 from .signals import Recording
-from .sliding import linear_sliding
+from .starts import state_matrices
 
 # Starts that go on from the features to the waveform; with time offsets to try, two with three each.
 KEPT = 4
@@ -195,14 +195,14 @@ class Stages:
             low, high = self.recordings[k].offset
             for _ in range(MOST_ROUNDS):
                 x = self.best.x
-                period = _period(problem.at(jnp.asarray(x[: problem.size])))
-                shifted = np.repeat(x[None], len(WHOLE_PERIODS) + 1, axis=0)
-                shifted[1:, place] += period / OFFSET_UNIT * np.array(WHOLE_PERIODS)
-                inside = low <= (offsets := problem.references[k] + OFFSET_UNIT * shifted[:, place])
+                period = _period(problem, x[: problem.size]) / OFFSET_UNIT
+                shifted = np.tile(x, (len(WHOLE_PERIODS), 1))
+                shifted[:, place] += period * np.array(WHOLE_PERIODS)
+                offsets = problem.references[k] + OFFSET_UNIT * shifted[:, place]
                 # The best one stays among them, so it never gets worse.
-                inside = (inside & (offsets <= high)) | (np.arange(len(shifted)) == 0)
-                self._waveform(shifted[inside], 1.0, FINAL_TOLERANCE)
-                if abs(self.best.x[place] - x[place]) < 0.5 * period / OFFSET_UNIT:
+                tried = np.concatenate([x[None], shifted[(low <= offsets) & (offsets <= high)]])
+                self._waveform(tried, 1.0, FINAL_TOLERANCE)
+                if abs(self.best.x[place] - x[place]) <= 0.5 * period:
                     break
 
     def _estimate_noise(self) -> bool:
@@ -361,12 +361,10 @@ def _predicted(problem: Problem, x: Float[Array, "s j"], about: _About) -> tuple
     return jax.vmap(followed)(x, about)
 
 
-_sliding_matrix = compiled(lambda scene: linear_sliding(scene).matrix)
-
-
-def _period(scene: Scene) -> float:
-    """Of the least damped vibration of steady sliding, s."""
-    eigenvalues = np.linalg.eigvals(np.asarray(_sliding_matrix(scene)))
+def _period(problem: Problem, u: Float[np.ndarray, " k"]) -> float:
+    """Of the least damped vibration of steady sliding, s; 0 where none is there."""
+    (matrix,) = state_matrices(problem.parameters, problem.scene, jnp.asarray(u[None]))
+    eigenvalues = np.linalg.eigvals(np.asarray(matrix))
     vibrating = eigenvalues[eigenvalues.imag > 0]
     return 2 * np.pi / float(vibrating[np.argmax(vibrating.real)].imag) if len(vibrating) else 0.0
 

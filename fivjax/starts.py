@@ -40,7 +40,8 @@ def vibrating(
     widest = -np.log1p(-spread)
     factors = np.exp(rng.uniform(-widest, widest, (TRIED_PER_START * count, len(own))))
     tried = np.array([parameters.unbounded(values) for values in own * factors])
-    modes = np.abs(np.linalg.eigvals(np.asarray(_matrices(parameters, scene, jnp.asarray(tried)))).imag) / (2 * np.pi)
+    matrices = np.asarray(state_matrices(parameters, scene, jnp.asarray(tried)))
+    modes = np.abs(np.linalg.eigvals(matrices).imag) / (2 * np.pi)
     apart = np.zeros(len(tried))
     for frequency in frequencies:
         # Both of a pair of eigenvalues count, so the second nearest mode is the third.
@@ -51,5 +52,6 @@ def vibrating(
 
 
 @compiled
-def _matrices(parameters: FreeParameters, scene: Scene, u: Float[Array, "s k"]):
+def state_matrices(parameters: FreeParameters, scene: Scene, u: Float[Array, "s k"]) -> Float[Array, "s m m"]:
+    """Of steady sliding, at a batch of unbounded parameters."""
     return jax.vmap(lambda u: linear_sliding(parameters.scene(scene, u)).matrix)(u)

@@ -162,22 +162,14 @@ def wedged(model: oracle.Model) -> bool:
 def endless(model: oracle.Model, last_event: float) -> bool | None:
     """Whether events accumulate for the independent solver too, at the instant at which they did for the lane."""
 
-    def stop(*_):
-        raise TooSlow
+    def accumulate() -> bool:
+        try:
+            oracle.simulate(model, 1.01 * last_event + 1e-9, np.array([0.0]))
+        except oracle.ZenoError:
+            return True
+        return False
 
-    before = signal.signal(signal.SIGALRM, stop)
-    # Again and again: an exception inside a callback of the interpreter's is swallowed.
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE, 1.0)
-    try:
-        oracle.simulate(model, 1.01 * last_event + 1e-9, np.array([0.0]))
-    except oracle.ZenoError:
-        return True
-    except (TooSlow, RuntimeError, ValueError, IndexError, FloatingPointError, MemoryError):
-        return None
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    return False
+    return limited(accumulate)
 
 
 def same_state(lane: dict, model: oracle.Model) -> bool | None:
