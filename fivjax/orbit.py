@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .compiling import computed_once
 from .contact import State
 
 # A chain of returns counts when it is at least this long.
@@ -115,7 +116,9 @@ def observe(
     crossed = (speed[0] < 0) & (speed[1] >= 0)
     share = speed[0] / jnp.where(crossed, speed[0] - speed[1], 1.0)
     at = before + jnp.where(crossed, share, 0.0) * (after - before)
-    distance = _length(weights * (at - orbit.anchor)) / _length(weights * (at - equilibrium))
+    distance = computed_once(
+        lambda: _length(weights * (at - orbit.anchor)) / _length(weights * (at - equilibrium)), jnp.zeros_like(peak)
+    )
 
     crossings = orbit.crossings + 1
     changes = orbit.changes + changed
@@ -179,4 +182,5 @@ def observe(
 
 
 def _length(x: Float[Array, " k"]) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(x * x))
+    # Term by term: in a batch that is one fused loop over lanes.
+    return jnp.sqrt(sum(x[k] ** 2 for k in range(x.shape[0])))

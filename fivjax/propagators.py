@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import contact as physics
+from .compiling import computed_once
 from .contact import Contact, Mechanics, State, Status
 from .event_exact import ROUNDING, ROUNDINGS
 from .steppers import Advance
@@ -35,6 +36,8 @@ ORDER = 13
 # Rebounds shorter than this share of an interval are at rest.
 RESTING = 1e-7
 MOST_ROOT_STEPS = 60
+# Terms of the series in the steps of Newton's method that nearly all roots are found with: few while it is still far off.
+ROOT_STEPS = (5, 5, ORDER)
 # Rows of all matrices of a scene per coordinate, about; for those who have to know how much memory they take.
 MATRIX_ROWS = 4 * (INTERVALS + ORDER)
 
@@ -103,14 +106,14 @@ def _advance(
     window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n, mechanics.tangential)
     none = jnp.zeros_like(load)
 
-    interval = _stage(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
-    state, peak = _stage(lambda: (window.state_at(interval), window.peak(interval)), (jnp.zeros_like(y), none))
+    interval = computed_once(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
+    state, peak = computed_once(lambda: (window.state_at(interval), window.peak(interval)), (jnp.zeros_like(y), none))
     there = _stacked(mechanics, contact, load, state)
     series = _Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), exact, n)
     no = jnp.zeros((3, *none.shape), bool)
     guess = jnp.zeros((3, *none.shape), none.dtype)
     like = _Bracket(guess, no.astype(jnp.int32), guess, no, no, no)
-    brackets = _dipped(series, _stage(lambda: series.brackets(interval < INTERVALS), like))
+    brackets = _dipped(series, computed_once(lambda: series.brackets(interval < INTERVALS), like))
     end = jnp.where(interval == INTERVALS, 0.0, jnp.minimum(steps - interval, 1.0))
     share, fires = _first_root(series, brackets, end)
 
@@ -128,23 +131,8 @@ def _advance(
         state = physics.on_constraint(mechanics, contact, reached)
         return physics.transition(mechanics, contact, load, state, fires[:2], RESTING * prepared.interval)
 
-    peak, (next_contact, y_next) = _stage(follow, (none, (contact, jnp.zeros_like(y))))
+    peak, (next_contact, y_next) = computed_once(follow, (none, (contact, jnp.zeros_like(y))))
     return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak)
-
-
-def _stage(function, like):
-    """`function()`, computed once and kept.
-
-    XLA on a CPU repeats arithmetic in every kernel that wants its result, so long chains with many results cost their
-    square. A loop that runs once is a border over which it repeats nothing; the sevenfold speed of maps is owed to it.
-    `like` has the structure and types of the result.
-    """
-    once = jnp.ones_like(jax.tree.leaves(like)[0], bool).ravel()[0]
-
-    def body(carry):
-        return jnp.zeros_like(once), jax.tree.map(lambda new, old: new.astype(old.dtype), function(), carry[1])
-
-    return jax.lax.while_loop(lambda carry: carry[0], body, (once, like))[1]
 
 
 def propagators(mechanics: Mechanics) -> Propagators:
@@ -352,10 +340,11 @@ class _Series(eqx.Module):
         half = 0.5 * jnp.where(rises, slope + root, root - slope)
         below = jnp.where(rises, bend, half)
         guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
-        guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
-        lowest = lead - slope**2 / (4 * jnp.where(bend > 0, bend, 1.0))
+        bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
         # With allowance for what is not parabolic.
-        dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0) & (lowest <= 0.1 * bend)
+        dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
+        dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
+        guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
         return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips & (jnp.arange(3)[:, None] < 2))
 
     def without_zeros(self, zeros: Int[Array, "3 l"]) -> Float[Array, "k 3 l"]:
@@ -404,7 +393,7 @@ def _start(
 class _Bracket(eqx.Module):
     """What is known of the first roots of the watched polynomials in [0, 1] from their starts and ends."""
 
-    guess: Float[Array, "3 l"]
+    guess: Float[Array, "3 l"]  # at the root; at the lowest point of one that perhaps dips; else 1
     zeros: Int[Array, "3 l"]  # roots at the very start, not meant
     end: Float[Array, "3 l"]  # where it is no longer positive, if it crosses
     crosses: Bool[Array, "3 l"]
@@ -417,14 +406,14 @@ def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
 
     def decided(bracket: _Bracket) -> _Bracket:
         c = series.parts[0]
-        slopes = c[1:] * jnp.arange(1.0, ORDER + 1, dtype=c.dtype)[:, None, None]
 
         def nearer(_, x):
-            slope, bend = _value_and_slope(slopes, x)
+            _, slope, bend = _value_slope_and_bend(c, x)
             return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
 
-        # Newton's method: within an interval a slope is all but a straight line.
-        lowest = jax.lax.fori_loop(0, 6, nearer, jnp.full_like(bracket.end, 0.5))
+        # Newton's method: within an interval a slope is all but a straight line. It sets out from what the loop carries:
+        # what depends on nothing else, XLA takes out of the loop and computes every time.
+        lowest = jax.lax.fori_loop(0, 6, nearer, bracket.guess)
         below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
         return _Bracket(
             guess=jnp.where(below, 0.5 * lowest, bracket.guess),
@@ -441,79 +430,77 @@ def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
 def _first_root(
     series: _Series, brackets: _Bracket, end: Float[Array, " l"]
 ) -> tuple[Float[Array, " l"], Bool[Array, "3 l"]]:
-    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the watched end it there.
-
-    The polynomial whose root is expected first is solved; only where another turns out to be negative by then, that one is.
-    """
-    index = jnp.arange(3)[:, None]
-    eps = jnp.finfo(end.dtype).eps
-
-    def expected_first(among: Bool[Array, "3 l"]) -> Int[Array, " l"]:
-        return jnp.argmin(jnp.where(among, brackets.guess, jnp.inf), axis=0).astype(jnp.int32)
-
-    def solve(carry):
-        open_, which, root, _, tries = carry
-        mine = index == which
-        guess, high = _chosen(brackets.guess, which), jnp.minimum(_chosen(brackets.end, which), root)
-        c, zeros = _stage(lambda: _chosen_polynomial(series, brackets, which), (zeros_like_c, which))
-        root = _polished(c, zeros, jnp.minimum(guess, high), high, root, open_)
-
-        def compare():
-            # A dip is over where its bracket ends.
-            at = jnp.minimum(root, brackets.end)
-            c = series.without_zeros(brackets.zeros)
-            # Roots that differ by rounding are the same: the two guards of an open gap always are.
-            same = 8 * eps * sum(jnp.abs(c[k]) for k in range(4))
-            values = _value_and_slope(c, at)[0]
-            earlier = brackets.crosses & ~mine & (values < -same)
-            fires = brackets.crosses & (mine | ((values <= same) & (at == root)))
-            again = open_ & (earlier[0] | earlier[1] | earlier[2])
-            return again, jnp.where(again, expected_first(earlier), which), root, jnp.where(open_, fires, carry[3])
-
-        return (*_stage(compare, carry[:4]), tries + 1)
-
-    zeros_like_c = jnp.zeros((ORDER + 1, *end.shape), end.dtype)
-    crosses = brackets.crosses
-    none = jnp.zeros_like(crosses)
-    any_crosses = crosses[0] | crosses[1] | crosses[2]
-    begin = any_crosses, expected_first(crosses), jnp.ones_like(end), none, jnp.zeros((), jnp.int32)
-    _, _, root, fires, _ = jax.lax.while_loop(lambda carry: jnp.any(carry[0]) & (carry[-1] < 3), solve, begin)
-    spent = brackets.spent
+    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the watched end it there."""
+    crosses, spent = brackets.crosses, brackets.spent
+    c = series.without_zeros(brackets.zeros)
+    # A few steps for all at once cost less than a loop that goes on until the last lane is done.
+    near = computed_once(lambda: _approached(c, brackets), brackets.guess)
+    root, slope, settled = _newton(c, brackets.zeros, near)
+    # In a bracket, the function falls through its root; a dip ends where it is lowest.
+    settled = settled & (slope < 0) & (root > 0) & (root <= brackets.end)
+    root, slope = _bisected(c, brackets, root, slope, crosses & ~settled)
+    root = jnp.where(crosses, root, jnp.inf)
+    first = jnp.minimum(jnp.minimum(root[0], root[1]), root[2])
+    # Roots that differ by rounding are the same: the two guards of an open gap always are.
+    same = 8 * jnp.finfo(end.dtype).eps * sum(jnp.abs(c[k]) for k in range(4))
+    fires = crosses & ((root == first) | ((root - first) * jnp.abs(slope) <= same))
     any_spent = spent[0] | spent[1] | spent[2]
-    root, fires = jnp.where(any_spent, 0.0, root), jnp.where(any_spent, spent, fires)
-    fires = fires & (root <= end)
-    return jnp.where(fires[0] | fires[1] | fires[2], root, end), fires
+    first, fires = jnp.where(any_spent, 0.0, first), jnp.where(any_spent, spent, fires)
+    fires = fires & (first <= end)
+    return jnp.where(fires[0] | fires[1] | fires[2], first, end), fires
 
 
-def _chosen(rows: Array, which: Int[Array, " l"]) -> Array:
-    return jnp.where(which == 0, rows[..., 0, :], jnp.where(which == 1, rows[..., 1, :], rows[..., 2, :]))
+def _approached(c: Float[Array, "k 3 l"], brackets: _Bracket) -> Float[Array, "3 l"]:
+    """The first roots in their brackets to half of all digits and more, where Newton's method goes the common way."""
+    x = jnp.minimum(brackets.guess, brackets.end)
+    for order in ROOT_STEPS:
+        x = jnp.clip(_newton(c[: order + 1], brackets.zeros, x)[0], 0.0, brackets.end)
+    return x
 
 
-def _chosen_polynomial(series: _Series, brackets: _Bracket, which: Int[Array, " l"]):
-    return _chosen(series.without_zeros(brackets.zeros), which), _chosen(brackets.zeros, which)
+def _newton(c: Float[Array, "k *x l"], zeros: Int[Array, "*x l"], x: Float[Array, "*x l"]):
+    """After one step of Newton's method: where, the slope before it, and whether it was so short that it is the last."""
+    value, slope = _value_and_slope(c, x)
+    # Without the roots at zero, which are divided out of value and slope alike.
+    slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
+    nearer = x - value / jnp.where(slope == 0, 1.0, slope)
+    # The next error is the square of this one.
+    return nearer, slope, (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
 
 
-def _polished(c: Float[Array, "k l"], zeros, x, high, kept, open_) -> Float[Array, " l"]:
-    """The first root of each `open_` lane's polynomial in (0, high], by Newton's method within a bracket; else `kept`."""
+def _bisected(
+    c: Float[Array, "k *x l"], brackets: _Bracket, root: Float[Array, "*x l"], slope, open_: Bool[Array, "*x l"]
+) -> tuple[Float[Array, "*x l"], Float[Array, "*x l"]]:
+    """Roots and the slopes there, those of `open_` polynomials found anew: by Newton's method in their brackets, bisecting
+    where it leaves them. Seldom run at all.
+    """
 
     def going(carry):
         *_, open_, count = carry
         return jnp.any(open_) & (count < MOST_ROOT_STEPS)
 
-    def newton(carry):
-        low, high, x, open_, count = carry
-        value, slope = _value_and_slope(c, x)
-        # Without the roots at zero, which are divided out of value and slope alike.
-        slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
+    def step(carry):
+        low, high, x, slope, open_, count = carry
+        value, _ = _value_and_slope(c, x)
+        nearer, slope_at, done = _newton(c, brackets.zeros, x)
         low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
-        nearer = x - value / jnp.where(slope == 0, 1.0, slope)
-        # The next error is the square of this one.
-        done = (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
         nearer = jnp.where(done | ((nearer > low) & (nearer < high)), nearer, 0.5 * (low + high))
-        return low, high, jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), open_ & ~done, count + 1
+        x, slope = jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), jnp.where(open_, slope_at, slope)
+        return low, high, x, slope, open_ & ~done, count + 1
 
-    begin = jnp.zeros_like(x), high, jnp.where(open_, x, kept), open_, jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(going, newton, begin)[2]
+    x = jnp.where(open_, jnp.minimum(brackets.guess, brackets.end), root)
+    begin = jnp.zeros_like(x), brackets.end, x, slope, open_, jnp.zeros((), jnp.int32)
+    _, _, root, slope, *_ = jax.lax.while_loop(going, step, begin)
+    return root, slope
+
+
+def _value_slope_and_bend(c: Float[Array, "k *x l"], x: Array) -> tuple[Array, Array, Array]:
+    value, slope, half_bend = c[-1], jnp.zeros_like(c[-1]), jnp.zeros_like(c[-1])
+    for k in reversed(range(c.shape[0] - 1)):
+        half_bend = half_bend * x + slope
+        slope = slope * x + value
+        value = value * x + c[k]
+    return value, slope, 2 * half_bend
 
 
 def _value_and_slope(c: Float[Array, "k *x l"], x: Array) -> tuple[Array, Array]:
