@@ -21,9 +21,11 @@ from .contact import State
 from .orbit import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
-RELEASES = np.linspace(1.5, 6.0, 10)
-# When an ensemble is asked whether it has met, in looks, two in each round of its method; later ones are not waited for.
-TESTS = (36, 42, 50, 62, 74, 88, 106, 128)
+RELEASES = np.linspace(1.5, 6.0, 16)
+# When an ensemble is asked whether it has met, in looks; later ones are not waited for.
+TESTS = (32, 36, 40, 44, 48, 52, 60, 68, 76, 88, 104, 128)
+# The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
+EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Members that have to meet.
 LEAST_MEMBERS = 5
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
@@ -48,8 +50,7 @@ class Attractor(eqx.Module):
 class Approach(eqx.Module):
     """How near a lane has been to the known limit cycle lately."""
 
-    seen: State  # the crossing state that was looked at last
-    before: State  # and the one before it
+    seen: Float[Array, "k 2n"]  # the crossing states that were looked at last, newest first
     near: Int[Array, ""]  # crossing states in a row that were close
     first: Float[Array, ""]  # relative distance of the first of these
 
@@ -69,20 +70,20 @@ def unknown(groups: int, size: int) -> Attractor:
 
 
 def no_approach(y: State) -> Approach:
-    none = jnp.full_like(y, jnp.nan)
-    return Approach(none, none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
+    none = jnp.full((LOOKS_NEAR, y.shape[0]), jnp.nan, y.dtype)
+    return Approach(none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
 
 
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
     """The crossing states and the amplitude (m/s) of the limit cycle that the ensemble has met on, if it has.
 
-    Members have met when the last third of their crossing states are all close to states that *others* were in during the
-    third before. In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its
-    slowest rate in 1/s); theirs has changed in size by no more than a tenth of that.
+    Members have met when all their crossing states of late are close to states that *others* were in some time ago. In
+    between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
+    1/s); theirs has changed in size by no more than a tenth of that.
     """
     looks = len(ensemble.times)
-    earlier, later = slice(looks // 3, 2 * looks // 3), slice(2 * looks // 3, looks)
-    if not np.all(np.isfinite(ensemble.deviations[looks // 3 :, ensemble.moving])):
+    earlier, later = (slice(*(round(looks * share) for share in stretch)) for stretch in (EARLIER, LATER))
+    if not np.all(np.isfinite(ensemble.deviations[earlier.start :, ensemble.moving])):
         return None
     members = []
     for member in np.flatnonzero(ensemble.moving):
@@ -96,14 +97,19 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]
     if lasting < DECAYED or abs(np.log(sizes[1] / sizes[0])) > SUSTAINED * lasting:
         return None
-    states = ensemble.deviations[later][:, members].reshape(-1, ensemble.deviations.shape[-1])
+    states, before = (
+        ensemble.deviations[part][:, members].reshape(-1, ensemble.deviations.shape[-1]) for part in (later, earlier)
+    )
+    # The more of them, the closer together they are on a torus.
+    states = np.concatenate([before[_distance(states, before) <= REACHED], states])
     chosen = np.linspace(0, len(states) - 1, KEPT).round().astype(int)
     return states[chosen], float(np.max(ensemble.peaks[later][:, members]))
 
 
 def _distance(known: Float[np.ndarray, "k 2n"], states: Float[np.ndarray, "m 2n"]) -> Float[np.ndarray, " m"]:
-    apart = np.linalg.norm(states[:, None] - known, axis=-1)
-    return np.min(apart, axis=1) / np.linalg.norm(states, axis=-1)
+    size = np.sum(states**2, axis=-1)
+    apart = size[:, None] - 2 * states @ known.T + np.sum(known**2, axis=-1)
+    return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0) / size)
 
 
 def approached(approach: Approach, attractor: Attractor, crossing: State) -> tuple[Approach, Bool[Array, ""]]:
@@ -115,6 +121,6 @@ def approached(approach: Approach, attractor: Attractor, crossing: State) -> tup
     first = jnp.where(close & (approach.near == 0), distance, approach.first)
     near = jnp.where(close, approach.near + 1, 0)
     reached = (near >= LOOKS_NEAR) & (distance <= jnp.maximum(first, SCATTER))
-    fresh = jnp.any(crossing != approach.seen)
-    look = Approach(crossing, approach.seen, near, first)
+    fresh = jnp.any(crossing != approach.seen[0])
+    look = Approach(jnp.concatenate([crossing[None], approach.seen[:-1]]), near, first)
     return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), look, approach), fresh & reached

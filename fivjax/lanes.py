@@ -283,26 +283,30 @@ def _with_attractors(
     most = max(attractors.TESTS)
     deviations = np.full((most, len(own), 2 * structure.size), np.nan)
     peaks, times = np.full((most, len(own)), np.nan), np.full((most, len(own)), np.nan)
+
+    def cycle_of(k: int, looks: int):
+        mine = slice(k * members, (k + 1) * members)
+        ensemble = attractors.Ensemble(deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine], moving[mine])
+        return attractors.met(ensemble, shared.modes.slowest_decay[groups[k]])
+
     looks = 0
     while len(running) and looks < most:
         report(0)
         lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
-        lanes = _followed(batch, together, own[running], columns[running], lanes, batch.method.round // LOOK_EVERY)
-        for crossing in (lanes.approach.before, lanes.approach.seen):
-            deviations[looks, running] = crossing
-            peaks[looks, running], times[looks, running] = lanes.orbit.peak, lanes.t
-            looks += 1
+        kept = lanes.approach.seen.shape[1]
+        lanes = _followed(batch, together, own[running], columns[running], lanes, kept)
+        now = slice(looks, looks + kept)
+        deviations[now, running] = np.moveaxis(lanes.approach.seen, 1, 0)[::-1]
+        peaks[now, running], times[now, running] = lanes.orbit.peak, lanes.t
+        looks += kept
         moving[running] = (lanes.verdict == Verdict.UNDECIDED) | (lanes.verdict == Verdict.LIMIT_CYCLE)
         over = ~moving[running]
         if looks in attractors.TESTS:
-            for k in np.unique(running // members):
-                mine = slice(k * members, (k + 1) * members)
-                seen = deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine]
-                group = groups[k]
-                cycle = attractors.met(attractors.Ensemble(*seen, moving[mine]), shared.modes.slowest_decay[group])
+            open_ = np.unique(running // members)
+            for k, cycle in zip(open_, batch.pool.map(lambda k, looks=looks: cycle_of(k, looks), open_), strict=True):
                 if cycle is not None:
-                    found.crossings[group], found.amplitude[group] = cycle
-                    found.known[group] = True
+                    found.crossings[groups[k]], found.amplitude[groups[k]] = cycle
+                    found.known[groups[k]] = True
             over |= found.known[own[running]]
         running, lanes = running[~over], jax.tree.map(lambda leaf, over=over: leaf[~over], lanes)
     return eqx.tree_at(lambda shared: shared.attractor, shared, found)

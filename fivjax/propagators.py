@@ -30,9 +30,9 @@ from .steppers import Advance
 # Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
 INTERVALS = 16
 # The fastest vibration turns by this much between two samples, rad: guards look like cubics there.
-TURN = 0.35
-# Order of the Taylor series within an interval: TURN^14 / 14! is below rounding.
-ORDER = 13
+TURN = 0.6
+# Order of the Taylor series within an interval: TURN^16 / 16! is below rounding.
+ORDER = 15
 # Rebounds shorter than this share of an interval are at rest.
 RESTING = 1e-7
 MOST_ROOT_STEPS = 60

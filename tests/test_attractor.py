@@ -87,7 +87,7 @@ def test_the_same_crossing_state_is_looked_at_once():
 def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
         unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0), jnp.asarray(False))
-        near = Approach(jnp.zeros(2), jnp.zeros(2), jnp.asarray(9), jnp.asarray(0.0))
+        near = Approach(jnp.zeros((4, 2)), jnp.asarray(9), jnp.asarray(0.0))
         assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 
 
