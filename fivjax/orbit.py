@@ -6,7 +6,8 @@ lag again and again, with contact events in between and without drifting off. Tw
 - *tight*: the states are the same to within the method's error, as on a periodic orbit;
 - *loose*: the state went away and came back close. Above 1.7 m/s the paper's limit cycle is not periodic: it winds
   around a torus, its amplitude beats over some 14 periods of 68 Hz for ever, and no two crossings are the same. So do
-  impacts that die out slowly in a structure that is hardly damped; loose returns have to go on for long enough to tell.
+  impacts and stick-slip that die out slowly in a structure that is hardly damped; so loose returns have to go on for long
+  enough to tell, and the motion has to keep its size meanwhile.
 
 Merely being close to an earlier state proves nothing. Right at the critical perturbation trajectories linger near an
 unstable cycle for seconds, almost periodic, before they decide. They stay close without going away, so they are no loose
