@@ -22,7 +22,9 @@ from .orbit import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
 RELEASES = np.linspace(1.5, 6.0, 16)
-# When an ensemble is asked whether it has met, in looks; later ones are not waited for.
+# Crossing states that a lane keeps: an ensemble is followed for as many looks at a time.
+SEEN = 4
+# When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
 TESTS = (32, 36, 40, 44, 48, 52, 60, 68, 76, 88, 104, 128)
 # The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
 EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
@@ -70,7 +72,7 @@ def unknown(groups: int, size: int) -> Attractor:
 
 
 def no_approach(y: State) -> Approach:
-    none = jnp.full((LOOKS_NEAR, y.shape[0]), jnp.nan, y.dtype)
+    none = jnp.full((SEEN, y.shape[0]), jnp.nan, y.dtype)
     return Approach(none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
 
 

@@ -284,26 +284,26 @@ def _with_attractors(
     deviations = np.full((most, len(own), 2 * structure.size), np.nan)
     peaks, times = np.full((most, len(own)), np.nan), np.full((most, len(own)), np.nan)
 
-    def cycle_of(k: int, looks: int):
+    looks = 0
+
+    def cycle_of(k: int):
         mine = slice(k * members, (k + 1) * members)
         ensemble = attractors.Ensemble(deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine], moving[mine])
         return attractors.met(ensemble, shared.modes.slowest_decay[groups[k]])
 
-    looks = 0
     while len(running) and looks < most:
         report(0)
         lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
-        kept = lanes.approach.seen.shape[1]
-        lanes = _followed(batch, together, own[running], columns[running], lanes, kept)
-        now = slice(looks, looks + kept)
+        lanes = _followed(batch, together, own[running], columns[running], lanes, attractors.SEEN)
+        now = slice(looks, looks + attractors.SEEN)
         deviations[now, running] = np.moveaxis(lanes.approach.seen, 1, 0)[::-1]
         peaks[now, running], times[now, running] = lanes.orbit.peak, lanes.t
-        looks += kept
+        looks += attractors.SEEN
         moving[running] = (lanes.verdict == Verdict.UNDECIDED) | (lanes.verdict == Verdict.LIMIT_CYCLE)
         over = ~moving[running]
         if looks in attractors.TESTS:
             open_ = np.unique(running // members)
-            for k, cycle in zip(open_, batch.pool.map(lambda k, looks=looks: cycle_of(k, looks), open_), strict=True):
+            for k, cycle in zip(open_, batch.pool.map(cycle_of, open_), strict=True):
                 if cycle is not None:
                     found.crossings[groups[k]], found.amplitude[groups[k]] = cycle
                     found.known[groups[k]] = True

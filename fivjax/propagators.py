@@ -435,7 +435,7 @@ def _first_root(
     c = series.without_zeros(brackets.zeros)
     # A few steps for all at once cost less than a loop that goes on until the last lane is done.
     near = computed_once(lambda: _approached(c, brackets), brackets.guess)
-    root, slope, settled = _newton(c, brackets.zeros, near)
+    root, _, slope, settled = _newton(c, brackets.zeros, near)
     # In a bracket, the function falls through its root; a dip ends where it is lowest.
     settled = settled & (slope < 0) & (root > 0) & (root <= brackets.end)
     root, slope = _bisected(c, brackets, root, slope, crosses & ~settled)
@@ -459,13 +459,13 @@ def _approached(c: Float[Array, "k 3 l"], brackets: _Bracket) -> Float[Array, "3
 
 
 def _newton(c: Float[Array, "k *x l"], zeros: Int[Array, "*x l"], x: Float[Array, "*x l"]):
-    """After one step of Newton's method: where, the slope before it, and whether it was so short that it is the last."""
+    """After one step of Newton's method: where, value and slope before it, and whether it was so short that it is the last."""
     value, slope = _value_and_slope(c, x)
     # Without the roots at zero, which are divided out of value and slope alike.
     slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
     nearer = x - value / jnp.where(slope == 0, 1.0, slope)
     # The next error is the square of this one.
-    return nearer, slope, (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
+    return nearer, value, slope, (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
 
 
 def _bisected(
@@ -481,8 +481,7 @@ def _bisected(
 
     def step(carry):
         low, high, x, slope, open_, count = carry
-        value, _ = _value_and_slope(c, x)
-        nearer, slope_at, done = _newton(c, brackets.zeros, x)
+        nearer, value, slope_at, done = _newton(c, brackets.zeros, x)
         low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
         nearer = jnp.where(done | ((nearer > low) & (nearer < high)), nearer, 0.5 * (low + high))
         x, slope = jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), jnp.where(open_, slope_at, slope)

@@ -7,7 +7,7 @@ import pytest
 
 import fivjax as fj
 from fivjax import lanes
-from fivjax.attractor import KEPT, REACHED, Approach, Attractor, Ensemble, approached, met, no_approach
+from fivjax.attractor import KEPT, REACHED, SEEN, Approach, Attractor, Ensemble, approached, met, no_approach
 
 LOOKS, MEMBERS, DECAY = 60, 16, 1.0
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -87,7 +87,7 @@ def test_the_same_crossing_state_is_looked_at_once():
 def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
         unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0), jnp.asarray(False))
-        near = Approach(jnp.zeros((4, 2)), jnp.asarray(9), jnp.asarray(0.0))
+        near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(9), jnp.asarray(0.0))
         assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 
 
