@@ -45,8 +45,11 @@ class Attractor(eqx.Module):
 
     # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
     crossings: Float[Array, "s 2n"]
-    amplitude: Float[Array, ""]  # its largest tangential speed, m/s
-    known: Bool[Array, ""]
+    amplitude: Float[Array, ""]  # its largest tangential speed, m/s; zero while it is not known
+
+    @property
+    def known(self) -> Bool[Array, ""]:
+        return self.amplitude > 0
 
 
 class Approach(eqx.Module):
@@ -68,7 +71,7 @@ class Ensemble(NamedTuple):
 
 def unknown(groups: int, size: int) -> Attractor:
     """Of several groups (leading axis), none known yet; `size` is the state's."""
-    return Attractor(np.zeros((groups, KEPT, size)), np.zeros(groups), np.zeros(groups, bool))
+    return Attractor(np.zeros((groups, KEPT, size)), np.zeros(groups))
 
 
 def no_approach(y: State) -> Approach:

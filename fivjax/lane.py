@@ -1,8 +1,11 @@
 """One trajectory on its way to a verdict.
 
-`follow` is written for one lane and a fixed number of steps; `lanes` makes many of it. States are deviations from the
+A lane takes steps (`step`), now and then has a `look` at the limit cycle that it may come to, and is asked for its verdict
+after a while (`conclude`): each is written for one lane; `lanes` makes many of it. States are deviations from the
 sliding equilibrium under the final load: crossing states, kicks and events are then as exact as they are small.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -44,6 +47,19 @@ class Lane(eqx.Module):
     approach: Approach
     verdict: Int[Array, ""]
     account: "Account | None" = None  # where its energy went, when asked for
+
+
+class Course(eqx.Module):
+    """What a lane is followed with."""
+
+    scene: Scene
+    method: AbstractStepper | Windowed
+    resolution: orbits.Resolution
+    mechanics: Mechanics  # see `measured_from_rest`
+    prepared: Any  # the method's own, see `AbstractStepper.prepare`
+    modes: SlidingModes
+    wedge: Wedge
+    attractor: Attractor
 
 
 class Account(eqx.Module):
@@ -105,88 +121,85 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
     return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
 
 
-def follow(
-    scene: Scene,
-    method: AbstractStepper | Windowed,
-    resolution: orbits.Resolution,
-    mechanics: Mechanics,
-    prepared,
-    modes: SlidingModes,
-    wedge: Wedge,
-    attractor: Attractor,
-    lane: Lane,
-    looks,
-) -> Lane:
-    """One lane, `looks` times `LOOK_EVERY` steps further, with the verdict if it can be proved by then."""
-    structure = scene.structure
-    weights = structure.weights
+def step(course: Course, lane: Lane) -> Lane:
+    """One step further, which ends at the next event at the latest."""
+    scene, structure, method = course.scene, course.scene.structure, course.method
     # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
     longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
+    t = next_step_end(scene.load, lane.t, longest)
+    load = scene.load(0.5 * (lane.t + t)) - scene.load.final
+    after = method.advance(course.prepared, lane.contact, load, lane.y, t - lane.t)
+    y, contact, h, peak = after
+    t = jnp.where(h >= t - lane.t, t, lane.t + h)
+    changed = contact.status != lane.contact.status
+    orbit = orbits.observe(
+        lane.orbit,
+        structure.weights,
+        jnp.zeros_like(y),
+        structure.tangential,
+        lane.y,
+        y,
+        changed,
+        peak,
+        t,
+        course.modes.slowest_decay,
+        course.resolution,
+    )
+    return Lane(
+        t=t,
+        y=y,
+        contact=contact,
+        orbit=orbit,
+        events=lane.events + changed,
+        last_event=jnp.where(changed, t, lane.last_event),
+        approach=lane.approach,
+        verdict=lane.verdict,
+        account=None if lane.account is None else _entered(course, lane.account, lane, load, after, t),
+    )
 
-    def step(_, lane: Lane) -> Lane:
-        t = next_step_end(scene.load, lane.t, longest)
-        load = scene.load(0.5 * (lane.t + t)) - scene.load.final
-        after = method.advance(prepared, lane.contact, load, lane.y, t - lane.t)
-        y, contact, h, peak = after
-        t = jnp.where(h >= t - lane.t, t, lane.t + h)
-        changed = contact.status != lane.contact.status
-        orbit = orbits.observe(
-            lane.orbit,
-            weights,
-            jnp.zeros_like(y),
-            structure.tangential,
-            lane.y,
-            y,
-            changed,
-            peak,
-            t,
-            modes.slowest_decay,
-            resolution,
-        )
-        return Lane(
-            t=t,
-            y=y,
-            contact=contact,
-            orbit=orbit,
-            events=lane.events + changed,
-            last_event=jnp.where(changed, t, lane.last_event),
-            approach=lane.approach,
-            verdict=lane.verdict,
-            account=None if lane.account is None else entered(lane.account, lane, load, after, t),
-        )
 
-    def entered(account: Account, lane: Lane, load, after: Advance, t) -> Account:
-        ledger = enter(Books(scene), method, mechanics, load, account.ledger, lane.contact, lane.y, after)
-        kick_ends = jnp.max(scene.load.jumps, initial=0.0)
-        just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
-        vibration = mechanical_energy(structure, after.y)
-        return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
+def _entered(course: Course, account: Account, before: Lane, load, after: Advance, t) -> Account:
+    scene = course.scene
+    ledger = enter(Books(scene), course.method, course.mechanics, load, account.ledger, before.contact, before.y, after)
+    kick_ends = jnp.max(scene.load.jumps, initial=0.0)
+    just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
+    vibration = mechanical_energy(scene.structure, after.y)
+    return Account(ledger, jnp.where(just_kicked, vibration, account.vibration))
 
-    def look(_, carry: tuple[Lane, Bool[Array, ""]]):
-        lane = jax.lax.fori_loop(0, LOOK_EVERY, step, carry[0])
-        approach, reached = attractors.approached(lane.approach, attractor, weights * lane.orbit.latest)
-        return eqx.tree_at(lambda lane: lane.approach, lane, approach), carry[1] | reached
 
-    after, reached = jax.lax.fori_loop(0, looks, look, (lane, jnp.zeros((), bool)))
-    reached = reached & ~after.orbit.returned
-    amplitude = jnp.where(reached, attractor.amplitude, after.orbit.amplitude)
-    after = eqx.tree_at(lambda lane: lane.orbit.amplitude, after, amplitude)
+def look(course: Course, lane: Lane, reached: Bool[Array, ""]) -> tuple[Lane, Bool[Array, ""]]:
+    """A look at how near the lane is to the known limit cycle, and whether it has `reached` it by now."""
+    crossing = course.scene.structure.weights * lane.orbit.latest
+    approach, reached_now = attractors.approached(lane.approach, course.attractor, crossing)
+    return eqx.tree_at(lambda lane: lane.approach, lane, approach), reached | reached_now
+
+
+def conclude(course: Course, began: Float[Array, ""], lane: Lane, reached: Bool[Array, ""]) -> Lane:
+    """The lane with the verdict, if it can be proved by now; it has been followed since the time `began` (s) and has
+    `reached` its known limit cycle, or not.
+    """
+    scene, mechanics, modes = course.scene, course.mechanics, course.modes
+    structure = scene.structure
+    weights = structure.weights
+    reached = reached & ~lane.orbit.returned
+    amplitude = jnp.where(reached, course.attractor.amplitude, lane.orbit.amplitude)
+    lane = eqx.tree_at(lambda lane: lane.orbit.amplitude, lane, amplitude)
     equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
     yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
-    grown = jnp.max(jnp.abs(weights * after.y)) > GROWTH * yardstick
-    wedged = sticks_forever(wedge, mechanics.of_totals, after.contact, after.y + equilibrium)
-    quiet_load = jnp.all(scene.load.jumps <= after.t)
+    grown = jnp.max(jnp.abs(weights * lane.y)) > GROWTH * yardstick
+    wedged = sticks_forever(course.wedge, mechanics.of_totals, lane.contact, lane.y + equilibrium)
+    quiet_load = jnp.all(scene.load.jumps <= lane.t)
     verdict = jnp.where(
-        ~jnp.all(jnp.isfinite(after.y)),
+        ~jnp.all(jnp.isfinite(lane.y)),
         Verdict.NOT_FINITE,
         jnp.where(
-            after.t <= lane.t,
+            lane.t <= began,
             Verdict.TOO_MANY_EVENTS,
             jnp.where(
-                quiet_load & slides_forever(mechanics, modes, after.contact, after.y),
+                quiet_load & slides_forever(mechanics, modes, lane.contact, lane.y),
                 Verdict.SLIDING,
                 jnp.where(
-                    quiet_load & (after.orbit.returned | reached),
+                    quiet_load & (lane.orbit.returned | reached),
                     Verdict.LIMIT_CYCLE,
                     jnp.where(
                         quiet_load & (wedged | grown),
@@ -197,4 +210,4 @@ def follow(
             ),
         ),
     )
-    return eqx.tree_at(lambda lane: lane.verdict, after, verdict.astype(jnp.int8))
+    return eqx.tree_at(lambda lane: lane.verdict, lane, verdict.astype(jnp.int8))

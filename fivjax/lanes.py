@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from tqdm.auto import tqdm
@@ -27,7 +28,7 @@ from .contact import Mechanics
 from .energy import exchanged
 from .event_exact import EventExact
 from .interrupts import noted
-from .lane import LOOK_EVERY, Lane, begin, follow, measured_from_rest, released
+from .lane import LOOK_EVERY, Course, Lane, begin, conclude, look, measured_from_rest, released, step
 from .packed import Packed, packed
 from .propagators import MATRIX_ROWS, Windowed
 from .scene import Scene
@@ -209,11 +210,11 @@ def bytes_per_lane(scene: Scene, sharing: float) -> int:
     """Memory that a lane takes where `sharing` lanes make a group, its part of a step's intermediate results included."""
     n = scene.structure.size
     m = 2 * (n - 1)
-    state_and_orbit = 8 * (5 * 2 * n + 30)
+    own = 8 * ((3 + attractors.SEEN) * 2 * n + 60)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
     attractor = 8 * attractors.KEPT * 2 * n
-    return int(3 * (state_and_orbit + (modes + prepared + attractor) / sharing))
+    return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
 def _groups(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -236,80 +237,73 @@ def _run_block(
     distinct, group = _groups(values)
     shared = _shared(batch, distinct)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in batch.history)], axis=-1)[:, 1:]
-    together = packed(shared)
     # What lanes share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(outcome.verdict[index] == Verdict.NOT_RUN)
-    lanes = _begun(batch, together, group[pending], columns[pending])
+    lanes = _begun(batch, shared, group[pending], columns[pending])
     done = 0
     while True:
-        verdict, t = lanes.verdict, lanes.t
+        _, now = lanes.tree
+        verdict = now.verdict
         if done >= max_steps:
-            verdict = np.where((verdict == Verdict.UNDECIDED) & (t < t_max), Verdict.STEP_FAILURE, verdict)
-            lanes = eqx.tree_at(lambda lanes: lanes.verdict, lanes, verdict.astype(np.int8))
-        finished = (verdict != Verdict.UNDECIDED) | (t >= t_max)
-        _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], lanes))
+            verdict = np.where((verdict == Verdict.UNDECIDED) & (now.t < t_max), Verdict.STEP_FAILURE, verdict)
+            now = eqx.tree_at(lambda lane: lane.verdict, now, verdict.astype(np.int8))
+        finished = (verdict != Verdict.UNDECIDED) | (now.t >= t_max)
+        _record(outcome, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], now))
         report(int(finished.sum()))
         if finished.all():
             return
-        pending = pending[~finished]
-        lanes = jax.tree.map(lambda leaf, done=finished: leaf[~done], lanes)
+        pending, lanes = pending[~finished], lanes.closed_up(np.flatnonzero(~finished))
         if done == KNOWN_FROM * batch.method.round:
             many = pending[company[pending] >= WORTH_KNOWING]
             groups, first = np.unique(group[many], return_index=True)
             for start in range(0, len(groups), ENSEMBLES):
                 part = slice(start, start + ENSEMBLES)
-                shared = _with_attractors(batch, shared, together, groups[part], columns[many[first[part]]], report)
-            if len(groups):
-                together = packed(shared)
+                _find_attractors(batch, shared, groups[part], columns[many[first[part]]], report)
         # Lanes that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // LOOK_EVERY)
-        lanes = _followed(batch, together, group[pending], columns[pending], lanes, looks)
+        _follow(batch, shared, group[pending], lanes, looks)
         done += looks * LOOK_EVERY
 
 
-def _with_attractors(
-    batch: Batch, shared: Shared, together: Packed, groups: np.ndarray, columns: np.ndarray, report
-) -> Shared:
-    """`shared` with the limit cycles of these groups, where their ensembles meet on one.
+def _find_attractors(batch: Batch, shared: Packed, groups: np.ndarray, columns: np.ndarray, report) -> None:
+    """Writes the limit cycles of these groups into what they share, where their ensembles meet on one.
 
-    `together` is what lanes share, packed, in which these are not known; `columns` are those of any lane of each group.
+    `columns` are those of any lane of each group.
     """
     structure, members = batch.scene.structure, len(attractors.RELEASES)
-    found = jax.tree.map(np.array, shared.attractor)
+    known, slowest_decay = shared.tree.attractor, shared.tree.modes.slowest_decay
     own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
     running, moving = np.arange(len(own)), np.ones(len(own), bool)
-    lanes = _begun(batch, together, own, columns, np.tile(attractors.RELEASES, len(groups)))
+    lanes = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
     most = max(attractors.TESTS)
     deviations = np.full((most, len(own), 2 * structure.size), np.nan)
     peaks, times = np.full((most, len(own)), np.nan), np.full((most, len(own)), np.nan)
-
     looks = 0
 
     def cycle_of(k: int):
         mine = slice(k * members, (k + 1) * members)
         ensemble = attractors.Ensemble(deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine], moving[mine])
-        return attractors.met(ensemble, shared.modes.slowest_decay[groups[k]])
+        return attractors.met(ensemble, slowest_decay[groups[k]])
 
     while len(running) and looks < most:
         report(0)
-        lanes = eqx.tree_at(lambda lanes: lanes.orbit.peak, lanes, np.zeros(len(running)))
-        lanes = _followed(batch, together, own[running], columns[running], lanes, attractors.SEEN)
-        now = slice(looks, looks + attractors.SEEN)
-        deviations[now, running] = np.moveaxis(lanes.approach.seen, 1, 0)[::-1]
-        peaks[now, running], times[now, running] = lanes.orbit.peak, lanes.t
+        lanes.tree[1].orbit.peak[:] = 0.0
+        _follow(batch, shared, own[running], lanes, attractors.SEEN)
+        _, now = lanes.tree
+        recent = slice(looks, looks + attractors.SEEN)
+        deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
+        peaks[recent, running], times[recent, running] = now.orbit.peak, now.t
         looks += attractors.SEEN
-        moving[running] = (lanes.verdict == Verdict.UNDECIDED) | (lanes.verdict == Verdict.LIMIT_CYCLE)
+        moving[running] = (now.verdict == Verdict.UNDECIDED) | (now.verdict == Verdict.LIMIT_CYCLE)
         over = ~moving[running]
         if looks in attractors.TESTS:
             open_ = np.unique(running // members)
             for k, cycle in zip(open_, batch.pool.map(cycle_of, open_), strict=True):
                 if cycle is not None:
-                    found.crossings[groups[k]], found.amplitude[groups[k]] = cycle
-                    found.known[groups[k]] = True
-            over |= found.known[own[running]]
-        running, lanes = running[~over], jax.tree.map(lambda leaf, over=over: leaf[~over], lanes)
-    return eqx.tree_at(lambda shared: shared.attractor, shared, found)
+                    known.crossings[groups[k]], known.amplitude[groups[k]] = cycle
+            over |= known.known[own[running]]
+        running, lanes = running[~over], lanes.closed_up(np.flatnonzero(~over))
 
 
 def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
@@ -330,23 +324,26 @@ def _record(outcome: Outcome, index: np.ndarray, lanes: Lane) -> None:
     outcome.verdict[index] = verdict
 
 
-def _shared(batch: Batch, distinct: np.ndarray) -> Shared:
-    """`Shared` of each row of `distinct`; arrays over groups."""
+def _shared(batch: Batch, distinct: np.ndarray) -> Packed:
+    """`Shared` of each row of `distinct`, packed."""
     size, parts = 64, []
     for start in range(0, len(distinct), size):
         # Filled up with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    mechanics, prepared, linear, wedges = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Shared(
-        distinct,
-        mechanics,
-        prepared,
-        sliding_modes(linear),
-        wedges,
-        attractors.unknown(len(distinct), 2 * batch.scene.structure.size),
-    )
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, _ in parts)))
+    numbers = form = None
+    for start in range(0, len(distinct), size):
+        # One by one into place, because they are large: they are never there twice.
+        mechanics, prepared, _, wedges = parts.pop(0)
+        rows = slice(start, min(start + size, len(distinct)))
+        unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)
+        own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
+        part = packed(Shared(distinct[rows], mechanics, prepared, own_modes, wedges, unknown))
+        numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
+        numbers[rows], form = part.numbers, part.form
+    return Packed(numbers, form)
 
 
 @compiled
@@ -359,32 +356,33 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
     return jax.vmap(one)(values)
 
 
-def _begun(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, releases=None) -> Lane:
-    """Lanes at their beginning; those that are released (from these multiples of their final load) after all kicks."""
+def _begun(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, releases=None) -> Packed:
+    """Lanes at their beginning, each with its history; those that are released (from these multiples of their final load)
+    after all kicks.
+    """
     kicked = releases is None
     releases = np.ones(len(group)) if kicked else releases
 
     def function(*tile):
-        return _begin(batch.scene, batch.names, batch.history, batch.energy, kicked, *tile)
+        return _begin_tile(batch.scene, batch.names, batch.history, batch.energy, kicked, *tile)
 
-    return in_tiles(function, shared, group, packed((columns, releases)), batch.width, batch.pool).tree
+    return in_tiles(function, shared, group, packed((columns, releases)), batch.width, batch.pool)
 
 
-def _followed(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray, lanes: Lane, looks: int) -> Lane:
-    """Lanes `looks` looks further."""
-
-    follow_tile = _follow_many if batch.many else _follow
+def _follow(batch: Batch, shared: Packed, group: np.ndarray, lanes: Packed, looks: int) -> None:
+    """Lanes `looks` looks further, in place."""
+    follow_tile = _follow_tile_of_many if batch.many else _follow_tile
 
     def function(*tile):
         return follow_tile(
             batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *tile
         )
 
-    return in_tiles(function, shared, group, packed((columns, lanes)), batch.width, batch.pool).tree
+    in_tiles(function, shared, group, lanes, batch.width, batch.pool, in_place=True)
 
 
 @compiled
-def _begin(scene, names, history, energy: bool, kicked: bool, shared: Packed, lanes: Packed) -> Packed:
+def _begin_tile(scene, names, history, energy: bool, kicked: bool, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, releases):
         own = _with(scene, names, shared.values)
 
@@ -394,24 +392,52 @@ def _begin(scene, names, history, energy: bool, kicked: bool, shared: Packed, la
 
         return jax.vmap(one)(columns, releases)
 
-    return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
+    columns, releases = lanes.tree
+    return packed((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
 
 
-def _follow_tile(scene, method, resolution, names, history, looks, shared: Packed, lanes: Packed) -> Packed:
-    def group(shared, columns, lanes):
-        own = _with(scene, names, shared.values)
+def _followed(scene, method, resolution, names, history, looks, shared: Packed, lanes: Packed) -> Packed:
+    columns, begun = lanes.tree
+    everything = shared.tree
 
-        known = shared.mechanics, shared.prepared, shared.modes, shared.wedge, shared.attractor
+    def of_lanes(function):
+        """A function of a course and of what is one lane's, for all lanes of the tile."""
 
-        def one(row, lane):
-            return follow(_with(own, history, row), method, resolution, *known, lane, looks)
+        def of_group(shared, columns, *own):
+            scene_of_group = _with(scene, names, shared.values)
 
-        return jax.vmap(one)(columns, lanes)
+            def of_lane(row, *own):
+                course = Course(
+                    _with(scene_of_group, history, row),
+                    method,
+                    resolution,
+                    shared.mechanics,
+                    shared.prepared,
+                    shared.modes,
+                    shared.wedge,
+                    shared.attractor,
+                )
+                return function(course, *own)
 
-    return packed(jax.vmap(group)(shared.tree, *lanes.tree), row_axes=2)
+            return jax.vmap(of_lane)(columns, *own)
+
+        return lambda *own: jax.vmap(of_group)(everything, columns, *own)
+
+    # Loops about lanes side by side, not lanes side by side in loops: JAX traces the body of a loop that it has to
+    # vectorise several times.
+    a_step, a_look, concluded = of_lanes(step), of_lanes(look), of_lanes(conclude)
+
+    def until_look(_, carry):
+        lanes, reached = carry
+        lanes = jax.lax.fori_loop(0, LOOK_EVERY, lambda _, lanes: a_step(lanes), lanes)
+        return a_look(lanes, reached)
+
+    none = jnp.zeros(begun.t.shape, bool)
+    after, reached = jax.lax.fori_loop(0, looks, until_look, (begun, none))
+    return packed((columns, concluded(begun.t, after, reached)), row_axes=2)
 
 
-_follow, _follow_many = compiled(_follow_tile), eqx.filter_jit(_follow_tile)
+_follow_tile, _follow_tile_of_many = compiled(_followed), eqx.filter_jit(_followed)
 
 
 def _with(scene: Scene, names: tuple[str, ...], row) -> Scene:

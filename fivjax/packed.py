@@ -6,7 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
+
+# Rows that are copied at a time.
+MOVED_AT_ONCE = 4096
 
 
 class Packed(eqx.Module):
@@ -17,7 +20,7 @@ class Packed(eqx.Module):
 
     @property
     def tree(self) -> PyTree:
-        """The tree again."""
+        """The tree again; of a NumPy array, its real leaves are views: what is written there is written here."""
         structure, shapes, types = self.form
         leaves, start, rows = [], 0, self.numbers.shape[:-1]
         for shape, kind in zip(shapes, types, strict=True):
@@ -27,9 +30,19 @@ class Packed(eqx.Module):
             if is_complex:
                 part = part.reshape(*rows, -1, 2)
                 part = part[..., 0] + 1j * part[..., 1]
-            leaves.append(part.reshape(*rows, *shape).astype(kind))
+            leaves.append(part.reshape(*rows, *shape).astype(kind, copy=False))
             start += size
         return jax.tree.unflatten(structure, leaves)
+
+    def closed_up(self, rows: Int[np.ndarray, " r"]) -> "Packed":
+        """Only these rows, in rising order, moved to the array's beginning in place: there is never a second array."""
+        if len(rows) == len(self.numbers):
+            return self
+        for start in range(0, len(rows), MOVED_AT_ONCE):
+            chosen = rows[start : start + MOVED_AT_ONCE]
+            # None of them lies before the place that it comes to, so nothing is written over that is still wanted.
+            self.numbers[start : start + len(chosen)] = self.numbers[chosen]
+        return Packed(self.numbers[: len(rows)], self.form)
 
 
 def packed(tree: PyTree, row_axes: int = 1) -> Packed:

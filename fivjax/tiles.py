@@ -28,11 +28,18 @@ def workers() -> int:
 
 
 def in_tiles(
-    function, shared: Packed, group: np.ndarray, lanes: Packed, width: int, pool: ThreadPoolExecutor
+    function,
+    shared: Packed,
+    group: np.ndarray,
+    lanes: Packed,
+    width: int,
+    pool: ThreadPoolExecutor,
+    in_place: bool = False,
 ) -> Packed:
     """`function(shared, lanes)` of all lanes, in tiles of one size, so that a scene is compiled once for any map.
 
-    `group` says which row of `shared` is each lane's. In a tile, `shared` has an axis of rows, `lanes` one more.
+    `group` says which row of `shared` is each lane's. In a tile, `shared` has an axis of rows, `lanes` one more. With
+    `in_place` the results, of the same form, take the place of `lanes`.
     """
     slots, filled = _side_by_side(group, width)
     size = TILE_ELSEWHERE
@@ -50,7 +57,7 @@ def in_tiles(
             result = function(own, Packed(lanes.numbers[place], lanes.form))
             return place[real], np.asarray(result.numbers)[real], result.form
 
-    numbers = form = None
+    numbers, form = (lanes.numbers, lanes.form) if in_place else (None, None)
     for places, part, its_form in pool.map(run, range(0, len(slots), rows)):
         # Into place at once, so that not all parts are kept beside the whole.
         numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers

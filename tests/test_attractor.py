@@ -59,7 +59,7 @@ def test_too_few_members_or_too_short_a_time_prove_nothing():
 def looks_until_reached(distances):
     """The look at which a lane has reached a cycle of one crossing state, seen at these relative distances from it."""
     with jax.enable_x64(True):
-        attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0), jnp.asarray(True))
+        attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0))
         approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
         step = jax.jit(lambda approach, state: approached(approach, attractor, state))
         for look, distance in enumerate(distances):
@@ -86,7 +86,7 @@ def test_the_same_crossing_state_is_looked_at_once():
 
 def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
-        unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0), jnp.asarray(False))
+        unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0))
         near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(9), jnp.asarray(0.0))
         assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 

@@ -40,7 +40,7 @@ def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
     paper_scene, whole, tmp_path, monkeypatch, at_once, calls
 ):
     """Were a lane's result to depend on what runs beside it, or half a record kept, the maps would differ."""
-    real, made = lanes._follow, []
+    real, made = lanes._follow_tile, []
 
     def interrupted(*args):
         made.append(1)
@@ -49,7 +49,7 @@ def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
         return real(*args)
 
     path = tmp_path / "map.part"
-    monkeypatch.setattr(lanes, "_follow", interrupted)
+    monkeypatch.setattr(lanes, "_follow_tile", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         first = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     open_ = first["verdict"] == fj.Verdict.NOT_RUN

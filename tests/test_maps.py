@@ -196,7 +196,7 @@ def test_undecided_lanes_are_labelled_and_counted(paper_scene):
 
 def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     """Ctrl-C in the middle of a run: the decided lanes are returned, the others labelled, and the user is told."""
-    real, calls = lanes._follow, []
+    real, calls = lanes._follow_tile, []
 
     def interrupted(*args):
         calls.append(1)
@@ -204,7 +204,7 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(lanes, "_follow", interrupted)
+    monkeypatch.setattr(lanes, "_follow_tile", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, p=[1.02, 1.19], progress=False)
     assert m["verdict"].values.tolist() == [0, fj.Verdict.NOT_RUN]
