@@ -47,7 +47,7 @@ def in_tiles(
         size = LARGE_TILE_ON_CPU if len(group) >= MANY else TILE_ON_CPU
     rows = max(1, size // width)
 
-    def run(start: int):
+    def run(start: int, numbers: np.ndarray | None) -> Packed:
         # The last tile is filled up with copies of its first row.
         chosen = np.arange(start, start + rows)
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
@@ -55,14 +55,16 @@ def in_tiles(
         with jax.enable_x64(True):  # the setting is a thread's own
             own = Packed(shared.numbers[group[place[:, 0]]], shared.form)
             result = function(own, Packed(lanes.numbers[place], lanes.form))
-            return place[real], np.asarray(result.numbers)[real], result.form
-
-    numbers, form = (lanes.numbers, lanes.form) if in_place else (None, None)
-    for places, part, its_form in pool.map(run, range(0, len(slots), rows)):
-        # Into place at once, so that not all parts are kept beside the whole.
+            part = np.asarray(result.numbers)
         numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers
-        numbers[places], form = part, its_form
-    return Packed(numbers, form)
+        # Into place at once, so that parts are not kept beside the whole.
+        numbers[place[real]] = part[real]
+        return Packed(numbers, result.form)
+
+    results = lanes if in_place else run(0, None)
+    for _ in pool.map(lambda start: run(start, results.numbers), range(0 if in_place else rows, len(slots), rows)):
+        pass
+    return results
 
 
 def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
