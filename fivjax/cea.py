@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, Complex, Float
-from scipy.optimize import linear_sum_assignment
 
 from . import arguments
 from .compiling import compiled
@@ -237,10 +236,18 @@ def _modes_of(matrix: np.ndarray) -> _Modes:
     )
 
 
+def _assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pairs that together cost least."""
+    # Imported when wanted: it takes as long to load as much of the rest.
+    from scipy.optimize import linear_sum_assignment
+
+    return linear_sum_assignment(cost)
+
+
 def _matched(at: _Sampler, x0: float, a: _Modes, x1: float, b: _Modes, halvings: int) -> np.ndarray:
     """For each mode of `a` the index of the same mode in `b`."""
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
-    rows, order = linear_sum_assignment(distance)
+    rows, order = _assigned(distance)
     moved = distance[rows, order]
     others = np.where(np.arange(len(order))[None, :] == order[:, None], np.inf, distance)
     neighbours = np.minimum(others.min(axis=1, initial=np.inf), _gaps(a.eigenvalue))
@@ -263,13 +270,13 @@ def _met(a: _Modes, b: _Modes) -> np.ndarray:
     """The same as `_matched` where two modes of `a` have come together at one point."""
     # Modes that merely cross keep their shapes: what projects onto one before finds one only afterwards.
     share = np.abs(a.left @ b.right.T)
-    rows, order = linear_sum_assignment(-share)
+    rows, order = _assigned(-share)
     rest = np.where(np.arange(len(order))[None, :] == order[:, None], 0.0, share)
     if np.all(share[rows, order] > 0.9) and np.all(rest.max(axis=1, initial=0.0) < 0.5):
         return order
     # They truly met: by frequency before and by growth rate after, or the other way round; the rest by distance.
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
-    _, order = linear_sum_assignment(distance)
+    _, order = _assigned(distance)
     close = np.flatnonzero(_gaps(a.eigenvalue) <= 10 * distance.max(axis=1))
     if len(close) > 1:
         order[close[_ranks(a.eigenvalue[close])]] = order[close][_ranks(b.eigenvalue[order[close]])]

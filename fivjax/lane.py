@@ -106,10 +106,14 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
 
 
 def released(scene: Scene, modes: SlidingModes, lane: Lane, load: Float[Array, ""]) -> Lane:
-    """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks."""
+    """The lane at rest under so many times its final load, which jumps to its final value now, after all kicks; not a
+    number, and the lane stays as it is.
+    """
     q, _ = steady_sliding(scene, load * scene.load.final)
     deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
-    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, (deviation, jnp.max(scene.load.jumps, initial=0.0)))
+    after = deviation, jnp.max(scene.load.jumps, initial=0.0)
+    chosen = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(load), old, new), after, (lane.y, lane.t))
+    return eqx.tree_at(lambda lane: (lane.y, lane.t), lane, chosen)
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
@@ -196,7 +200,7 @@ def conclude(course: Course, began: Float[Array, ""], lane: Lane, reached: Bool[
             lane.t <= began,
             Verdict.TOO_MANY_EVENTS,
             jnp.where(
-                quiet_load & slides_forever(mechanics, modes, lane.contact, lane.y),
+                slides_forever(mechanics, modes, lane.contact, lane.y, quiet_load),
                 Verdict.SLIDING,
                 jnp.where(
                     quiet_load & (lane.orbit.returned | reached),

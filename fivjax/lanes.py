@@ -360,11 +360,10 @@ def _begun(batch: Batch, shared: Packed, group: np.ndarray, columns: np.ndarray,
     """Lanes at their beginning, each with its history; those that are released (from these multiples of their final load)
     after all kicks.
     """
-    kicked = releases is None
-    releases = np.ones(len(group)) if kicked else releases
+    releases = np.full(len(group), np.nan) if releases is None else releases
 
     def function(*tile):
-        return _begin_tile(batch.scene, batch.names, batch.history, batch.energy, kicked, *tile)
+        return _begin_tile(batch.scene, batch.names, batch.history, batch.energy, *tile)
 
     return in_tiles(function, shared, group, packed((columns, releases)), batch.width, batch.pool)
 
@@ -382,13 +381,13 @@ def _follow(batch: Batch, shared: Packed, group: np.ndarray, lanes: Packed, look
 
 
 @compiled
-def _begin_tile(scene, names, history, energy: bool, kicked: bool, shared: Packed, lanes: Packed) -> Packed:
+def _begin_tile(scene, names, history, energy: bool, shared: Packed, lanes: Packed) -> Packed:
     def group(shared, columns, releases):
         own = _with(scene, names, shared.values)
 
         def one(row, release):
             lane = begin(_with(own, history, row), shared.mechanics, shared.modes, energy)
-            return lane if kicked else released(own, shared.modes, lane, release)
+            return released(own, shared.modes, lane, release)
 
         return jax.vmap(one)(columns, releases)
 

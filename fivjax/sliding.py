@@ -169,14 +169,20 @@ def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
     return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
 
 
-def slides_forever(mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now, under its final load, never stops sliding; from the state's
+def slides_forever(
+    mechanics: Mechanics,
+    modes: SlidingModes,
+    contact: Contact,
+    deviation: State,
+    under_final_load: Bool[Array, ""] | bool,
+) -> Bool[Array, ""]:
+    """Whether a bound shows that a contact which slides now, `under_final_load`, never stops sliding; from the state's
     deviation from the equilibrium.
     """
     linear = modes.linear
     z = deviation[_sliding_coordinates(deviation.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
-    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
+    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & under_final_load
     sliding = sliding & modes.stable & linear.exists
     if not mechanics.friction.constant:
         return sliding & decays_nonlinearly(modes, modal)

@@ -48,7 +48,7 @@ def proved(scene: fj.Scene, q, v) -> bool:
     with jax.enable_x64(True):
         contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.asarray(1.0))
         y, modes = jnp.concatenate([jnp.asarray(q), jnp.asarray(v)]), modes_of(scene)
-        return bool(slides_forever(Mechanics(scene), modes, contact, y - modes.linear.equilibrium))
+        return bool(slides_forever(Mechanics(scene), modes, contact, y - modes.linear.equilibrium, True))
 
 
 @pytest.mark.parametrize(
