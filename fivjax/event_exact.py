@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from . import arguments
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution
+from .orbit import Resolution, rise_between
 from .scene import Scene
 from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
 
@@ -119,7 +119,8 @@ class EventExact(AbstractStepper):
         reached = physics.on_constraint(mechanics, contact, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        return Advance(y_next, next_contact, x * reach * unit, jnp.abs(y_next[n + mechanics.tangential]))
+        peak = jnp.abs(y_next[n + mechanics.tangential])
+        return Advance(y_next, next_contact, x * reach * unit, peak, rise_between(y, y_next, mechanics.tangential))
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]

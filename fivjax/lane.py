@@ -27,7 +27,7 @@ from .steppers import AbstractStepper, Advance
 from .verdict import Verdict
 from .wedging import Wedge, sticks_forever
 
-# Steps between two looks at how near a lane is to a known limit cycle: about a cycle for the fastest method.
+# Steps between two looks at how near a lane is to a known limit cycle: one or two cycles for the fastest method.
 LOOK_EVERY = 8
 # The longest advance that a ledger is asked to enter, s.
 LONGEST_ENTRY = 1.0
@@ -133,16 +133,14 @@ def step(course: Course, lane: Lane) -> Lane:
     t = next_step_end(scene.load, lane.t, longest)
     load = scene.load(0.5 * (lane.t + t)) - scene.load.final
     after = method.advance(course.prepared, lane.contact, load, lane.y, t - lane.t)
-    y, contact, h, peak = after
+    y, contact, h, peak, rise = after
     t = jnp.where(h >= t - lane.t, t, lane.t + h)
     changed = contact.status != lane.contact.status
     orbit = orbits.observe(
         lane.orbit,
         structure.weights,
         jnp.zeros_like(y),
-        structure.tangential,
-        lane.y,
-        y,
+        rise,
         changed,
         peak,
         t,

@@ -14,6 +14,8 @@ unstable cycle for seconds, almost periodic, before they decide. They stay close
 return, and they drift, so they are no tight one: a chain whose distances grow does not count.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -69,6 +71,22 @@ class Orbit(eqx.Module):
     returned: Bool[Array, ""]  # seen to return: a limit cycle
 
 
+class Rise(NamedTuple):
+    """A rise of the tangential velocity through zero, where orbits are compared."""
+
+    happened: Bool[Array, ""]
+    at: State  # the state there; anything if there was none
+
+
+def rise_between(before: State, after: State, tangential: int) -> Rise:
+    """The rise between two states close to each other, on a straight line."""
+    velocity = before.shape[0] // 2 + tangential
+    speed = before[velocity], after[velocity]
+    rose = (speed[0] < 0) & (speed[1] >= 0)
+    share = speed[0] / jnp.where(rose, speed[0] - speed[1], 1.0)
+    return Rise(rose, before + jnp.where(rose, share, 0.0) * (after - before))
+
+
 def new_orbit(y: State) -> Orbit:
     zero, none = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
     # No anchor yet: an infinite one is never returned to, and a patience of one replaces it at the first crossing.
@@ -97,26 +115,20 @@ def observe(
     orbit: Orbit,
     weights: Float[Array, " 2n"],
     equilibrium: State,
-    tangential: int,
-    before: State,
-    after: State,
+    rise: Rise,
     changed: Bool[Array, ""],
     peak: Float[Array, ""],
     t: Float[Array, ""],
     decay: Float[Array, ""],
     resolution: Resolution,
 ) -> Orbit:
-    """The orbit's memory after one more step, from the state `before` it to the state `after` it.
+    """The orbit's memory after one more step, in which the velocity rose through zero or not.
 
     `weights` make displacements and velocities comparable; distances are relative to that from `equilibrium`. `changed`
     says whether the status changed in the step, `peak` is the largest tangential speed in it, `t` is the time at its end,
     and `decay` the slowest rate (1/s) at which a vibration decays that nothing sustains.
     """
-    tangential_velocity = before.shape[0] // 2 + tangential
-    speed = before[tangential_velocity], after[tangential_velocity]
-    crossed = (speed[0] < 0) & (speed[1] >= 0)
-    share = speed[0] / jnp.where(crossed, speed[0] - speed[1], 1.0)
-    at = before + jnp.where(crossed, share, 0.0) * (after - before)
+    crossed, at = rise
     distance = computed_once(
         lambda: _length(weights * (at - orbit.anchor)) / _length(weights * (at - equilibrium)), jnp.zeros_like(peak)
     )

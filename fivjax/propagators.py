@@ -25,6 +25,7 @@ from . import contact as physics
 from .compiling import computed_once
 from .contact import Contact, Mechanics, State, Status
 from .event_exact import ROUNDING, ROUNDINGS
+from .orbit import Rise
 from .steppers import Advance
 
 # Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
@@ -96,22 +97,23 @@ def _advance_many(size: int, batched, prepared: Propagators, *lanes):
 def _advance(
     prepared: Propagators, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"], h: Float[Array, " l"]
 ) -> Advance:
-    """One advance of lanes side by side: to the next event, the next rise of the tangential velocity through zero, the
-    end of the step or that of the window, whichever comes first.
+    """One advance of lanes side by side: to the next event, the end of the step or that of the window, whichever comes
+    first.
     """
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
     here = _stacked(mechanics, contact, load, y)
     exact = physics.exactly_zero(contact)
     window = _Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n, mechanics.tangential)
-    none = jnp.zeros_like(load)
+    none, no_state = jnp.zeros_like(load), jnp.zeros_like(y)
 
     interval = computed_once(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
-    state, peak = computed_once(lambda: (window.state_at(interval), window.peak(interval)), (jnp.zeros_like(y), none))
+    state, peak = computed_once(lambda: (window.state_at(interval), window.peak(interval)), (no_state, none))
+    rises, around = computed_once(lambda: window.rise(interval), (none > 0, (no_state, no_state)))
     there = _stacked(mechanics, contact, load, state)
     series = _Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), exact, n)
-    no = jnp.zeros((3, *none.shape), bool)
-    guess = jnp.zeros((3, *none.shape), none.dtype)
+    no = jnp.zeros((2, *none.shape), bool)
+    guess = jnp.zeros((2, *none.shape), none.dtype)
     like = _Bracket(guess, no.astype(jnp.int32), guess, no, no, no)
     brackets = _dipped(series, computed_once(lambda: series.brackets(interval < INTERVALS), like))
     end = jnp.where(interval == INTERVALS, 0.0, jnp.minimum(steps - interval, 1.0))
@@ -119,20 +121,50 @@ def _advance(
 
     velocity = n + mechanics.tangential
 
-    def follow() -> tuple[Float[Array, " l"], tuple[Contact, Float[Array, "2n l"]]]:
+    def follow():
         reached = series.state(share)
-        rows = jnp.arange(2 * n)[:, None]
-        reached = jnp.where(rows >= n, reached / prepared.interval, reached)
-        reached = jnp.where((rows == velocity) & fires[2], 0.0, reached)
-        return jnp.maximum(peak, jnp.abs(reached[velocity])), over_lanes(reached, contact, load, fires)
+        reached = jnp.where(jnp.arange(2 * n)[:, None] >= n, reached / prepared.interval, reached)
+        next_contact, y_next = over_lanes(reached, contact, load, fires)
+        # The last rise is the one that counts: in what is left of the interval, after the window's.
+        later = (state[velocity] < 0) & (reached[velocity] >= 0)
+        before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
+        at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
+        jumps = (reached[velocity] < 0) & (y_next[velocity] >= 0)
+        rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
+        return jnp.maximum(peak, jnp.abs(reached[velocity])), next_contact, y_next, rise
 
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
     def over_lanes(reached, contact, load, fires):
         state = physics.on_constraint(mechanics, contact, reached)
-        return physics.transition(mechanics, contact, load, state, fires[:2], RESTING * prepared.interval)
+        return physics.transition(mechanics, contact, load, state, fires, RESTING * prepared.interval)
 
-    peak, (next_contact, y_next) = computed_once(follow, (none, (contact, jnp.zeros_like(y))))
-    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak)
+    peak, next_contact, y_next, rise = computed_once(follow, (none, contact, no_state, Rise(none > 0, no_state)))
+    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise)
+
+
+def _rise(
+    before: Float[Array, "2n l"], after: Float[Array, "2n l"], h: Float[Array, " l"], tangential: int
+) -> Float[Array, "2n l"]:
+    """Where the tangential velocity rises through zero between two states a time `h` (s) apart, on cubics through both.
+
+    It is off by some thousandths, and by the same ones whenever the motion is the same: as good a place to compare orbits
+    at as the rise itself, which an advance would have to end at.
+    """
+    n = before.shape[0] // 2
+    h = jnp.where(h > 0, h, 1.0)
+    way = (after[:n] - before[:n]) / h
+    slope = 2 * (3 * way - 2 * before[n:] - after[n:])
+    bend = 3 * (before[n:] + after[n:] - 2 * way)
+    value, first, second = before[n + tangential], slope[tangential], bend[tangential]
+    root = jnp.sqrt(jnp.maximum(first**2 - 4 * second * value, 0.0))
+    # Two forms of one root, each free of cancellation where it is used.
+    rising = first >= 0
+    below = jnp.where(rising, first + root, 2 * second)
+    x = jnp.where(rising, -2 * value, root - first) / jnp.where(below == 0, 1.0, below)
+    x = jnp.clip(x, 0.0, 1.0)
+    velocity = before[n:] + x * (slope + x * bend)
+    velocity = jnp.where(jnp.arange(n)[:, None] == tangential, 0.0, velocity)
+    return jnp.concatenate([before[:n] + h * x * (before[n:] + x * (slope / 2 + x * bend / 3)), velocity])
 
 
 def propagators(mechanics: Mechanics) -> Propagators:
@@ -159,9 +191,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
     values, slopes = guards @ samples, coefficients[1] @ samples
     control = jnp.stack([values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3])
     window = [coefficients[:4], hulls, control, samples[:, :, : 2 * n]]
-    falling = -orders[:, None, None] * powers[1:, :, mechanics.tangential]
-    watched = jnp.concatenate([coefficients, falling[:, :, None]], axis=2)
-    series = [watched, jnp.sum(watched, axis=0), powers[:, :, :n]]
+    series = [coefficients, jnp.sum(coefficients, axis=0), powers[:, :, :n]]
 
     sizes, rates = jax.vmap(lambda way: _magnitudes(mechanics, way))(ways)
     terms = jnp.stack([sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)])
@@ -286,20 +316,23 @@ class _Window(eqx.Module):
         first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
         index = jnp.arange(INTERVALS)[:, None]
         safe = safe[:, 0] & safe[:, 1] | (index == 0)
-        speed = self.speed
-        rises = (speed[:-1] < 0) & (speed[1:] >= 0)
-        first = _least(jnp.where(safe & ~rises, INTERVALS, index).astype(jnp.int32))
+        first = _least(jnp.where(safe, INTERVALS, index).astype(jnp.int32))
         first = jnp.where(first_safe[0] & first_safe[1], first, 0)
         return jnp.minimum(first, jnp.floor(steps).astype(jnp.int32))
 
     def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "2n l"]:
         """The state where an interval begins."""
         samples = self.parts[-1]
-        found, size = samples[:INTERVALS], INTERVALS
-        while size > 1:
-            size //= 2
-            found = jnp.where((interval & size) > 0, found[size:], found[:size])
-        return jnp.where(interval == INTERVALS, samples[INTERVALS], found[0])
+        return jnp.where(interval == INTERVALS, samples[INTERVALS], _chosen(samples[:INTERVALS], interval))
+
+    def rise(self, interval: Int[Array, " l"]) -> tuple[Bool[Array, " l"], tuple[Array, Array]]:
+        """Whether the tangential velocity rises through zero before the beginning of an interval, and the samples of the
+        state around the last time.
+        """
+        samples, speed, index = self.parts[-1], self.speed, jnp.arange(INTERVALS)[:, None]
+        rises = (speed[:-1] < 0) & (speed[1:] >= 0) & (index < interval)
+        last = -_least(jnp.where(rises, -index, 1).astype(jnp.int32))
+        return last >= 0, (_chosen(samples[:-1], last), _chosen(samples[1:], last))
 
     def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
         """The largest tangential speed up to the beginning of an interval."""
@@ -317,21 +350,15 @@ class _Series(eqx.Module):
 
     @property
     def parts(self) -> list[Array]:
-        """Coefficients of what is watched: the guards, and the negative tangential velocity, because orbits are compared
-        where it rises through zero; their values at the end of the interval; coefficients of the displacements.
-        """
-        return _parts(self.rows, (ORDER + 1, 3), (3,), (ORDER + 2, self.n))
+        """Coefficients of the guards; their values at the end of the interval; coefficients of the displacements."""
+        return _parts(self.rows, (ORDER + 1, 2), (2,), (ORDER + 2, self.n))
 
     def brackets(self, inside: Bool[Array, " l"]) -> "_Bracket":
-        """Of each watched polynomial; at the end of the window, not `inside` an interval, there is nothing to look for."""
+        """Of each guard; at the end of the window, not `inside` an interval, there is nothing to look for."""
         c, end, _ = self.parts
-        limits = self.sizes[:6].reshape(3, 2, -1)
-        limits = jnp.concatenate([limits, jnp.zeros_like(limits[:, :1])], axis=1)
-        exact = jnp.concatenate([self.exact, jnp.zeros_like(self.exact[:1])])
-        watch = inside & ((jnp.arange(3)[:, None] < 2) | (c[0] > 0))
-        zeros, lead = _start(c, limits, exact)
-        spent = watch & (lead < 0)
-        crosses = watch & (lead >= 0) & (end <= 0)
+        zeros, lead = _start(c, self.sizes[:6].reshape(3, 2, -1), self.exact)
+        spent = inside & (lead < 0)
+        crosses = inside & (lead >= 0) & (end <= 0)
         # The first root of the parabola with this start, slope and end, in the form that does not cancel.
         slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
         bend = end - lead - slope
@@ -342,13 +369,13 @@ class _Series(eqx.Module):
         guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
         bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
         # With allowance for what is not parabolic.
-        dips = watch & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
+        dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
         dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
         guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
-        return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips & (jnp.arange(3)[:, None] < 2))
+        return _Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
 
-    def without_zeros(self, zeros: Int[Array, "3 l"]) -> Float[Array, "k 3 l"]:
-        """What is watched, its coefficients that are zero but for rounding exactly so."""
+    def without_zeros(self, zeros: Int[Array, "2 l"]) -> Float[Array, "k 2 l"]:
+        """The guards, their coefficients that are zero but for rounding exactly so."""
         c = self.parts[0]
         return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
 
@@ -363,6 +390,15 @@ def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
     return [
         rows[end - math.prod(shape) : end].reshape(*shape, -1) for shape, end in zip(shapes, ends.tolist(), strict=True)
     ]
+
+
+def _chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array, "*x l"]:
+    """Of as many rows as a window has intervals the one with this index in each lane."""
+    size = INTERVALS
+    while size > 1:
+        size //= 2
+        rows = jnp.where((index & size) > 0, rows[size:], rows[:size])
+    return rows[0]
 
 
 def _least(rows: Array) -> Array:
@@ -391,14 +427,14 @@ def _start(
 
 
 class _Bracket(eqx.Module):
-    """What is known of the first roots of the watched polynomials in [0, 1] from their starts and ends."""
+    """What is known of the first roots of the guards in [0, 1] from their starts and ends."""
 
-    guess: Float[Array, "3 l"]  # at the root; at the lowest point of one that perhaps dips; else 1
-    zeros: Int[Array, "3 l"]  # roots at the very start, not meant
-    end: Float[Array, "3 l"]  # where it is no longer positive, if it crosses
-    crosses: Bool[Array, "3 l"]
-    spent: Bool[Array, "3 l"]  # negative from the start
-    dips: Bool[Array, "3 l"]  # positive at both ends, perhaps not in between
+    guess: Float[Array, "2 l"]  # at the root; at the lowest point of one that perhaps dips; else 1
+    zeros: Int[Array, "2 l"]  # roots at the very start, not meant
+    end: Float[Array, "2 l"]  # where it is no longer positive, if it crosses
+    crosses: Bool[Array, "2 l"]
+    spent: Bool[Array, "2 l"]  # negative from the start
+    dips: Bool[Array, "2 l"]  # positive at both ends, perhaps not in between
 
 
 def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
@@ -429,8 +465,8 @@ def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
 
 def _first_root(
     series: _Series, brackets: _Bracket, end: Float[Array, " l"]
-) -> tuple[Float[Array, " l"], Bool[Array, "3 l"]]:
-    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the watched end it there."""
+) -> tuple[Float[Array, " l"], Bool[Array, "2 l"]]:
+    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the guards end it there."""
     crosses, spent = brackets.crosses, brackets.spent
     c = series.without_zeros(brackets.zeros)
     # A few steps for all at once cost less than a loop that goes on until the last lane is done.
@@ -440,17 +476,17 @@ def _first_root(
     settled = settled & (slope < 0) & (root > 0) & (root <= brackets.end)
     root, slope = _bisected(c, brackets, root, slope, crosses & ~settled)
     root = jnp.where(crosses, root, jnp.inf)
-    first = jnp.minimum(jnp.minimum(root[0], root[1]), root[2])
+    first = jnp.minimum(root[0], root[1])
     # Roots that differ by rounding are the same: the two guards of an open gap always are.
     same = 8 * jnp.finfo(end.dtype).eps * sum(jnp.abs(c[k]) for k in range(4))
     fires = crosses & ((root == first) | ((root - first) * jnp.abs(slope) <= same))
-    any_spent = spent[0] | spent[1] | spent[2]
+    any_spent = spent[0] | spent[1]
     first, fires = jnp.where(any_spent, 0.0, first), jnp.where(any_spent, spent, fires)
     fires = fires & (first <= end)
-    return jnp.where(fires[0] | fires[1] | fires[2], first, end), fires
+    return jnp.where(fires[0] | fires[1], first, end), fires
 
 
-def _approached(c: Float[Array, "k 3 l"], brackets: _Bracket) -> Float[Array, "3 l"]:
+def _approached(c: Float[Array, "k 2 l"], brackets: _Bracket) -> Float[Array, "2 l"]:
     """The first roots in their brackets to half of all digits and more, where Newton's method goes the common way."""
     x = jnp.minimum(brackets.guess, brackets.end)
     for order in ROOT_STEPS:

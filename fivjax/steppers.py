@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution
+from .orbit import Resolution, Rise
 from .scene import Scene
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
@@ -58,6 +58,7 @@ class Advance(NamedTuple):
     contact: Contact
     h: Float[Array, ""]  # how far it came, s
     peak: Float[Array, ""]  # largest tangential speed it saw, m/s
+    rise: Rise
 
 
 class Within(NamedTuple):

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from . import arguments
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution
+from .orbit import Resolution, rise_between
 from .scene import Scene
 from .steppers import AbstractStepper, Advance, StepperState, Within, rates
 
@@ -64,7 +64,7 @@ class WhereSwitched(AbstractStepper):
         # No step straddles a jump, so the load in its middle is the load of the whole step.
         load, h = args.load(0.5 * (t0 + t1)), t1 - t0
         smooth, error = self._smooth_step(mechanics, contact, load, y0, h)
-        y1, next_contact, *_ = self._switched(mechanics, contact, load, smooth, h)
+        y1, next_contact = self._switched(mechanics, contact, load, smooth, h)
         dense_info = {
             "y0": y0,
             "y1": y1,
@@ -77,7 +77,9 @@ class WhereSwitched(AbstractStepper):
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Advance:
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
-        return self._switched(mechanics, contact, load, smooth, h)
+        y_next, next_contact = self._switched(mechanics, contact, load, smooth, h)
+        peak = jnp.abs(y_next[y.shape[0] // 2 + mechanics.tangential])
+        return Advance(y_next, next_contact, h, peak, rise_between(y, y_next, mechanics.tangential))
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -105,13 +107,13 @@ class WhereSwitched(AbstractStepper):
             stages.append(rates(mechanics, contact, load, states[-1]))
         return states, stages
 
-    def _switched(self, mechanics, contact, load, smooth, h) -> Advance:
+    def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact]:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
         # An impact noticed up to a step late is that much too fast, which keeps rebounds of up to e/(1 - e) steps alive.
         e = mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
         next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
-        return Advance(y, next_contact, h, jnp.abs(y[y.shape[0] // 2 + mechanics.tangential]))
+        return y, next_contact
 
 
 def _weighted(weights, stages: list[State]) -> State:

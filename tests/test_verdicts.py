@@ -8,7 +8,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
-from fivjax.orbit import Resolution, new_orbit, observe
+from fivjax.orbit import Resolution, new_orbit, observe, rise_between
 from fivjax.sliding import envelope, envelope_peak, linear_sliding, slides_forever, sliding_modes
 
 
@@ -99,7 +99,15 @@ def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True, decay=1.0):
         resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
         step = jax.jit(
             lambda orbit, before, after, changed, t: observe(
-                orbit, jnp.ones(4), jnp.zeros(4), 0, before, after, changed, jnp.abs(after[2]), t, decay, resolution
+                orbit,
+                jnp.ones(4),
+                jnp.zeros(4),
+                rise_between(before, after, 0),
+                changed,
+                jnp.abs(after[2]),
+                t,
+                decay,
+                resolution,
             )
         )
         orbit, when = new_orbit(jnp.zeros(4)), None
