@@ -272,7 +272,7 @@ def _find_attractors(batch: Batch, shared: Packed, groups: np.ndarray, columns: 
     `columns` are those of any lane of each group.
     """
     structure, members = batch.scene.structure, len(attractors.RELEASES)
-    known, slowest_decay = shared.tree.attractor, shared.tree.modes.slowest_decay
+    cycles, slowest_decay = shared.tree.attractor, shared.tree.modes.slowest_decay
     own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
     running, moving = np.arange(len(own)), np.ones(len(own), bool)
     lanes = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
@@ -301,8 +301,8 @@ def _find_attractors(batch: Batch, shared: Packed, groups: np.ndarray, columns: 
             open_ = np.unique(running // members)
             for k, cycle in zip(open_, batch.pool.map(cycle_of, open_), strict=True):
                 if cycle is not None:
-                    known.crossings[groups[k]], known.amplitude[groups[k]] = cycle
-            over |= known.known[own[running]]
+                    cycles.crossings[groups[k]], cycles.amplitude[groups[k]] = cycle
+            over |= cycles.known[own[running]]
         running, lanes = running[~over], lanes.closed_up(np.flatnonzero(~over))
 
 

@@ -57,6 +57,37 @@ def test_states_and_events_agree_with_the_oracle(name):
     assert len(seen) >= 2
 
 
+def rises(method, scene: fj.Scene, t1: float) -> np.ndarray:
+    """The states at all rises of the tangential velocity through zero up to `t1`, as the method sees them."""
+    with jax.enable_x64(True):
+        prepared = prepared_for(method, scene)
+        q, _ = steady_sliding(scene, scene.load.force)
+        y = jnp.concatenate([q, jnp.zeros_like(q)])
+        contact, t, seen = status_from_forces(Mechanics(scene), scene.load(0.0), y), jnp.zeros(()), []
+        while t < t1:
+            after, t = advanced(method, prepared, scene, contact, y, t, jnp.asarray(t1))
+            if after.rise.happened:
+                seen.append(np.asarray(after.rise.at))
+            y, contact = after.y, after.contact
+        return np.array(seen)
+
+
+def test_rises_within_an_advance_are_where_the_series_stepper_ends_its_own():
+    """Read off the samples of a window, to a hundredth; and on a periodic orbit they are the same ones each time."""
+    scene = scene_of(dict(mu=0.2, belt_speed=1.0, p=2.0))
+    exact, read = rises(fj.EventExact(), scene, 4.0), rises(Windowed(), scene, 4.0)
+    with jax.enable_x64(True):
+        weights = np.asarray(scene.structure.weights)
+    equilibrium = np.concatenate([fj.sliding_equilibrium(scene), np.zeros(3)])
+    exact, read = weights * (exact - equilibrium), weights * (read - equilibrium)
+    assert 0.9 * len(exact) < len(read) <= len(exact)
+    sizes = np.linalg.norm(read, axis=1)
+    apart = np.linalg.norm(read[:, None] - exact, axis=2).min(axis=1)
+    assert np.max(apart / sizes) < 0.01
+    again = np.linalg.norm(read[-1] - read[-12:-1], axis=1) / sizes[-1]
+    assert again.min() < 1e-8
+
+
 def random_scene(rng: np.random.Generator, n: int) -> fj.Scene:
     """Any symmetric structure of n coordinates, pressed on firmly enough to touch, on a belt that runs either way."""
 
