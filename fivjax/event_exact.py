@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Float
 from . import arguments
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution, rise_between
+from .orbit import Resolution
 from .scene import Scene
-from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_by
+from .steppers import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_between, advance_by
 
 # A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
 # If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
@@ -119,8 +119,7 @@ class EventExact(AbstractStepper):
         reached = physics.on_constraint(mechanics, contact, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        peak = jnp.abs(y_next[n + mechanics.tangential])
-        return Advance(y_next, next_contact, x * reach * unit, peak, rise_between(y, y_next, mechanics.tangential))
+        return advance_between(y, y_next, next_contact, x * reach * unit, mechanics.tangential)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]

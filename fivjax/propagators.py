@@ -156,12 +156,7 @@ def _rise(
     slope = 2 * (3 * way - 2 * before[n:] - after[n:])
     bend = 3 * (before[n:] + after[n:] - 2 * way)
     value, first, second = before[n + tangential], slope[tangential], bend[tangential]
-    root = jnp.sqrt(jnp.maximum(first**2 - 4 * second * value, 0.0))
-    # Two forms of one root, each free of cancellation where it is used.
-    rising = first >= 0
-    below = jnp.where(rising, first + root, 2 * second)
-    x = jnp.where(rising, -2 * value, root - first) / jnp.where(below == 0, 1.0, below)
-    x = jnp.clip(x, 0.0, 1.0)
+    x = jnp.clip(_parabola_root(-value, -first, -second), 0.0, 1.0)
     velocity = before[n:] + x * (slope + x * bend)
     velocity = jnp.where(jnp.arange(n)[:, None] == tangential, 0.0, velocity)
     return jnp.concatenate([before[:n] + h * x * (before[n:] + x * (slope / 2 + x * bend / 3)), velocity])
@@ -359,14 +354,9 @@ class _Series(eqx.Module):
         zeros, lead = _start(c, self.sizes[:6].reshape(3, 2, -1), self.exact)
         spent = inside & (lead < 0)
         crosses = inside & (lead >= 0) & (end <= 0)
-        # The first root of the parabola with this start, slope and end, in the form that does not cancel.
         slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
         bend = end - lead - slope
-        root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
-        rises = slope > 0
-        half = 0.5 * jnp.where(rises, slope + root, root - slope)
-        below = jnp.where(rises, bend, half)
-        guess = jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
+        guess = _parabola_root(lead, slope, bend)
         bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
         # With allowance for what is not parabolic.
         dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
@@ -390,6 +380,15 @@ def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
     return [
         rows[end - math.prod(shape) : end].reshape(*shape, -1) for shape, end in zip(shapes, ends.tolist(), strict=True)
     ]
+
+
+def _parabola_root(lead: Array, slope: Array, bend: Array) -> Array:
+    """Where lead + slope x + bend x² first falls to zero, if it does; in the form that does not cancel."""
+    root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
+    rises = slope > 0
+    half = 0.5 * jnp.where(rises, slope + root, root - slope)
+    below = jnp.where(rises, bend, half)
+    return jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
 
 
 def _chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array, "*x l"]:

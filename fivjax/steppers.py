@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution, Rise
+from .orbit import Resolution, Rise, rise_between
 from .scene import Scene
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
@@ -59,6 +59,12 @@ class Advance(NamedTuple):
     h: Float[Array, ""]  # how far it came, s
     peak: Float[Array, ""]  # largest tangential speed it saw, m/s
     rise: Rise
+
+
+def advance_between(before: State, y: State, contact: Contact, h: Float[Array, ""], tangential: int) -> Advance:
+    """An advance from one state to another that knows of what lay between only what these two say."""
+    peak = jnp.abs(y[y.shape[0] // 2 + tangential])
+    return Advance(y, contact, h, peak, rise_between(before, y, tangential))
 
 
 class Within(NamedTuple):

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 from . import arguments
 from . import contact as physics
 from .contact import Contact, Mechanics, State
-from .orbit import Resolution, rise_between
+from .orbit import Resolution
 from .scene import Scene
-from .steppers import AbstractStepper, Advance, StepperState, Within, rates
+from .steppers import AbstractStepper, Advance, StepperState, Within, advance_between, rates
 
 
 class WhereSwitched(AbstractStepper):
@@ -78,8 +78,7 @@ class WhereSwitched(AbstractStepper):
     ) -> Advance:
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
         y_next, next_contact = self._switched(mechanics, contact, load, smooth, h)
-        peak = jnp.abs(y_next[y.shape[0] // 2 + mechanics.tangential])
-        return Advance(y_next, next_contact, h, peak, rise_between(y, y_next, mechanics.tangential))
+        return advance_between(y, y_next, next_contact, h, mechanics.tangential)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
