@@ -15,22 +15,26 @@ import jax
 import numpy as np
 import tyro
 
-from . import cea, plot, plot_calibration, plot_energy, plot_linear
-from .calibrate import calibrate
-from .event_exact import EventExact
-from .friction import Coulomb, ExponentialDecay
-from .load import Pulse
-from .maps import bistability_map
-from .reproduce import reproduce
-from .results import check_writable, save, save_figure
-from .scene import Scene
-from .signals import read_recording
-from .simulate import simulate
-from .steppers import AbstractStepper
-from .structure import belt_oscillator
-from .tradeoff import table, tradeoff
-from .verdict import Verdict
-from .where_switched import WhereSwitched
+from .calibration.fit import calibrate
+from .io.datasets import check_writable, save, save_figure
+from .io.recordings import read_recording
+from .linear import cea
+from .maps.bistability import bistability_map
+from .maps.tradeoff_study import table, tradeoff
+from .model.friction import Coulomb, ExponentialDecay
+from .model.load import Pulse
+from .model.scene import Scene
+from .model.structure import belt_oscillator
+from .paper.report import reproduce
+from .plot import calibration as plot_calibration
+from .plot import energy as plot_energy
+from .plot import linear as plot_linear
+from .plot import results as plot
+from .simulation.trajectory import simulate
+from .steppers.base import AbstractStepper
+from .steppers.event_exact import EventExact
+from .steppers.where_switched import WhereSwitched
+from .verdicts.verdict import Verdict
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,9 @@ def run(folder: Path, name: str = "none", delay: float = 0.0, cache: Path | None
 
 
 def main(folder: str, name: str, delay: str) -> int:
-    from fivjax import cli, lanes, maps
+    from fivjax import cli
+    from fivjax.maps import bistability as maps
+    from fivjax.maps import engine as lanes
 
     lanes.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
     keep = maps.checkpoint.keep

@@ -11,7 +11,7 @@ import linear_reference as reference
 import numpy as np
 
 import fivjax as fj
-from fivjax import cea, design
+from fivjax.linear import cea, design
 
 
 def heading(text):

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 import fivjax as fj
-from fivjax import energy as accounts
+from fivjax.simulation import energy as accounts
 
 
 def scene(**changes) -> fj.Scene:

@@ -28,10 +28,10 @@ import refusing
 import xarray as xr
 
 import fivjax as fj
-from fivjax import lanes as engine
-from fivjax.simulate import start_state, states_at
-from fivjax.steppers import MOST_ADVANCES
-from fivjax.verdict import Verdict
+from fivjax.maps import engine as engine
+from fivjax.simulation.trajectory import start_state, states_at
+from fivjax.steppers.base import MOST_ADVANCES
+from fivjax.verdicts.verdict import Verdict
 
 COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
 ASKED = int(os.environ.get("EXTREMES_ASKED", "300"))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax import lanes
-from fivjax.attractor import KEPT, REACHED, SEEN, Approach, Attractor, Ensemble, approached, met, no_approach
+from fivjax.maps import engine as lanes
+from fivjax.verdicts.ensemble import KEPT, REACHED, SEEN, Approach, Attractor, Ensemble, approached, met, no_approach
 
 LOOKS, MEMBERS, DECAY = 60, 16, 1.0
 GOLDEN = (np.sqrt(5) - 1) / 2

@@ -12,14 +12,15 @@ import xarray as xr
 from recordings import FREE, case, clean, noisy, off, paper, recording, times
 
 import fivjax as fj
-from fivjax import cli, features
-from fivjax.calibrate import UNSTABLE, Outcome, _covariance
-from fivjax.cycle_misfit import BEATS, cycle_misfit, cycle_rate
-from fivjax.least_squares import Evaluated, minimise
-from fivjax.parameters import FreeParameters
-from fivjax.plot_calibration import calibration
-from fivjax.signals import averaged
-from fivjax.stages import Problem, _Comparison, _growth
+from fivjax import cli
+from fivjax.calibration import features
+from fivjax.calibration.cycle_misfit import BEATS, cycle_misfit, cycle_rate
+from fivjax.calibration.fit import UNSTABLE, Outcome, _covariance
+from fivjax.calibration.least_squares import Evaluated, minimise
+from fivjax.calibration.parameters import FreeParameters
+from fivjax.calibration.stages import Problem, _Comparison, _growth
+from fivjax.io.recordings import averaged
+from fivjax.plot.calibration import calibration
 
 
 def scores(fit, scene):

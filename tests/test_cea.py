@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize_scalar
 
 import fivjax as fj
-from fivjax import cea, stability
-from fivjax.critical import Mechanism, Outcome
-from fivjax.elimination import solve
+from fivjax.foundation.linear_solve import solve
+from fivjax.linear import cea
+from fivjax.linear import routh_hurwitz as stability
+from fivjax.linear.critical import Mechanism, Outcome
 
 # μ_crit is a root where the growth rate has a slope of some 500/s and rounding of some 1e-12/s: both routes agree to 1e-14.
 MU_CRIT = reference.critical_friction()

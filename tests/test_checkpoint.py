@@ -12,7 +12,9 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax import checkpoint, cli, lanes
+from fivjax import cli
+from fivjax.maps import engine as lanes
+from fivjax.maps import store as checkpoint
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 

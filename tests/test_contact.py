@@ -11,7 +11,7 @@ import pytest
 import fivjax as fj
 from fivjax import contact as physics
 from fivjax.contact import Contact, Mechanics, Rest, Status
-from fivjax.scene import steady_sliding
+from fivjax.model.scene import steady_sliding
 
 # Sums of a dozen products and one small linear solve with a well-conditioned mass matrix.
 ROUNDING = 1e-12

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax import cea, design
-from fivjax.critical import Outcome
-from fivjax.design import DesignOutcome
+from fivjax.linear import cea, design
+from fivjax.linear.critical import Outcome
+from fivjax.linear.design import DesignOutcome
 
 ROUTES = ["eigenvalues", "routh-hurwitz"]
 STARTS = np.random.default_rng(2025).uniform(0.0, 1.0, 20)

@@ -13,12 +13,12 @@ import pytest
 from test_simulate import CASES, scene_of
 
 import fivjax as fj
-from fivjax import energy as accounts
-from fivjax import plot_energy
 from fivjax.contact import Mechanics, Status
-from fivjax.lane import measured_from_rest
-from fivjax.lanes import run_to_verdict
-from fivjax.verdict import Verdict
+from fivjax.maps.engine import run_to_verdict
+from fivjax.maps.lane import measured_from_rest
+from fivjax.plot import energy as plot_energy
+from fivjax.simulation import energy as accounts
+from fivjax.verdicts.verdict import Verdict
 
 # What the issue of this ledger asks for is 1e-10 of the energy exchanged; rounding over some 10⁴ advances is this.
 CLOSED = 1e-13

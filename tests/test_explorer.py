@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import fivjax as fj
-from fivjax import display, results
+from fivjax.io import datasets as results
+from fivjax.notebook import display
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fivjax.packed import MOVED_AT_ONCE, packed
+from fivjax.maps.packed import MOVED_AT_ONCE, packed
 
 
 def tree_of(rows: int):

@@ -5,7 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import fivjax as fj
-from fivjax import cea, plot_linear
+from fivjax.linear import cea
+from fivjax.plot import linear as plot_linear
 
 
 def test_eigenvalues_are_drawn_with_the_limit():

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import fivjax as fj
-from fivjax import plot
+from fivjax.plot import results as plot
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
-from fivjax.lane import next_step_end
-from fivjax.propagators import Windowed, propagators
-from fivjax.scene import steady_sliding
+from fivjax.maps.lane import next_step_end
+from fivjax.model.scene import steady_sliding
+from fivjax.steppers.windowed import Windowed, propagators
 
 
 @eqx.filter_jit

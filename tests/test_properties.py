@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 import fivjax as fj
 from fivjax import contact as physics
-from fivjax import lanes
 from fivjax.contact import Mechanics, Status
+from fivjax.maps import engine as lanes
 
 # Few and repeatable: every example runs a trajectory. One compilation serves all of a kind.
 FEW = settings(max_examples=12, deadline=None, derandomize=True)

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from refusing import refused, refused_on_the_command_line, untouched
 
 import fivjax as fj
-from fivjax import cli, results
+from fivjax import cli
+from fivjax.io import datasets as results
 
 
 class EngineReached(BaseException):

@@ -8,7 +8,8 @@ import xarray as xr
 from refusing import refused, refused_on_the_command_line, untouched
 
 import fivjax as fj
-from fivjax import checkpoint, cli
+from fivjax import cli
+from fivjax.maps import store as checkpoint
 
 T = np.arange(64) * 1e-3
 A = np.sin(400.0 * T)

@@ -8,8 +8,10 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax import cli, paper, spectra
-from fivjax.reproduce import report
+from fivjax import cli
+from fivjax.paper import scenes as paper
+from fivjax.paper import spectra
+from fivjax.paper.report import report
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import scipy.io
 from scipy.io import wavfile
 
 import fivjax as fj
-from fivjax.signals import Channel, averaged
+from fivjax.io.recordings import Channel, averaged
 
 RATE = 1000.0
 T = np.arange(40) / RATE

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.simulate import start_state, states_at
-from fivjax.steppers import MOST_ADVANCES
+from fivjax.simulation.trajectory import start_state, states_at
+from fivjax.steppers.base import MOST_ADVANCES
 
 T1 = 0.3
 

@@ -7,7 +7,7 @@ import oracle
 import pytest
 
 import fivjax as fj
-from fivjax.tradeoff import recommend, table
+from fivjax.maps.tradeoff_study import recommend, table
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,10 @@ import pytest
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
-from fivjax.orbit import Resolution, new_orbit, observe, rise_between
-from fivjax.sliding import envelope, envelope_peak, linear_sliding, slides_forever, sliding_modes
+from fivjax.linear.linearisation import linear_sliding
+from fivjax.steppers.section import Resolution, rise_between
+from fivjax.verdicts.recurrence import new_orbit, observe
+from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
 
 
 def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):

@@ -1,0 +1,158 @@
+"""A measured limit cycle beside that of a scene: frequency, harmonics, and fractions of time in the statuses.
+
+Both are exact. The recording's come from all of its samples with the errors that its noise makes (`features`); the scene's
+from one closed period (`shooting`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..io.recordings import Averaged, Channel, Recording, averaged
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+from . import features
+from .misfit import AbstractMisfit, Compared, noise_of_means, sliding_frequencies
+from .shooting import Cycle, around, settled
+
+MOST_HARMONICS = 8
+# Blocks per period: many, because landings are short; the least and the most.
+CYCLE_BLOCKS = (28, 48)
+# A recording need not hold more periods than these for its lines to be told apart.
+CYCLE_PERIODS = 30
+# Errors of a guess: of the frequency, relative; of lines, as shares of the largest; of fractions of time, of it all.
+ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
+# What lies about the fundamental without being part of it, relative: from here on a vibration beats.
+BEATS = 0.01
+
+
+class CycleMisfit(AbstractMisfit):
+    """A limit cycle by its harmonics and, where they were measured, its fractions of time in the statuses."""
+
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    measured: Float[Array, " h"]
+    whitening: Float[Array, "h h"]
+    fractions: Float[
+        Array, "2 2"
+    ]  # sticking, detached; value and standard deviation, which is infinite if not measured
+    method: AbstractStepper
+    width: Float[Array, ""]  # of a block, s
+    fundamental: Float[Array, "2"]  # of the first channel at the first block's middle, as measured: cosine and sine
+    beating: Float[Array, ""]  # size of what lies between the harmonics, relative
+    count: int = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    fitted_by_elimination: int = eqx.field(static=True, default=0)
+
+    @property
+    def frequency(self) -> Float[Array, ""]:
+        """As measured, Hz."""
+        return self.measured[0]
+
+    def settled(self, scene: Scene) -> Cycle:
+        """The limit cycle that the scene settles on, nearly."""
+        return settled(scene.replace(**self.known), self.method, self.frequency)
+
+    def compared(self, scene, own: Cycle, share):
+        scene = scene.replace(**self.known)
+        after = around(scene, self.method, own, self.count)
+        lines = self._averaged(after.lines, own.period)
+        found = _referred(1 / own.period, lines)
+        times = self.fractions[:, 0] - after.fractions
+        exactly = jnp.concatenate([self.whitening @ (self.measured - found), times / self.fractions[:, 1]])
+        size = self.measured[1]
+        error = jnp.full(found.shape, ROUGH_LINES * size).at[0].set(ROUGH_FREQUENCY * self.measured[0])
+        rough = times / jnp.maximum(self.fractions[:, 1], ROUGH_FRACTIONS)
+        roughly = jnp.concatenate([(self.measured - found) / error, rough])
+        residual = jnp.where(share < 1, roughly, exactly)
+        return Compared(residual, self._in_time(lines, own.period), after.y - own.y, after.contact)
+
+    def _averaged(self, lines, period):
+        """Lines of the channels' means over blocks."""
+        orders = jnp.arange(1, self.count + 1)
+        columns = []
+        for quantity, coordinate in self.channels:
+            rate = 2j * jnp.pi * orders / period if quantity == "acceleration" else 1.0
+            columns.append(rate * lines[:, coordinate] * jnp.sinc(orders * self.width / period))
+        return jnp.stack(columns, axis=1)
+
+    def _in_time(self, lines, period):
+        """These lines over the blocks of the recording, in step with it."""
+        orders = jnp.arange(1, self.count + 1)
+        phase = jnp.angle(self.fundamental[0] - 1j * self.fundamental[1]) - jnp.angle(lines[0, 0])
+        turns = 2 * jnp.pi * self.width / period * jnp.arange(self.means.shape[0])[:, None] + phase
+        return (jnp.exp(1j * turns * orders) @ lines).real
+
+
+def _referred(frequency, found):
+    """`features.referred`, to be differentiated."""
+    size = jnp.sqrt(found[0, 0].real ** 2 + found[0, 0].imag ** 2)
+    turned = found * (found[0, 0].conj() / size) ** jnp.arange(1, found.shape[0] + 1)[:, None]
+    rest = turned.ravel()[1:]
+    return jnp.concatenate([jnp.stack([frequency, size]), rest.real, rest.imag])
+
+
+def cycle_misfit(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> CycleMisfit:
+    """A recording of a limit cycle, averaged over blocks, ready to be compared."""
+    width = float(blocks.edges[1] - blocks.edges[0])
+    sigma = noise_of_means(recording, blocks)
+    lowest, highest = _searched(scene, recording)
+    frequency = features.harmonics(blocks.means, width, 1, lowest, highest, sigma).frequency
+    count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
+    lowest, highest = 0.6 * frequency, 1.6 * frequency
+    frequency = features.harmonics(blocks.means, width, count, lowest, highest, sigma).frequency
+    left, lines = features.without_lines(blocks.means, width, frequency, count)
+    if recording.noise is None:
+        # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
+        sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / max(len(left) - 2 * count - 1, 1)))
+    measured = features.harmonics(blocks.means, width, count, lowest, highest, sigma)
+    fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
+    of_samples = sigma * np.sqrt(blocks.per_block)
+    return CycleMisfit(
+        means=jnp.asarray(blocks.means),
+        sigma=jnp.asarray(sigma),
+        known={name: jnp.asarray(value) for name, value in recording.known.items()},
+        measured=jnp.asarray(measured.values),
+        whitening=jnp.asarray(np.linalg.inv(np.linalg.cholesky(measured.covariance))),
+        fractions=jnp.asarray(fractions),
+        method=method,
+        width=jnp.asarray(width),
+        fundamental=jnp.asarray([lines[0, 0].real, -lines[0, 0].imag]),
+        beating=jnp.asarray(features.between_lines(recording.values, 1 / recording.rate, frequency, of_samples)),
+        count=count,
+        channels=recording.channels,
+    )
+
+
+def cycle_rate(recording: Recording, scene: Scene) -> float:
+    """Blocks per second for a limit cycle, so many to a period that what averaging folds down lies between its lines."""
+    blocks = averaged(recording, 16 * sliding_frequencies(scene, recording).max())
+    width = float(blocks.edges[1] - blocks.edges[0])
+    frequency = features.harmonics(
+        blocks.means, width, 1, *_searched(scene, recording), noise_of_means(recording, blocks)
+    ).frequency
+    samples = recording.rate / frequency
+    choices = np.arange(max(1, int(samples / CYCLE_BLOCKS[1])), max(2, int(samples / CYCLE_BLOCKS[0]) + 1))
+    return recording.rate / float(choices[np.argmin([_folded(samples / choice) for choice in choices])])
+
+
+def _folded(per_period: float) -> float:
+    """How much of the lines around each multiple of the block rate is taken for fitted lines, in units of a flat spectrum.
+
+    Averaging leaves a share h/(m r) of what lies next to m times the rate of r blocks per period, for the line h; the
+    taper keeps out what is folded down far enough from it.
+    """
+    m = np.arange(1, 13)
+    aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
+    t = np.linspace(0, 1, 401)
+    taper = features.taper(len(t))
+    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ taper) / taper.sum()
+    return float(np.sum(seen * MOST_HARMONICS / (m * per_period)))
+
+
+def _searched(scene: Scene, recording: Recording) -> tuple[float, float]:
+    """The fundamental is sought where the sliding modes are: a start 30 % off in a spring is 16 % off in frequency."""
+    modes = sliding_frequencies(scene, recording)
+    return 0.6 * modes.min(), 1.6 * modes.max()

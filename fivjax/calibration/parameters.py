@@ -1,0 +1,111 @@
+"""Free parameters of a fit: their names, their bounds, and the unbounded numbers that an optimiser moves."""
+
+from collections.abc import Iterable, Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..foundation import arguments
+from ..model.scene import Scene
+
+# Parameters that may be negative; all others are positive.
+SIGNED = ("theta", "belt_speed")
+HIGHEST = {"restitution": 1.0}
+
+
+class FreeParameters(eqx.Module):
+    r"""Which parameters are free, and where.
+
+    Between two bounds $x = l + (h - l) / (1 + e^{-u})$, above one $x = l + e^u$, without any $x = s u$; so the optimiser
+    never leaves the bounds. `scale` says what a large change of a parameter is: its size, or the width of its bounds.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    lower: Float[np.ndarray, " k"]
+    upper: Float[np.ndarray, " k"]
+    size: Float[np.ndarray, " k"]
+
+    def __init__(self, scene: Scene, free: Iterable[str], bounds: Mapping[str, tuple[float, float]] | None = None):
+        if isinstance(free, str):
+            raise TypeError(f'Argument `free` must be a list of names, such as ["{free}"], but is {free!r} (str).')
+        names = tuple(free)
+        if not names:
+            raise ValueError("Argument `free` must name at least one parameter, but is empty.")
+        bounds = {} if bounds is None else dict(bounds)
+        known = scene.parameters
+        for name in (*names, *bounds):
+            if name not in known:
+                raise ValueError(f"Scene has no parameter `{name}`; it has: {', '.join(sorted(known))}.")
+        if len(set(names)) != len(names):
+            raise ValueError(f"Argument `free` names a parameter twice: {', '.join(names)}.")
+        for name in bounds:
+            if name not in names:
+                raise ValueError(
+                    f"Argument `bounds` names `{name}`, which is not among the free ones: {', '.join(names)}."
+                )
+        lower, upper, size, kinds = [], [], [], []
+        for name in names:
+            value = float(known[name])
+            low, high = _bound(name, bounds.get(name))
+            if not low < value < high:
+                raise ValueError(
+                    f"Parameter `{name}` must start inside its bounds ({low:g}, {high:g}), but is {value:g} in the scene. "
+                    f"Widen `bounds`, or start elsewhere with `scene.replace`."
+                )
+            lower.append(low)
+            upper.append(high)
+            kinds.append("both" if np.isfinite([low, high]).all() else "lower" if np.isfinite(low) else "none")
+            size.append(abs(value) if value else min(1.0, high - low))
+        self.names, self.kinds = names, tuple(kinds)
+        self.lower, self.upper, self.size = np.array(lower), np.array(upper), np.array(size)
+
+    def values(self, u: Float[Array, " k"]) -> Float[Array, " k"]:
+        """The parameters, in their own units."""
+        found = []
+        for k, kind in enumerate(self.kinds):
+            if kind == "both":
+                # tanh neither overflows nor loses its derivative to an inf - inf.
+                share = 0.5 * (1.0 + jnp.tanh(0.5 * u[k]))
+                found.append(self.lower[k] + (self.upper[k] - self.lower[k]) * share)
+            elif kind == "lower":
+                found.append(self.lower[k] + self.size[k] * jnp.exp(u[k]))
+            else:
+                found.append(self.size[k] * u[k])
+        return jnp.stack(found)
+
+    def unbounded(self, values) -> np.ndarray:
+        """What `values` makes of these are `values`; they are moved inside the bounds first."""
+        found = []
+        for k, kind in enumerate(self.kinds):
+            value = float(values[k])
+            if kind == "both":
+                width = self.upper[k] - self.lower[k]
+                share = np.clip((value - self.lower[k]) / width, 1e-3, 1 - 1e-3)
+                found.append(np.log(share / (1 - share)))
+            elif kind == "lower":
+                found.append(np.log(max(value - self.lower[k], 1e-3 * self.size[k]) / self.size[k]))
+            else:
+                found.append(value / self.size[k])
+        return np.array(found)
+
+    def scene(self, scene: Scene, u: Float[Array, " k"]) -> Scene:
+        """The scene with these parameters."""
+        values = self.values(u)
+        return scene.replace(**{name: values[k] for k, name in enumerate(self.names)})
+
+
+def _bound(name: str, bound) -> tuple[float, float]:
+    lowest = -np.inf if name in SIGNED else 0.0
+    highest = HIGHEST.get(name, np.inf)
+    if bound is None:
+        return lowest, highest
+    array = arguments.numeric_array(f"bounds[{name!r}]", bound).astype(np.float64)
+    if array.shape != (2,) or np.any(np.isnan(array)) or not array[0] < array[1]:
+        raise ValueError(f"Argument `bounds[{name!r}]` must be a pair that goes up, but is {bound!r}.")
+    low, high = max(float(array[0]), lowest), min(float(array[1]), highest)
+    if np.isfinite(high) and not np.isfinite(low):
+        raise ValueError(f"Argument `bounds[{name!r}]` must also have a finite lower end, but is {bound!r}.")
+    return low, high

@@ -1,0 +1,120 @@
+r"""Periodic motion by shooting: one period through every contact event, and what it takes to close it.
+
+A limit cycle is a state that comes back to itself after one period. With $Φ(y, T)$ the motion from y over a time T,
+
+$$Φ(y, T) - y = 0$$
+
+determines the period and all components of the state but one: the tangential velocity, whose value only says where on the
+cycle one looks. Newton's method meets it to rounding however slowly the motion settles, and the same equation gives the
+derivatives, over a single period. (Differentiating a motion that settles would carry along a phase that turns by thousands
+of degrees on the way.)
+
+Fourier coefficients are integrals over exactly one period. Where the contact closes, velocities jump and accelerations are
+impulses; but the coefficients of an acceleration are those of its velocity, differentiated.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from ..contact import Contact, Mechanics, State, Status, status_from_forces
+from ..model.scene import Scene, steady_sliding
+from ..steppers.base import MOST_ADVANCES, AbstractStepper, Within, advance_adding
+
+# From its first, arbitrary state a motion is followed for so many periods before it is taken for nearly periodic.
+SETTLING_PERIODS = 80
+# Then it is looked at so often per expected period, to see where it comes back to itself.
+LOOKS = 48
+# Periods that are tried, in units of the expected one.
+SHORTEST, LONGEST = 0.6, 1.7
+
+
+class Cycle(NamedTuple):
+    """A guess of a periodic motion: a state on it and how long it takes to come back. NaN where there is none."""
+
+    y: State
+    contact: Contact
+    period: Float[Array, ""]  # s
+
+    def unknowns(self, tangential: int) -> Float[Array, " 2n"]:
+        """What closes the cycle: the state, with the period in place of the tangential velocity."""
+        return self.y.at[self.y.shape[0] // 2 + tangential].set(self.period)
+
+    def at(self, unknowns: Float[Array, " 2n"], tangential: int) -> "Cycle":
+        """The cycle with these unknowns."""
+        where = unknowns.shape[0] // 2 + tangential
+        return Cycle(unknowns.at[where].set(self.y[where]), self.contact, unknowns[where])
+
+
+class Around(NamedTuple):
+    """One period of a motion that may not be closed yet."""
+
+    y: State  # at its end
+    contact: Contact
+    lines: Complex[Array, "count n"]  # of the velocities: v(t) = Re sum of c_h exp(2πi h t / period), m/s
+    fractions: Float[Array, "2"]  # of the time, sticking and detached
+
+
+def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
+    """The motion under the final load after a kick almost as fast as the belt, which is outside everything that dies out.
+
+    Where its tangential velocity rises through zero, and after about how long, near 1/`frequency` (Hz), it is nearly back.
+    """
+    mechanics, load = Mechanics(scene), scene.load.final
+    n, tangential = scene.structure.size, scene.structure.tangential
+    q, _ = steady_sliding(scene, load)
+    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + tangential].set(0.9 * scene.belt_speed)
+
+    def to_next(carry, h):
+        y, contact = carry
+        y, contact, _, reached = advance_adding(
+            method, mechanics, contact, load, y, h, MOST_ADVANCES, None, lambda *_: None, "lax"
+        )
+        y = jnp.where(reached, y, jnp.nan)
+        return (y, contact), (y, contact)
+
+    longest = int(LONGEST * LOOKS) + 1
+    spans = jnp.full(2 * longest + 1, 1 / (LOOKS * frequency)).at[0].set(SETTLING_PERIODS / frequency)
+    _, (states, contacts) = jax.lax.scan(to_next, (y0, status_from_forces(mechanics, load, y0)), spans)
+    speed = states[:, n + tangential]
+    rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
+    begin = jnp.argmax(rises) + 1
+    y = states[begin]
+    apart = jnp.sum((scene.structure.weights * (states - y)) ** 2, axis=1)
+    later = jnp.arange(states.shape[0]) - begin
+    tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS)
+    back = jnp.argmin(jnp.where(tried & jnp.isfinite(apart), apart, jnp.inf))
+    # What no longer moves, and what slides at rest, is no cycle.
+    moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.abs(scene.belt_speed))
+    period = jnp.where(moves, (back - begin) / (LOOKS * frequency), jnp.nan)
+    return Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
+
+
+def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
+    """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable, forward."""
+    mechanics, load = Mechanics(scene), scene.load.final
+    codes = jnp.array([Status.STICK, Status.DETACH])
+    none = jnp.zeros_like(cycle.period)
+
+    def add(total, contact, y, after):
+        t, lines, spent = total
+        within = method.within(mechanics, contact, load, y, after.h)
+        spent = spent + jnp.where(contact.status == codes, after.h, 0.0)
+        return t + after.h, lines + _integrals(within, t, cycle.period, count), spent
+
+    total = (none, jnp.zeros((count, 2, scene.structure.size)), jnp.zeros(2))
+    y, contact, (_, lines, spent), reached = advance_adding(
+        method, mechanics, cycle.contact, load, cycle.y, cycle.period, MOST_ADVANCES, total, add, "lax"
+    )
+    lines = (2 / cycle.period) * (lines[:, 0] - 1j * lines[:, 1])
+    return Around(jnp.where(reached, y, jnp.nan), contact, lines, spent / cycle.period)
+
+
+def _integrals(within: Within, t, period, count: int) -> Float[Array, "count 2 n"]:
+    """Of velocities times cosines and sines over one advance that begins at t; m."""
+    n = within.states.shape[1] // 2
+    turns = 2 * jnp.pi * jnp.arange(1, count + 1)[:, None] * ((t + within.times) / period)
+    waves = jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)
+    return (waves * within.weights) @ within.states[:, n:]

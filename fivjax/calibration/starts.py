@@ -1,0 +1,57 @@
+"""Where fits set out from: a scene's own parameters, and others around them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..foundation.compiling import compiled
+from ..linear.linearisation import linear_sliding
+from ..model.scene import Scene
+from .parameters import FreeParameters
+
+# Scenes that are looked at, by their sliding modes alone, for each that is followed to its limit cycle.
+TRIED_PER_START = 128
+# How close to the measured frequency two sliding modes are sought: a limit cycle vibrates where modes have come together.
+CLOSE = 0.03
+
+
+def hypercube(
+    parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int
+) -> Float[np.ndarray, "s k"]:
+    """Unbounded numbers of the scene's own values, then of others up to `spread` (relative) beside them: a Latin hypercube."""
+    own = np.array([float(scene.parameters[name]) for name in parameters.names])
+    rng = np.random.default_rng(seed)
+    strata = np.stack([rng.permutation(count - 1) for _ in own], axis=1) + rng.random((count - 1, len(own)))
+    factors = 1 + spread * (2 * strata / max(count - 1, 1) - 1)
+    return np.array([parameters.unbounded(values) for values in (own, *(own * factors))])
+
+
+def vibrating(
+    parameters: FreeParameters, scene: Scene, frequencies: list[float], count: int, spread: float, seed: int
+) -> Float[np.ndarray, "s k"]:
+    """The scene's own values, then such around them whose sliding modes lie at the measured frequencies (Hz).
+
+    A start that is `spread` too low lies `1/(1 - spread)` below the truth, so that far are they sought. Where fewer than
+    `count` have two modes close to the frequency, those that come closest.
+    """
+    own = np.array([float(scene.parameters[name]) for name in parameters.names])
+    rng = np.random.default_rng(seed)
+    widest = -np.log1p(-spread)
+    factors = np.exp(rng.uniform(-widest, widest, (TRIED_PER_START * count, len(own))))
+    tried = np.array([parameters.unbounded(values) for values in own * factors])
+    matrices = np.asarray(state_matrices(parameters, scene, jnp.asarray(tried)))
+    modes = np.abs(np.linalg.eigvals(matrices).imag) / (2 * np.pi)
+    apart = np.zeros(len(tried))
+    for frequency in frequencies:
+        # Both of a pair of eigenvalues count, so the second nearest mode is the third.
+        away = np.sort(np.abs(modes - frequency), axis=1)[:, min(2, modes.shape[1] - 1)]
+        apart = np.maximum(apart, away / frequency)
+    order = np.argsort(np.maximum(apart, CLOSE), kind="stable")[: count - 1]
+    return np.concatenate([parameters.unbounded(own)[None], tried[order]])
+
+
+@compiled
+def state_matrices(parameters: FreeParameters, scene: Scene, u: Float[Array, "s k"]) -> Float[Array, "s m m"]:
+    """Of steady sliding, at a batch of unbounded parameters."""
+    return jax.vmap(lambda u: linear_sliding(parameters.scene(scene, u)).matrix)(u)

@@ -1,0 +1,54 @@
+r"""The one physics: accelerations, contact forces, what ends a status, and what follows.
+
+A contact sticks (0), slides (1) or is detached (2). With the free acceleration $a^f = M^{-1}(fF - C\dot q - Kq)$ and the
+contact's compliance $G = E^T M^{-1} E$, $E = [e_t, e_n]$, every status is the free structure plus contact forces
+$a = a^f + M^{-1}(e_t T + e_n N)$ that keep what the status demands:
+
+| status | demands | forces |
+|---|---|---|
+| stick | $a_t = a_n = 0$ | $(T, N) = -G^{-1} (a^f_t, a^f_n)$ |
+| slide | $a_n = 0$, $T = \sigma \mu N$ | $N = -a^f_n / (G_{nn} + \sigma \mu G_{nt})$ |
+| detach | | $T = N = 0$ |
+
+with $\sigma = -\mathrm{sign}(\dot q_t - v_{belt})$. These are Eqs. 3, 6 and 5 of the paper, for any structure: the
+projection of the symmetric free matrices replaces typing each set in.
+
+A status lasts while its *guards* are positive: the two edges of the friction cone while sticking, N and the slip speed
+while sliding, the gap while detached. When one is used up, `transition` puts the state on its constraint, applies the
+impact law where the gap closed, and chooses the next status from the forces, never from which guard it was.
+
+Where a high load stores much more energy than a small vibration moves, states as totals cannot hold the vibration: its
+digits are lost in the rounding of what is at rest. `Mechanics.about` makes mechanics for displacements and loads that are
+deviations from a `Rest` instead. The free acceleration is then that under the contact forces at rest, and
+`sticking_forces`, `sliding_forces` and `forces_by_status` are what is *added* to those; `guards` and `contact_forces` are of
+the total forces either way.
+
+Everything here is about one contact at one instant; batches come from `jax.vmap`.
+"""
+
+from .forces import State as State
+from .forces import acceleration as acceleration
+from .forces import acceleration_under as acceleration_under
+from .forces import added_forces as added_forces
+from .forces import contact_forces as contact_forces
+from .forces import forces_by_status as forces_by_status
+from .forces import free_acceleration as free_acceleration
+from .forces import gap as gap
+from .forces import relative_velocity as relative_velocity
+from .forces import sliding_forces as sliding_forces
+from .forces import slip_speed as slip_speed
+from .forces import sticking_forces as sticking_forces
+from .forces import total_forces as total_forces
+from .guard import cone_margins as cone_margins
+from .guard import guards as guards
+from .guard import guards_under as guards_under
+from .impacts import impact as impact
+from .mechanics import Mechanics as Mechanics
+from .mechanics import Rest as Rest
+from .mode import Contact as Contact
+from .mode import Status as Status
+from .rounding import exactly_zero as exactly_zero
+from .rounding import magnitudes as magnitudes
+from .transitions import on_constraint as on_constraint
+from .transitions import status_from_forces as status_from_forces
+from .transitions import transition as transition

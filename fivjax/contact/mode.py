@@ -1,0 +1,21 @@
+"""The contact mode: what the contact does, and which way friction points while it slides."""
+
+import enum
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+
+class Status(enum.IntEnum):
+    """The paper's codes."""
+
+    STICK = 0
+    SLIDE = 1
+    DETACH = 2
+
+
+class Contact(eqx.Module):
+    """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides."""
+
+    status: Int[Array, ""]
+    direction: Float[Array, ""]

@@ -1,0 +1,1 @@
+"""Datasets and files: results with units and provenance, recordings."""

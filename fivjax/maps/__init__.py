@@ -1,0 +1,1 @@
+"""Many trajectories, each followed to its verdict: maps, critical kicks, what accuracy costs."""

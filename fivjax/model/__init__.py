@@ -1,0 +1,1 @@
+"""What is simulated: structure, friction law, load, scene."""

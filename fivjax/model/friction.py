@@ -1,0 +1,127 @@
+"""Friction laws: the coefficient of friction as a function of slip speed.
+
+A law is a callable of the slip speed |v_rel| ≥ 0 (m/s). Its direction, and whether the contact slides at all, is the
+business of `contact`. Laws are smooth in the slip speed, also a little below zero, so that a step may look past the
+instant where sliding ends.
+"""
+
+import abc
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.experimental.jet import jet
+from jaxtyping import Array, Float
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision, is_known, real
+
+
+class AbstractFriction(eqx.Module):
+    """What `contact` and `verdict` ask of a friction law."""
+
+    # Constant friction makes every status linear; exact methods rest on that.
+    constant: eqx.AbstractClassVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def static(self) -> Float[Array, ""]:
+        """The largest |T|/N that a sticking contact can hold."""
+
+    @abc.abstractmethod
+    def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
+        """The coefficient of friction while sliding at this slip speed."""
+
+    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
+        """The last Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one)."""
+        order = len(slip) - 1
+        derivatives = [math.factorial(k) * slip[k] for k in range(1, order + 1)]
+        _, series = jet(self.__call__, (slip[0],), (derivatives,))
+        return series[-1] / math.factorial(order)
+
+    @abc.abstractmethod
+    def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Bounds on |μ'| and |μ''| at and above this slip speed, for proofs about the future."""
+
+
+class Coulomb(AbstractFriction):
+    """Constant friction.
+
+    **Arguments:** `mu`, the coefficient while sliding; `mu_static`, the one that sticking can hold, `mu` unless given
+    (both without unit).
+
+    **Raises:** `ValueError` if a coefficient is negative or not finite, or if `mu_static` is below `mu`.
+    """
+
+    mu: Float[Array, ""]
+    mu_static: Float[Array, ""] | None
+    constant = True
+
+    @in_double_precision
+    def __init__(self, mu, mu_static=None):
+        arguments.real_number("mu", mu, minimum=0)
+        if mu_static is not None:
+            arguments.real_number("mu_static", mu_static, minimum=0)
+            _check_order("mu_static", mu_static, "mu", mu)
+        self.mu = real(mu)
+        self.mu_static = None if mu_static is None else real(mu_static)
+
+    @property
+    def static(self) -> Float[Array, ""]:
+        return self.mu if self.mu_static is None else self.mu_static
+
+    def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
+        return self.mu
+
+    def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        return jnp.zeros_like(slip_speed), jnp.zeros_like(slip_speed)
+
+
+class ExponentialDecay(AbstractFriction):
+    r"""Friction that falls with slip speed, $\mu = \mu_d + (\mu_s - \mu_d)\, e^{-d |v_{rel}|}$ (Eq. 1).
+
+    **Arguments:** `mu_static` $\mu_s$ and `mu_dynamic` $\mu_d$ without unit, `decay` $d$ in s/m.
+
+    **Raises:** `ValueError` if a value is negative or not finite, or if `mu_static` is below `mu_dynamic`.
+    """
+
+    mu_static: Float[Array, ""]
+    mu_dynamic: Float[Array, ""]
+    decay: Float[Array, ""]
+    constant = False
+
+    @in_double_precision
+    def __init__(self, mu_static, mu_dynamic, decay=0.5):
+        arguments.real_number("mu_static", mu_static, minimum=0)
+        arguments.real_number("mu_dynamic", mu_dynamic, minimum=0)
+        arguments.real_number("decay", decay, minimum=0)
+        _check_order("mu_static", mu_static, "mu_dynamic", mu_dynamic)
+        self.mu_static, self.mu_dynamic, self.decay = real(mu_static), real(mu_dynamic), real(decay)
+
+    @property
+    def static(self) -> Float[Array, ""]:
+        return self.mu_static
+
+    def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
+        return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)
+
+    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
+        # The exponential's own recurrence, Ė = -d u̇ E, does not start anew at every order as the general way does.
+        order = len(slip) - 1
+        falling = [self(slip[0]) - self.mu_dynamic]
+        for k in range(1, order + 1):
+            falling.append(-self.decay / k * sum(j * slip[j] * falling[k - j] for j in range(1, k + 1)))
+        return falling[order]
+
+    def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        # Both derivatives shrink in size with slip speed, so the bound is the value at the lower end.
+        slope = self.decay * (self(slip_speed) - self.mu_dynamic)
+        return slope, self.decay * slope
+
+
+def _check_order(high_name: str, high, low_name: str, low) -> None:
+    if is_known(high) and is_known(low) and float(high) < float(low):
+        raise ValueError(
+            f"Argument `{high_name}` must be at least `{low_name}`, but is {float(high):g} and `{low_name}` is "
+            f"{float(low):g}. A contact that slips more easily while it sticks would chatter without end; are the two swapped?"
+        )

@@ -1,0 +1,174 @@
+"""A scene: a structure pressed onto a moving belt, with a friction law and a load."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision, is_known, real, returning_numpy
+from .friction import AbstractFriction
+from .load import AbstractLoad, ConstantLoad
+from .structure import Structure
+
+IMPACT_LAWS = ("coulomb", "frictionless", "reset")
+
+
+class Scene(eqx.Module):
+    """What is simulated.
+
+    **Arguments:**
+
+    - `structure`: a `Structure`, for instance from `belt_oscillator()`.
+    - `friction`: `Coulomb` or `ExponentialDecay`.
+    - `belt_speed`: in m/s; sliding equilibrium needs one that is not zero.
+    - `load`: `ConstantLoad` or `Pulse`.
+    - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1.
+    - `impact_law`: "coulomb", "frictionless" or "reset" (see `contact.impact`).
+
+    **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
+    """
+
+    structure: Structure
+    friction: AbstractFriction
+    belt_speed: Float[Array, ""]
+    load: AbstractLoad
+    restitution: Float[Array, ""]
+    impact_law: str = eqx.field(static=True)
+
+    @in_double_precision
+    def __init__(
+        self,
+        structure: Structure,
+        friction: AbstractFriction,
+        belt_speed=3.0,
+        load: AbstractLoad | None = None,
+        restitution=0.0,
+        impact_law: str = "coulomb",
+    ):
+        load = ConstantLoad() if load is None else load
+        arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+        arguments.instance("friction", friction, AbstractFriction, "a friction law, such as Coulomb(mu=0.2)")
+        arguments.instance("load", load, AbstractLoad, "a load, such as Pulse(force=100.0, p=1.2)")
+        arguments.real_number("belt_speed", belt_speed)
+        arguments.real_number("restitution", restitution, minimum=0, maximum=1)
+        arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
+        self.structure = structure
+        self.friction = friction
+        self.belt_speed = real(belt_speed)
+        self.load = load
+        self.restitution = real(restitution)
+        self.impact_law = impact_law
+
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """Every numeric parameter by the name that `replace` and the axes of a map know it by."""
+        found = {"belt_speed": self.belt_speed, "restitution": self.restitution}
+        for part in (self.friction, self.load):
+            found.update({name: value for name, value in vars(part).items() if value is not None})
+        return {**found, **self.structure.parameters}
+
+    @in_double_precision
+    def replace(self, **changes) -> "Scene":
+        """The scene with other values of some parameters: `scene.replace(mu=0.2, p=1.3, k1=90e3)`.
+
+        **Raises:** `ValueError` for a name that is not among `scene.parameters`, and whatever the part's own
+        constructor refuses.
+        """
+        unknown = [name for name in changes if name not in self.parameters]
+        if unknown:
+            raise ValueError(f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}.")
+
+        def rebuilt(part):
+            own = {name: value for name, value in vars(part).items() if value is not None}
+            if not own.keys() & changes.keys():
+                return part
+            return type(part)(**{name: changes.get(name, value) for name, value in own.items()})
+
+        of_structure = {name: changes[name] for name in self.structure.parameters if name in changes}
+        return Scene(
+            structure=self.structure.replace(**of_structure) if of_structure else self.structure,
+            friction=rebuilt(self.friction),
+            belt_speed=changes.get("belt_speed", self.belt_speed),
+            load=rebuilt(self.load),
+            restitution=changes.get("restitution", self.restitution),
+            impact_law=self.impact_law,
+        )
+
+
+def sliding_stiffness(scene: Scene, mu) -> tuple[Float[Array, "m m"], Float[Array, " m"]]:
+    """Stiffness and load direction of the steady sliding motion, normal coordinate left out (K and F of Eq. 3).
+
+    Rows are the structure's without the normal one, the tangential row less σμ times the normal row.
+    """
+    structure = scene.structure
+    t, n = structure.tangential, structure.normal
+    direction = jnp.sign(scene.belt_speed)
+    keep = np.array([i for i in range(structure.size) if i != n])
+    stiffness = structure.stiffness.at[t].add(-direction * mu * structure.stiffness[n])
+    load = structure.load_direction.at[t].add(-direction * mu * structure.load_direction[n])
+    return stiffness[keep][:, keep], load[keep]
+
+
+@returning_numpy
+def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
+    r"""Displacements of steady sliding, $K^{-1}F$ of Eq. 3, under the load before any jump, in m.
+
+    **Raises:** `ValueError` where there is no such state: a belt at rest, a singular sliding stiffness, or a normal
+    force that would have to pull.
+    """
+    if is_known(scene.belt_speed) and float(scene.belt_speed) == 0:
+        raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
+    q, normal_force = steady_sliding(scene, scene.load.force)
+    if is_known(q):
+        if not np.all(np.isfinite(q)):
+            raise ValueError(
+                "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
+                "the friction or the springs, or give `y0` to start elsewhere."
+            )
+        if normal_force < 0:
+            raise ValueError(
+                f"There is no sliding equilibrium: the belt would have to pull with {-float(normal_force):.3g} N. "
+                f"Change the load, its direction or the friction."
+            )
+    return q
+
+
+def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is none."""
+    structure = scene.structure
+    mu = scene.friction(jnp.abs(scene.belt_speed))
+    stiffness, load = sliding_stiffness(scene, mu)
+    reduced = jnp.linalg.solve(stiffness, load * force)
+    # A motion that is free but for rounding answers with displacements whose rounding alone outweighs the load.
+    rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
+    reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
+    q = jnp.insert(reduced, structure.normal, 0.0)
+    normal_force = structure.stiffness[structure.normal] @ q
+    normal_force = normal_force - structure.load_direction[structure.normal] * force
+    return q, normal_force
+
+
+@returning_numpy
+def painleve_friction(structure: Structure) -> Float[Array, ""]:
+    r"""The friction beyond which the contact problem has no unique solution, $G_{nn} / |G_{nt}|$, without unit.
+
+    For the belt oscillator this is $(m_2 + m_1 \cos^2θ)/(m_1 \sinθ \cosθ)$: 108.49 at θ = 0.01. Infinite where the
+    mass matrix does not couple the two contact coordinates.
+    """
+    columns = jnp.eye(structure.size)[:, jnp.array([structure.tangential, structure.normal])]
+    compliance = columns.T @ jnp.linalg.solve(structure.mass, columns)
+    coupling = jnp.abs(compliance[0, 1])
+    return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
+
+
+def refuse_painleve(scene: Scene) -> None:
+    """Refuse friction at which the contact problem has no unique solution, where its value is known."""
+    largest = scene.friction.static
+    if is_known(largest) and is_known(scene.structure.mass):
+        limit = painleve_friction(scene.structure)
+        if is_known(limit) and float(largest) >= limit:
+            raise ValueError(
+                f"The contact problem has no unique solution at friction {float(largest):g}: Painlevé's limit of this "
+                f"structure is {float(limit):.4g}. Lower the friction or the coupling in the mass matrix."
+            )

@@ -1,0 +1,118 @@
+"""The paper: its parameters, the runs behind its figures, and what it says about each, in words and numbers.
+
+*Energy analysis of contact nonlinear transitions: Insights on the origin of limit cycles and bi-stable states in
+friction-induced instabilities.* Everything here is printed there, except what `Case` has to add because the paper leaves
+it open; that is said where it is added.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from ..model.friction import AbstractFriction, Coulomb, ExponentialDecay
+from ..model.load import Pulse
+from ..model.scene import Scene, sliding_equilibrium
+from ..model.structure import belt_oscillator
+from ..simulation.trajectory import Trajectory, simulate
+
+# Table 1, as printed: value and unit.
+TABLE_1 = {
+    "m1": ("mass of the first body", 0.53, "kg"),
+    "m2": ("mass of the second body", 0.045, "kg"),
+    "c1": ("damper of the first body to the frame", 1.0, "N s/m"),
+    "c2": ("damper between the bodies", 1.0, "N s/m"),
+    "k1": ("spring of the first body to the frame", 100e3, "N/m"),
+    "k2": ("spring between the bodies", 101e3, "N/m"),
+    "force": ("external normal force", 100.0, "N"),
+    "theta": ("inclination of the belt", 0.01, "rad"),
+}
+
+# Table 2, as printed: belt speed in m/s and the critical perturbation.
+TABLE_2 = {0.5: "1.06", 1.0: "1.11", 1.5: "1.17", 3.0: "1.20", 5.0: "1.20", 10.0: "1.20", 100.0: "1.20"}
+
+# Fig. 2 and Sections 3.1 to 3.3: constant; falling; falling, and above the critical friction.
+CONSTANT = Coulomb(0.5)
+FALLING = ExponentialDecay(0.2, 0.1, 0.5)
+BOTH = ExponentialDecay(0.6, 0.5, 0.5)
+
+# Section 4 from 4.1 on, unless the case says otherwise.
+MU = 0.227
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One transient of the paper. Times are from t = 0; the paper's 40 s of quiet sliding before a kick are left out.
+
+    `nudge` displaces the sliding equilibrium by that share of itself. The paper starts an unstable system at rest at
+    its equilibrium, where it would stay for ever; what sets it off there is not said, and only decides when it starts.
+    """
+
+    friction: AbstractFriction
+    belt_speed: float
+    p: float = 1.0
+    start: float = 0.0
+    nudge: float = 0.0
+    t1: float = 12.0
+    # Every case has as many rows, so that all of one friction law share what is compiled for the first.
+    rows: int = 60_000
+
+    def scene(self) -> Scene:
+        """The scene with the parameters of Table 1."""
+        return scene(self.friction, self.belt_speed, self.p, self.start)
+
+    def run(self) -> Trajectory:
+        """The trajectory with its energy ledger."""
+        what = self.scene()
+        q = (1 + self.nudge) * sliding_equilibrium(what)
+        return simulate(what, self.t1, self.t1 / self.rows, y0=(q, np.zeros_like(q)), energy=True)
+
+
+NUDGE = 1e-4
+
+CASES = {
+    "mode coupling, 3 m/s": Case(CONSTANT, 3.0, nudge=NUDGE, t1=6.0),
+    "negative slope": Case(FALLING, 0.5, nudge=NUDGE, t1=6.0),
+    "mode coupling": Case(CONSTANT, 0.5, nudge=NUDGE, t1=6.0),
+    "both": Case(BOTH, 0.5, nudge=NUDGE, t1=6.0),
+    # A kick that dies out (Fig. 8); the paper does not say how strong.
+    "a kick": Case(Coulomb(MU), 3.0, p=1.1, start=0.5),
+    "p = 1.2": Case(Coulomb(MU), 3.0, p=1.2),
+    "p = 1.19": Case(Coulomb(MU), 3.0, p=1.19),
+    "1 m/s": Case(Coulomb(MU), 1.0, p=1.16),
+    "1.5 m/s": Case(Coulomb(MU), 1.5, p=1.16),
+    "5 m/s": Case(Coulomb(MU), 5.0, p=1.2),
+    "10 m/s": Case(Coulomb(MU), 10.0, p=1.2),
+    "100 m/s": Case(Coulomb(MU), 100.0, p=1.2),
+}
+
+
+def scene(friction: AbstractFriction | None = None, belt_speed=3.0, p=1.2, start=0.0) -> Scene:
+    """The paper's scene: Table 1, and unless given μ = 0.227, 3 m/s and a kick of 1.2 for 0.1 s (Section 4)."""
+    values = {name: value for name, (_, value, _) in TABLE_1.items()}
+    load = Pulse(values.pop("force"), p, duration=0.1, start=start)
+    return Scene(belt_oscillator(**values), Coulomb(MU) if friction is None else friction, belt_speed, load)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What the paper says at one place, beside what was computed."""
+
+    where: str  # "Fig. 3", "Section 4.3"
+    what: str
+    printed: str
+    computed: str
+    agrees: bool
+    why: str = ""  # where it differs; or what else is worth knowing
+
+
+def number(where: str, what: str, printed: str, computed: float, unit: str = "", why: str = "") -> Finding:
+    """A number that the paper prints: it agrees where the computed one, rounded to as many digits, prints the same."""
+    decimals = len(printed.partition(".")[2])
+    agrees = f"{computed:.{decimals}f}" == printed
+    unit = f" {unit}" if unit else ""
+    return Finding(where, what, printed + unit, f"{computed:.{max(decimals + 3, 3)}f}{unit}", bool(agrees), why)
+
+
+def statement(where: str, what: str, said: str, computed: str, holds, why: str = "") -> Finding:
+    """A statement without a number: `holds` says whether the computed numbers bear it out."""
+    return Finding(where, what, said, computed, bool(holds), why)

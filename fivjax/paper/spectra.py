@@ -1,0 +1,86 @@
+"""What frequencies a trajectory holds, and when: spectrogram, harmonics, phase shift. NumPy and SciPy, on saved rows."""
+
+import numpy as np
+import xarray as xr
+
+from ..foundation import arguments
+from ..io.datasets import labelled
+from ..simulation.trajectory import Trajectory
+
+# A Hann window leaves half of a sinusoid's amplitude in the mean.
+HANN_GAIN = 0.5
+
+
+def spectrogram(
+    run: Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, window: float = 0.2
+) -> xr.Dataset:
+    """The spectrum of one coordinate over time, as in Figs. 4(c) and 5(c).
+
+    **Arguments:** `run`, with rows at equal distances; `quantity`, "displacement", "velocity" or "acceleration";
+    `coordinate`, the tangential one unless given; `window`, the length in s of the Hann windows, which overlap by nine
+    tenths. Their inverse is the resolution in frequency.
+
+    **Returns:** a dataset over `frequency` (Hz) and `t` (the middle of each window, s) with `level`, power in dB below the
+    strongest of all.
+
+    **Raises:** `ValueError` for a window that does not fit into the run, or rows at unequal distances.
+    """
+    arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
+    arguments.one_of("quantity", quantity, ("displacement", "velocity", "acceleration"))
+    arguments.real_number("window", window, above=0)
+    rate = _sampling_rate(run)
+    samples = round(window * rate)
+    if not 8 <= samples <= len(run.t):
+        raise ValueError(
+            f"Argument `window` must hold at least 8 rows and fit into the run, but {window:g} s holds {samples} of "
+            f"{len(run.t)} rows."
+        )
+    # Half a second to import, which no map should wait for.
+    from scipy.signal import spectrogram as short_time_spectrum
+
+    coordinate = run.scene.structure.tangential if coordinate is None else coordinate
+    signal = np.asarray(getattr(run, quantity))[:, coordinate]
+    frequency, t, power = short_time_spectrum(
+        signal, rate, window="hann", nperseg=samples, noverlap=round(0.9 * samples), detrend="constant"
+    )
+    strongest = np.max(power)
+    # Far below what is drawn; keeps silence finite.
+    level = 10 * np.log10(np.maximum(power / (strongest if strongest > 0 else 1.0), 1e-20))
+    dataset = xr.Dataset(
+        {"level": (("frequency", "t"), level, {"long_name": f"power of {quantity}", "units": "dB"})},
+        {"frequency": ("frequency", frequency, {"long_name": "frequency", "units": "Hz"}), "t": float(run.t[0]) + t},
+    )
+    return labelled(dataset, run.scene, quantity=quantity, coordinate=coordinate, window=window)
+
+
+def component(t: np.ndarray, signal: np.ndarray, frequency: float) -> complex:
+    """The sinusoid of one frequency (Hz) in a signal at equal distances: its complex amplitude, Hann-windowed."""
+    weights = np.hanning(len(t)) / (HANN_GAIN * len(t))
+    return complex(2 * np.sum(weights * (signal - np.mean(signal)) * np.exp(-2j * np.pi * frequency * t)))
+
+
+def harmonics(run: Trajectory, window: tuple[float, float], frequency: float, count: int = 4) -> np.ndarray:
+    """Levels of the tangential acceleration at 2, 3, … `count` times a frequency (Hz), in dB above that frequency's own."""
+    inside, signal = _within(run, window, run.scene.structure.tangential)
+    found = [abs(component(inside, signal, k * frequency)) for k in range(1, count + 1)]
+    return 20 * np.log10(np.array(found[1:]) / found[0])
+
+
+def phase_shift(run: Trajectory, window: tuple[float, float], frequency: float, coordinate: int) -> float:
+    """By how much a coordinate's acceleration lags behind the tangential one at a frequency (Hz), in degrees, -180 to 180."""
+    t, tangential = _within(run, window, run.scene.structure.tangential)
+    _, other = _within(run, window, coordinate)
+    return float(np.degrees(np.angle(component(t, tangential, frequency) / component(t, other, frequency))))
+
+
+def _within(run: Trajectory, window: tuple[float, float], coordinate: int) -> tuple[np.ndarray, np.ndarray]:
+    inside = (np.asarray(run.t) >= window[0]) & (np.asarray(run.t) <= window[1])
+    return np.asarray(run.t)[inside], np.asarray(run.acceleration)[inside, coordinate]
+
+
+def _sampling_rate(run: Trajectory) -> float:
+    steps = np.diff(run.t)
+    # The last row is the end of the run, wherever that falls.
+    if np.ptp(steps[:-1]) > 1e-6 * steps[0]:
+        raise ValueError("Argument `run` must have rows at equal distances; `simulate` makes such runs.")
+    return 1.0 / float(steps[0])

@@ -1,0 +1,47 @@
+"""A picture of a calibration: data against fit, what is left, and the parameters. It draws and computes nothing."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..calibration.fit import Calibration
+from ..io.datasets import QUANTITIES
+
+MEASURED, FITTED, LEFT = "#56B4E9", "#000000", "#D55E00"
+UNITS = {"acceleration": "m/s²", "velocity": "m/s"}
+# A fit is looked at in its details and as a whole: so many blocks of the first, all of the second.
+DETAIL = 160
+
+
+def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
+    """Every channel of every recording: the beginning in detail, the whole with what the fit leaves; the parameters above.
+
+    A limit cycle is fitted by its first harmonics: these are drawn, and what is left is also all that lies above them.
+    """
+    rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
+    figure = figure or Figure(figsize=(9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows)), layout="constrained")
+    axes = np.atleast_2d(figure.subplots(len(rows), 2, width_ratios=(3, 2)))
+    for (k, c), (detail, whole) in zip(rows, axes, strict=True):
+        t, measured, fitted = fit.t[k], fit.measured[k][:, c], fit.fitted[k][:, c]
+        whole.plot(t, measured, color=MEASURED, lw=0.6)
+        whole.plot(t, measured - fitted, color=LEFT, lw=0.6, ls="-", label="what is left")
+        shown = slice(0, DETAIL)
+        detail.plot(t[shown], measured[shown], color=MEASURED, lw=2.4, label="measured")
+        detail.plot(t[shown], fitted[shown], color=FITTED, lw=0.9, ls="--", label="fitted")
+        channel = fit.recordings[k].channels[c]
+        name = f"{channel}" if len(fit.recordings) == 1 else f"recording {k}: {channel}"
+        detail.set_ylabel(f"{name} ({UNITS[channel.quantity]})")
+        for part in (detail, whole):
+            part.margins(x=0)
+    axes[0, 0].legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), fontsize="small")
+    axes[0, 1].legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), fontsize="small")
+    for part in axes[-1]:
+        part.set_xlabel("time (s)")
+    lines = []
+    for name in fit.names:
+        unit = QUANTITIES.get(name, ("", "1"))[1]
+        unit = "" if unit == "1" else f" {unit}"
+        told = fit.identifiable[name]
+        value = f"{fit.values[name]:.6g} ± {fit.uncertainty[name]:.2g}{unit}" if told else fit.untold
+        lines.append(f"{name} = {value}")
+    figure.suptitle("\n".join([str(fit.outcome).split(":")[0], *lines]), ha="left", x=0.02, fontsize="small")
+    return figure

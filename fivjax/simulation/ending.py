@@ -1,0 +1,23 @@
+"""How a single trajectory ended."""
+
+import enum
+
+
+class Ending(enum.IntEnum):
+    """How a single trajectory ended; the negative codes are those of `Verdict`, and `ENDING` has a sentence for each."""
+
+    FINISHED = 0
+    NOT_FINITE = -2
+    TOO_MANY_EVENTS = -6
+    STEP_FAILURE = -8
+
+
+ENDING = {
+    Ending.FINISHED: "reached its end",
+    Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
+    "parameters",
+    Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
+    "change the restitution or the belt speed a little",
+    Ending.STEP_FAILURE: "the fastest vibration needs too many steps between two saved rows, and the rows from there on are "
+    "NaN; lower `dt_save`",
+}

@@ -1,0 +1,193 @@
+"""The ledger of a trajectory by cycle and by contact event, exact however far apart its rows are.
+
+A cycle runs from one instant where the tangential velocity rises through zero to the next; there the structure is at its
+turning point. From the row before such an instant the trajectory is stepped on to it with `EventExact`, so times,
+energies and durations are those of the instant itself. The same is done for contact events.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float
+
+from ..contact import Contact, Mechanics, State
+from ..foundation import arguments
+from ..foundation.compiling import compiled, power_of_4
+from ..foundation.precision import in_double_precision, is_known
+from ..io.datasets import labelled
+from ..model.scene import Scene
+from ..steppers.base import MOST_ADVANCES
+from ..steppers.event_exact import EventExact
+from . import energy as accounts
+from .energy import Books, Energy, Ledger
+from .trajectory import Trajectory
+
+
+class _Instant(NamedTuple):
+    """Where a trajectory stands, and what its ledger says there."""
+
+    t: Float[Array, ""]
+    y: State
+    contact: Contact
+    ledger: Ledger
+
+
+@in_double_precision
+def energy_per_cycle(run: Trajectory) -> xr.Dataset:
+    """The ledger of each whole cycle of a trajectory: what Figs. 13, 15 and 16 draw in black.
+
+    **Arguments:** `run`, from `simulate(..., energy=True)`.
+
+    **Returns:** a dataset over `cycle`, empty where there is no whole one. Energies in J, over the cycle: `contact_work`
+    (of it `stick_work` and `slide_work`), `interface_work`, `damping_work` (apart by damper where the structure names
+    them), `load_work`, `impact_loss`, `impact_dissipated`, and `energy_gain`, by which mechanical energy grew. Durations in s:
+    `stick_time`, `slide_time`, `detach_time`. At the cycle's start: `mechanical_energy` and the tangential
+    `turning_point` in m. Coordinates `cycle_start` and `cycle_end` in s. Exact for `EventExact`; for other methods,
+    cycle ends are found to within their own error.
+
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+    """
+    _check(run)
+    found, _ = _marks(run, _crossings)
+    energy = _mechanical(run.scene, found)
+    work = {**found.ledger.work.lines("work"), "contact_work": found.ledger.work.contact}
+    lines = {
+        **work,
+        "impact_loss": found.ledger.impact,
+        "impact_dissipated": found.ledger.impact_dissipated,
+        "energy_gain": energy,
+        "stick_time": found.ledger.stick_time,
+        "slide_time": found.t - found.ledger.stick_time - found.ledger.detach_time,
+        "detach_time": found.ledger.detach_time,
+    }
+    over = {name: ("cycle", np.diff(line)) for name, line in lines.items() if name != "kick_work"}
+    count = max(len(found.t) - 1, 0)
+    at = {
+        "mechanical_energy": ("cycle", energy[:count]),
+        "turning_point": ("cycle", found.y[:count, run.scene.structure.tangential]),
+    }
+    coords = {
+        "cycle": np.arange(count),
+        "cycle_start": ("cycle", found.t[:count]),
+        "cycle_end": ("cycle", found.t[1 : count + 1]),
+    }
+    return labelled(xr.Dataset(over | at, coords), run.scene)
+
+
+@in_double_precision
+def energy_per_event(run: Trajectory) -> xr.Dataset:
+    """The ledger of each contact event of a trajectory: when, from which status to which, and what an impact cost.
+
+    **Arguments:** `run`, from `simulate(..., energy=True)`.
+
+    **Returns:** a dataset over `event`: `event_time` in s; `status_before` and `status_after` (equal for a rebound, and where
+    slip goes straight from one direction to the other); `impact_loss` and `impact_dissipated` in J, zero but for
+    re-contacts; and `mechanical_energy` just after, in J. Exact for `EventExact`; for other methods, times are found to
+    within their own error.
+
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+    """
+    _check(run)
+    found, before = _marks(run, _events)
+    variables = {
+        "status_before": before.astype(np.int8),
+        "status_after": found.contact.status.astype(np.int8),
+        "impact_loss": np.diff(found.ledger.impact, prepend=0.0),
+        "impact_dissipated": np.diff(found.ledger.impact_dissipated, prepend=0.0),
+        "mechanical_energy": _mechanical(run.scene, found),
+    }
+    coords = {"event": np.arange(len(found.t)), "event_time": ("event", found.t)}
+    return labelled(xr.Dataset({name: ("event", x) for name, x in variables.items()}, coords), run.scene)
+
+
+# Functions with a name, so that what is compiled for one of them is found again.
+def _crossings(ledger: Ledger) -> Array:
+    return ledger.crossings
+
+
+def _events(ledger: Ledger) -> Array:
+    return ledger.events
+
+
+def _check(run) -> None:
+    arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
+    if run.energy is None:
+        raise ValueError(
+            "Argument `run` must come with its ledger, but has none; ask for it: `simulate(..., energy=True)`."
+        )
+    if not is_known(run.t):
+        raise ValueError(
+            "Argument `run` must hold known values: tables of cycles and events cannot be made inside `jit`."
+        )
+
+
+def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant, np.ndarray]:
+    """Every instant at which a count of the ledger went up, one per row; and the status that ended there."""
+    scene = run.scene
+    rows = jax.tree.map(np.asarray, _row_instants(run))
+    counted = np.asarray(count(rows.ledger))
+    finite = np.isfinite(rows.y).all(axis=1)
+    rising = np.diff(counted) * finite[1:]
+    chosen = np.flatnonzero(rising)
+    # One of few shapes, so that not every trajectory compiles anew; surplus lanes repeat the first row and are dropped.
+    most = power_of_4(max(int(rising.max(initial=1)), 4))
+    lanes = power_of_4(max(len(chosen), 4096 // most, 64))
+    padded = np.concatenate([chosen, np.zeros(lanes - len(chosen), int)])
+    starts = jax.tree.map(lambda leaf: leaf[padded], rows)
+    found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
+    wanted = np.zeros((lanes, most), bool)
+    wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
+    return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
+
+
+@compiled
+def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Callable, most: int):
+    """The first `most` instants after each start at which the count goes up, not beyond each end."""
+    mechanics, books, method = Mechanics(scene), Books(scene), EventExact()
+
+    def advance(carry, end):
+        (t, y, contact, ledger), _, steps = carry
+        jumps = jnp.where(scene.load.jumps > t, scene.load.jumps, jnp.inf)
+        stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
+        load = scene.load(0.5 * (t + stop))
+        after = method.advance(mechanics, contact, load, y, stop - t)
+        ledger = accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+        t = jnp.where(after.h >= stop - t, stop, t + after.h)
+        return _Instant(t, after.y, after.contact, ledger), contact.status, steps + 1
+
+    def to_next(start: _Instant, end):
+        def going(carry):
+            now, _, steps = carry
+            return (count(now.ledger) == count(start.ledger)) & (now.t < end) & (steps < MOST_ADVANCES)
+
+        found, before, _ = jax.lax.while_loop(
+            going, lambda carry: advance(carry, end), (start, start.contact.status, jnp.zeros((), jnp.int32))
+        )
+        return found, (found, before)
+
+    def of_row(start: _Instant, end):
+        return jax.lax.scan(lambda instant, _: to_next(instant, end), start, None, length=most)[1]
+
+    return jax.vmap(of_row)(starts, ends)
+
+
+def _row_instants(run: Trajectory) -> _Instant:
+    energy = run.energy
+    assert isinstance(energy, Energy)
+    slip, force = np.asarray(run.slip_velocity), np.asarray(run.friction_force)
+    # Friction points against the slip; where there is none yet, its own sign says where it points.
+    direction = np.where(slip != 0, -np.sign(slip), np.where(force != 0, np.sign(force), 1.0))
+    return _Instant(
+        t=run.t,
+        y=np.concatenate([run.displacement, run.velocity], axis=1),
+        contact=Contact(np.asarray(run.status).astype(np.int32), direction),
+        ledger=energy.ledger,
+    )
+
+
+def _mechanical(scene: Scene, found: _Instant) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda y: accounts.mechanical_energy(scene.structure, y))(jnp.asarray(found.y)))

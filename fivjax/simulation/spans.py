@@ -1,0 +1,79 @@
+r"""From one saved instant to the next, and the derivative of that.
+
+A span is as many advances as it takes; how many is known only when they are made. Forward derivatives run along with
+them. For reverse ones there are two ways:
+
+- JAX's own, through a loop of bounded length, which works in both modes and pays for every advance that might have been;
+- "reverse": a span maps a few dozen numbers (state, mechanics, load, time) to a few. Its whole Jacobian is found in
+  forward mode when the backward pass comes to it. That costs about as much however many parameters a scene has, keeps
+  nothing but the span's start, and repeats the forward derivatives to the last digits.
+"""
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..contact import Contact, Mechanics, State
+from ..steppers.base import AbstractStepper, advance_adding
+from . import energy as accounts
+from .energy import Books, Ledger
+
+MODES = ("both", "forward", "reverse")
+
+
+class Begin(eqx.Module):
+    """All that a span depends on."""
+
+    mechanics: Mechanics
+    contact: Contact
+    load: Float[Array, ""]
+    y: State
+    h: Float[Array, ""]  # s
+    ledger: Ledger | None
+    books: Books | None
+
+
+End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
+
+
+def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str = "both") -> End:
+    """State, contact and ledger after `begin.h`; last, whether `most` advances were enough."""
+    if derivatives != "reverse":
+        return _advances(begin, method, most, "bounded" if derivatives == "both" else "lax")
+    return _reversible(begin, method, most)
+
+
+def _advances(begin: Begin, method: AbstractStepper, most: int, kind: str) -> End:
+    mechanics, load, books = begin.mechanics, begin.load, begin.books
+
+    def enter(ledger, contact, y, after):
+        return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+
+    return advance_adding(method, mechanics, begin.contact, load, begin.y, begin.h, most, begin.ledger, enter, kind)
+
+
+def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
+    numbers, rest = eqx.partition(begin, eqx.is_inexact_array)
+    counts, names = eqx.partition(rest, eqx.is_array)
+
+    def end(numbers, counts):
+        return _advances(eqx.combine(numbers, counts, names), method, most, "lax")
+
+    def backward(start, cotangent):
+        numbers, counts = start
+        flat, unravel = jax.flatten_util.ravel_pytree(numbers)
+
+        def flat_end(flat):
+            return jax.flatten_util.ravel_pytree(eqx.filter(end(unravel(flat), counts), eqx.is_inexact_array))[0]
+
+        # Nothing depends on what is counted.
+        cotangent = jax.tree.map(lambda ct: None if ct.dtype == jax.dtypes.float0 else ct, cotangent)
+        cotangent = jax.flatten_util.ravel_pytree(cotangent)[0]
+        zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, jax.dtypes.float0), counts)
+        return unravel(cotangent @ jax.jacfwd(flat_end)(flat)), zeros
+
+    span = jax.custom_vjp(end)
+    span.defvjp(lambda numbers, counts: (end(numbers, counts), (numbers, counts)), backward)
+    return span(numbers, counts)

@@ -1,0 +1,315 @@
+"""One trajectory, with everything that can be read off it."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State, Status
+from ..foundation import arguments
+from ..foundation.compiling import compiled, power_of_4
+from ..foundation.precision import in_double_precision, is_known, known_to_numpy, real
+from ..io.datasets import labelled
+from ..model.scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
+from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
+from ..steppers.event_exact import EventExact
+from . import energy as accounts
+from .ending import ENDING, Ending
+from .energy import Books, Energy, Ledger
+from .spans import MODES, Begin, go_on
+
+# Rows that a trajectory may have: some 20 GB of them.
+MOST_ROWS = 10**8
+# Trajectories up to the second are compiled for the next power of four of rows, none for fewer than the first.
+LEAST_ROWS, MOST_REPEATED = 64, 4**8
+
+
+class Trajectory(eqx.Module):
+    """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size."""
+
+    t: Float[Array, " T"]  # s
+    displacement: Float[Array, "T n"]  # m
+    velocity: Float[Array, "T n"]  # m/s
+    acceleration: Float[Array, "T n"]  # m/s²
+    status: Int[Array, " T"]  # 0 stick, 1 slide, 2 detach
+    normal_force: Float[Array, " T"]  # N
+    friction_force: Float[Array, " T"]  # N
+    load: Float[Array, " T"]  # N
+    scene: Scene
+    energy: Energy | None = None  # the ledger, when asked for
+    outcome: Int[Array, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
+
+    @property
+    def meaning(self) -> str:
+        """How the trajectory ended, in a sentence."""
+        return ENDING[Ending(int(self.outcome))]
+
+    @property
+    def slip_velocity(self) -> Float[Array, " T"]:
+        """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
+        return self.velocity[:, self.scene.structure.tangential] - np.asarray(self.scene.belt_speed)
+
+    @property
+    def gap(self) -> Float[Array, " T"]:
+        """Distance from the belt, in m."""
+        return self.displacement[:, self.scene.structure.normal]
+
+    def to_dataset(self) -> xr.Dataset:
+        """The trajectory with names, units and the scene it came from."""
+        along = ("t", "coordinate")
+        dataset = xr.Dataset(
+            {
+                "displacement": (along, np.asarray(self.displacement)),
+                "velocity": (along, np.asarray(self.velocity)),
+                "acceleration": (along, np.asarray(self.acceleration)),
+                "status": ("t", np.asarray(self.status)),
+                "normal_force": ("t", np.asarray(self.normal_force)),
+                "friction_force": ("t", np.asarray(self.friction_force)),
+                "load": ("t", np.asarray(self.load)),
+            },
+            coords={"t": np.asarray(self.t), "coordinate": np.arange(self.displacement.shape[1])},
+        )
+        if self.energy is not None:
+            dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
+        return labelled(dataset, self.scene).assign_attrs(
+            outcome=Ending(int(self.outcome)).name.lower(), meaning=self.meaning
+        )
+
+
+@in_double_precision
+def simulate(
+    scene: Scene,
+    t1: float = 2.0,
+    dt_save: float = 1e-4,
+    method: AbstractStepper | None = None,
+    *,
+    y0=None,
+    energy: bool = False,
+    derivatives: str = "both",
+) -> Trajectory:
+    """The response of a scene from t = 0 to `t1`.
+
+    **Arguments:**
+
+    - `scene`: what is simulated.
+    - `t1`: the end, in s.
+    - `dt_save`: distance of the saved instants, in s; the steps in between are the method's.
+    - `method`: how to step, `EventExact()` unless given.
+    - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
+      equilibrium at rest unless given.
+    - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
+    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward" or "reverse". In one mode alone it
+      is faster, `jax.grad` about ten times. It matters only inside a transformation.
+
+    **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
+    being finite, or contact events come without end, the rows from there on are NaN; `run.outcome` (an `Ending`) and
+    `run.meaning` (a sentence) say which.
+
+    **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
+    equilibrium to start from, or friction beyond Painlevé's limit.
+    """
+    method = EventExact() if method is None else method
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    arguments.real_number("t1", t1, above=0)
+    arguments.real_number("dt_save", dt_save, above=0)
+    arguments.truth("energy", energy)
+    arguments.one_of("derivatives", derivatives, MODES)
+    refuse_painleve(scene)
+    rows = math.ceil(t1 / dt_save - 1e-9)
+    if rows > MOST_ROWS:
+        raise ValueError(
+            f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
+            f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
+        )
+    y0 = start_state(scene, y0)
+    # Events cut advances short, so there may be more of them than it takes to span the interval.
+    most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
+    count = rows + 1
+    # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled.
+    if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
+        derivatives, count = "forward", _compiled_rows(rows + 1)
+    instants = jnp.arange(count)
+    saved = jnp.where(instants < rows, jnp.minimum(dt_save * instants, t1), t1)
+    found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
+    # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
+    found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
+    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most))
+
+
+def _compiled_rows(count: int) -> int:
+    """The number of rows that is compiled for so many. Where these are many, compiling is little beside them."""
+    return power_of_4(max(count, LEAST_ROWS)) if count <= MOST_REPEATED else count
+
+
+def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:
+    """How the rows end: an `Ending`. Under a transformation, where no one can look, every failure is not finite."""
+    finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
+    if not is_known(finite):
+        return jnp.where(jnp.all(finite), Ending.FINISHED, Ending.NOT_FINITE).astype(jnp.int8)
+    if np.all(finite):
+        return np.int8(Ending.FINISHED)
+    first = int(np.argmin(finite))
+    if first == 0:
+        return np.int8(Ending.NOT_FINITE)
+    start = jnp.concatenate([rows["displacement"][first - 1], rows["velocity"][first - 1]])
+    events, reached = _events_from(scene, method, real(rows["t"][first - 1]), start, most)
+    if not np.all(np.isfinite(reached)):
+        return np.int8(Ending.NOT_FINITE)
+    return np.int8(Ending.TOO_MANY_EVENTS if 2 * int(events) > most else Ending.STEP_FAILURE)
+
+
+@compiled
+def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: int):
+    """How many of the next `most` advances end in an event, and the state after them."""
+    mechanics = Mechanics(scene)
+
+    def body(_, carry):
+        y, contact, events = carry
+        after = method.advance(mechanics, contact, scene.load(t), y, jnp.asarray(method.dt, y.dtype))
+        # A rebound keeps its status; it ends on the belt all the same.
+        landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
+        return after.y, after.contact, events + (landed | (after.contact.status != contact.status))
+
+    contact = physics.status_from_forces(mechanics, scene.load(t), y)
+    y, _, events = jax.lax.fori_loop(0, most, body, (y, contact, jnp.zeros((), jnp.int32)))
+    return events, y
+
+
+@compiled
+def _simulate(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    saved: Float[Array, " T"],
+    most: int,
+    energy: bool,
+    derivatives: str,
+) -> dict:
+    mechanics = Mechanics(scene)
+    books = Books(scene) if energy else None
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, derivatives)
+    # What follows a number that was not reached is none either, also where the contact would hold it at zero.
+    reached = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
+    y = jnp.where(reached[:, None], y, jnp.nan)
+    load = jax.vmap(scene.load)(saved)
+    # A row on a jump of the load shows what follows from it, as its load does.
+    on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
+    contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
+    n = scene.structure.size
+    friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
+        contacts, load, y
+    )
+    return {
+        "t": saved,
+        "displacement": y[:, :n],
+        "velocity": y[:, n:],
+        "acceleration": jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y),
+        "status": contacts.status.astype(jnp.int8),
+        "normal_force": normal_force,
+        "friction_force": friction_force,
+        "load": load,
+        "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
+    }
+
+
+def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
+    """The contact after a jump of the load, if there is one `now`."""
+    ended = now & (physics.guards(mechanics, contact, load, y) < 0)
+    after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
+    return after
+
+
+def states_at(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    instants: Float[Array, " T"],
+    most: int,
+    books: Books | None = None,
+    derivatives: str = "both",
+) -> tuple[Float[Array, "T 2n"], Contact, Ledger | None]:
+    """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
+    where `most` advances between two of them were not enough.
+
+    Differentiable in the instants and in the load's jumps too; in "both" modes, or faster in "forward" or "reverse" mode
+    alone. In reverse mode only the states at the instants are kept; what lies between is computed again.
+    """
+    mechanics = Mechanics(scene)
+    # Steps end on the load's jumps as well as on the instants.
+    jumps = scene.load.jumps
+    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
+    # A jump outside has no share in the derivative, one exactly on an end has its full one, which `clip` would halve.
+    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
+    ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
+
+    def to_next(carry, end):
+        t, y, contact, ledger = carry
+        h = end - t
+        load = scene.load(0.5 * (t + end))
+        # A jump that falls on an instant leaves no time between them, but either may move: what happens in between is
+        # the motion under the load just before the jump.
+        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
+        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+        begin = Begin(mechanics, contact, load, y, h, ledger, books)
+        moved, following, ledger, reached = go_on(begin, method, most, derivatives)
+        # A number that was not reached is no number; counts stay what they are.
+        moved, ledger = jax.tree.map(
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
+        )
+        y = jnp.where(h > 0, moved, y + drift)
+        return (end, y, following, ledger), (y, following, ledger)
+
+    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
+    ledger0 = None if books is None else accounts.open_ledger(books, y0)
+    # Inside a scan nothing can be merged across the checkpoint anyway.
+    step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
+    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
+    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    return jax.tree.map(with_start, (y0, contact0, ledger0), after)
+
+
+def start_state(scene: Scene, y0) -> State:
+    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
+    n, normal = scene.structure.size, scene.structure.normal
+    if y0 is None:
+        # The first refuses where there is none, which nobody can tell inside a compiled function.
+        known = is_known(scene.belt_speed)
+        q = jnp.asarray(sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0])
+        return jnp.concatenate([q, jnp.zeros_like(q)])
+    is_pair = isinstance(y0, tuple | list) and len(y0) == 2
+    parts = tuple(y0) if is_pair else (y0,)
+    for part in parts:
+        if is_known(part):
+            arguments.numeric_array("y0", part)
+    parts = tuple(map(real, parts))
+    shapes = tuple(part.shape for part in parts)
+    if shapes != (((n,), (n,)) if is_pair else ((2 * n,),)):
+        raise ValueError(
+            f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
+            f"({2 * n},), but has shape {' and '.join(map(str, shapes))}."
+        )
+    y = jnp.concatenate(parts)
+    if is_known(y):
+        if not np.all(np.isfinite(y)):
+            raise ValueError("Argument `y0` must be finite.")
+        if y[normal] < 0:
+            raise ValueError(
+                f"Argument `y0` must not start below the belt, but its displacement {normal} (the gap) is "
+                f"{float(y[normal]):g} m."
+            )
+        if y[normal] == 0 and y[n + normal] < 0:
+            raise ValueError(
+                f"Argument `y0` must not start on the belt and moving into it, but its velocity {normal} (of the gap) "
+                f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
+            )
+    return y

@@ -1,0 +1,1 @@
+"""How a trajectory is stepped: exactly from event to event, in windows, or with the status switched at step ends."""

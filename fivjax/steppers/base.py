@@ -1,0 +1,161 @@
+"""What the diffrax solvers of fivjax have in common.
+
+They integrate the smooth field of the status that a trajectory is in, decide with `contact.transition` what follows
+when it ends, and carry the status in their solver state. They work in a plain `diffrax.diffeqsolve`:
+
+    sol = diffrax.diffeqsolve(
+        diffrax.ODETerm(fj.vector_field), fj.WhereSwitched(diffrax.Tsit5()), t0, t1, dt0, y0, args=scene,
+        stepsize_controller=diffrax.StepTo(ts),
+    )
+
+The state `y` is the displacements followed by the velocities, in m and m/s; the scene travels in `args`.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple, TypeVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State
+from ..model.scene import Scene
+from .section import Resolution, Rise, rise_between
+
+# Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
+MOST_ADVANCES = 4096
+
+Total = TypeVar("Total")
+
+
+class StepperState(eqx.Module):
+    """What a stepper carries from step to step."""
+
+    mechanics: Mechanics
+    contact: Contact
+
+
+def vector_field(t: Float[Array, ""], y: State, args: Scene) -> State:
+    """Rates of the state at one instant, in the status that its forces demand; the field for `diffrax.ODETerm`."""
+    mechanics, load = Mechanics(args), args.load(t)
+    contact = physics.status_from_forces(mechanics, load, y)
+    return rates(mechanics, contact, load, y)
+
+
+def rates(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> State:
+    """Rates of the state in the given status: its velocities and accelerations."""
+    velocity = y[y.shape[0] // 2 :]
+    return jnp.concatenate([velocity, physics.acceleration(mechanics, contact, load, y)])
+
+
+class Advance(NamedTuple):
+    """What one advance reached."""
+
+    y: State
+    contact: Contact
+    h: Float[Array, ""]  # how far it came, s
+    peak: Float[Array, ""]  # largest tangential speed it saw, m/s
+    rise: Rise
+
+
+def advance_between(before: State, y: State, contact: Contact, h: Float[Array, ""], tangential: int) -> Advance:
+    """An advance from one state to another that knows of what lay between only what these two say."""
+    peak = jnp.abs(y[y.shape[0] // 2 + tangential])
+    return Advance(y, contact, h, peak, rise_between(before, y, tangential))
+
+
+class Within(NamedTuple):
+    """The motion inside one advance, in a form to integrate along it: the sum of weight times integrand over the states."""
+
+    states: Float[Array, "k 2n"]
+    weights: Float[Array, " k"]  # s
+    times: Float[Array, " k"]  # s after its start
+    end: State  # where the status's own motion ends, before anything that follows from its end
+
+
+class AbstractStepper(diffrax.AbstractSolver[StepperState]):
+    """A diffrax solver that knows the contact. `simulate` and the maps call its `advance`, diffrax its `step`."""
+
+    # No advance is longer, in s.
+    dt: eqx.AbstractVar[float]
+    # Advances between two looks at whether a lane's verdict is known: a few periods of vibration.
+    round: eqx.AbstractClassVar[int]
+    term_structure: ClassVar = diffrax.ODETerm
+
+    @property
+    @abc.abstractmethod
+    def resolution(self) -> Resolution:
+        """What orbits computed by this method are good for, see `orbit`."""
+
+    @abc.abstractmethod
+    def prepare(self, mechanics: Mechanics):
+        """What `advance` wants to know of a scene, worked out once: the mechanics themselves, or matrices made of them."""
+
+    @abc.abstractmethod
+    def advance(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Advance:
+        """Go on from a state under a load that does not change, by `h` (s) or less."""
+
+    @abc.abstractmethod
+    def within(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Within:
+        """States inside an advance that came `h` (s) far, and the weights that integrate over it to the method's order."""
+
+    def init(self, terms, t0, t1, y0: State, args: Scene) -> StepperState:
+        mechanics = Mechanics(args)
+        return StepperState(mechanics, physics.status_from_forces(mechanics, args.load(0.5 * (t0 + t1)), y0))
+
+    def func(self, terms, t0, y0: State, args: Scene) -> State:
+        return terms.vf(t0, y0, args)
+
+
+def advance_by(
+    stepper: AbstractStepper,
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    h: Float[Array, ""],
+    most: int,
+) -> tuple[State, Contact, Bool[Array, ""]]:
+    """As many advances as it takes to get `h` (s) further; last, whether `most` of them were enough."""
+    y, contact, _, arrived = advance_adding(stepper, mechanics, contact, load, y, h, most, None, lambda *_: None)
+    return y, contact, arrived
+
+
+def advance_adding(
+    stepper: AbstractStepper,
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    h: Float[Array, ""],
+    most: int,
+    total: Total,
+    add: Callable[[Total, Contact, State, Advance], Total],
+    kind: str = "bounded",
+) -> tuple[State, Contact, Total, Bool[Array, ""]]:
+    """`advance_by`, with a `total` to which `add` adds what each advance contributes, from its start and what it reached.
+
+    `kind` of loop: "bounded" can be differentiated in both modes; "lax" in forward mode only, and costs less.
+    """
+
+    def body(carry):
+        y, contact, left, total = carry
+        # Equal parts; the allowance keeps rounding from adding one more, vanishingly short.
+        parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
+        after = stepper.advance(mechanics, contact, load, y, left / parts)
+        arrived = (parts == 1) & (after.h >= left)
+        total = add(total, contact, y, after)
+        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
+
+    start = (y, contact, jnp.asarray(h, y.dtype), total)
+    y, contact, left, total = eqx.internal.while_loop(
+        lambda carry: carry[2] > 0, body, start, max_steps=most, kind=kind
+    )
+    return y, contact, total, left <= 0

@@ -1,0 +1,334 @@
+r"""Steps that end exactly on contact events.
+
+Between events the motion is smooth, so its Taylor series at the start of an advance tells all: how far it may be
+trusted, where a guard is used up first, and the state there. The physics of `contact` is linear in the state but for
+friction, so the same functions map Taylor coefficients to Taylor coefficients.
+"""
+
+import itertools
+import math
+from typing import ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from diffrax import AbstractLocalInterpolation
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State
+from ..foundation import arguments
+from ..model.scene import Scene
+from .base import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_between, advance_by
+from .section import Resolution
+
+# A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
+# If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
+ROUNDING = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
+# Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
+RESTING = {"float64": 1e-7, "float32": 1e-4}
+# Or if it is this many roundings of the terms that it is a sum of.
+ROUNDINGS = 64
+MOST_ROOT_STEPS = 60
+
+
+class EventExact(AbstractStepper):
+    """A Taylor-series solver that ends its advances exactly on contact events: exact to rounding through all of them.
+
+    - The earliest of several events is taken, found on the series itself from the start of the advance onwards; a guard
+      that dips below zero and returns within the advance is found too.
+    - A guard that starts at zero, because the status has just begun there, does not fire at its own start.
+    - After an event the state is put exactly on its constraint, and the next status follows from the forces.
+
+    Event times are differentiable (implicitly: the root is corrected by one Newton step whose derivative is the exact
+    one), forward and reverse.
+
+    **Arguments:** `order` of the series; `tolerance`, the size of its last term relative to the motion, which sets how
+    far one advance reaches; `dt`, a longest advance in s (none by default).
+
+    **Raises:** `ValueError` for an order below 4, or a tolerance or `dt` that is not positive.
+    """
+
+    order_: int = eqx.field(static=True)
+    tolerance: float
+    dt: float
+
+    round: ClassVar = 64
+    interpolation_cls: ClassVar = staticmethod(lambda **info: _Restepped(**info))
+
+    def __init__(self, order: int = 16, tolerance: float = 1e-15, dt: float = math.inf):
+        arguments.whole_number("order", order, minimum=4)
+        arguments.real_number("tolerance", tolerance, above=0)
+        if not (isinstance(dt, float) and dt == math.inf):
+            arguments.real_number("dt", dt, above=0)
+        self.order_ = int(order)
+        self.tolerance = float(tolerance)
+        self.dt = float(dt)
+
+    def order(self, terms) -> int:
+        return self.order_
+
+    @property
+    def resolution(self) -> Resolution:
+        # Next to the critical perturbation an unstable cycle is left at some 5 % a period: sixty periods without a drift
+        # of 1e-8 mean that it was met to 1e-9, or that the orbit is another.
+        return Resolution(jnp.asarray(1e-8), jnp.asarray(64), jnp.asarray(1e-5))
+
+    def prepare(self, mechanics: Mechanics) -> Mechanics:
+        return mechanics
+
+    def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
+        mechanics, contact = solver_state.mechanics, solver_state.contact
+        # No step straddles a jump, so the load in its middle is the load of the whole step.
+        load = args.load(0.5 * (t0 + t1))
+        y1, next_contact, reached = advance_by(self, mechanics, contact, load, y0, t1 - t0, MOST_ADVANCES)
+        dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
+        result = diffrax.RESULTS.where(reached, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        return y1, None, dense_info, StepperState(mechanics, next_contact), result
+
+    def advance(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Advance:
+        # The last row watches the tangential velocity rise through zero: not an event of the contact, but where orbits
+        # are compared, see `orbit`.
+        unit = _time_unit(mechanics)
+        states, guards = _series(mechanics, contact, load, y, self.order_, unit)
+        rounding = _rounding(mechanics, contact, load, y, unit)
+        reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
+        power, scaled = jnp.ones_like(reach), []
+        for guard in guards:
+            scaled.append(guard * power)
+            power = power * reach
+        exact = jnp.append(physics.exactly_zero(contact), False)
+        safe, fires = _march_to_roots(
+            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
+        )
+        watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
+        safe, fires = jnp.where(watching, safe, 1.0), fires & watching
+        first = jnp.min(safe)
+        # Guards that run out at the same instant, but for rounding, do so together.
+        fires = fires & (safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps))
+        x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
+        ended = fires[:2]
+        reached, _ = _value_and_slope(states, x * reach)
+        n = y.shape[0] // 2
+        rising = jnp.arange(2 * n) == n + mechanics.tangential
+        reached = jnp.where(rising & fires[2], 0.0, reached)
+        reached = physics.on_constraint(mechanics, contact, reached)
+        resting = RESTING[y.dtype.name] * reach * unit
+        next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
+        return advance_between(y, y_next, next_contact, x * reach * unit, mechanics.tangential)
+
+    def within(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Within:
+        # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
+        # product of two series is integrated with an error far below that of the series itself.
+        unit = _time_unit(mechanics)
+        states, _ = _series(mechanics, contact, load, y, self.order_, unit)
+        points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
+        times = 0.5 * (points + 1.0) * h
+        inside, _ = _value_and_slope([state[None] for state in states], times[:, None] / unit)
+        end, _ = _value_and_slope(states, h / unit)
+        return Within(inside, 0.5 * h * weights, times, end)
+
+
+def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
+    """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
+
+    In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
+    """
+    positions, velocities = jax.lax.stop_gradient((mechanics.free_position, mechanics.free_velocity))
+    rate = jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(positions))), jnp.max(jnp.abs(velocities)))
+    _, exponent = jnp.frexp(rate)
+    return jnp.ldexp(jnp.ones_like(rate), -exponent)
+
+
+def _series(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
+) -> tuple[list[State], list[Float[Array, "3"]]]:
+    """Taylor coefficients in time of the state, and of the guards with the (negative) tangential velocity; time in units.
+
+    The physics is linear in the state but for friction, so it maps coefficients to coefficients, the constant parts
+    (load, belt) entering with the first. Only T = σμN and N (G_nn + σμ G_nt) = -a_n multiply two series.
+    """
+    n = y.shape[0] // 2
+    _, g_tn, _ = mechanics.compliance
+    none = jnp.zeros_like(load)
+    states, guards, slips, friction, normal_forces = [y], [], [], [], []
+    for k in range(order + 1):
+        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, none)
+        free = physics.free_acceleration(own, force, states[k])
+        slips.append(physics.slip_speed(own, contact, states[k]))
+        if k == 0:
+            sliding = physics.sliding_forces(own, free, contact.direction, slips[0])
+            friction.append(mechanics.friction(slips[0]))
+            compliance = mechanics.normal_compliance(contact.direction, friction[0])
+            normal_forces.append(physics.total_forces(own, *sliding)[1])
+        else:
+            if not mechanics.friction.constant:
+                friction.append(mechanics.friction.next_term(slips))
+            varying = sum((friction[j] * normal_forces[k - j] for j in range(1, len(friction))), none)
+            normal = -(free[mechanics.normal] + contact.direction * g_tn * varying) / compliance
+            normal_forces.append(normal)
+            sliding = contact.direction * (friction[0] * normal + varying), normal
+        forces = physics.forces_by_status(own, contact, free, sliding)
+        own_guards = physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k]))
+        guards.append(jnp.concatenate([own_guards, -states[k][n + mechanics.tangential, None]]))
+        rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
+        states.append(rate * (unit / (k + 1)))
+    return states[: order + 1], guards
+
+
+def _rounding(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, unit: Float[Array, ""]
+) -> list[Float[Array, "3"]]:
+    """What rounding leaves of the first three coefficients of the guards where they are zero."""
+    eps = jnp.finfo(y.dtype).eps
+    mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
+    sizes, found = jnp.abs(y), []
+    for k in range(3):
+        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
+        guards, rates = physics.magnitudes(own, contact, force, sizes)
+        found.append(ROUNDINGS * eps * jnp.concatenate([guards, jnp.zeros_like(guards[:1])]))
+        sizes = rates * (unit / (k + 1))
+    return found
+
+
+def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
+    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in its units of time."""
+    order, n = len(states) - 1, states[0].shape[0] // 2
+    # A term that is lost in the rounding of the first ones cannot be asked to be smaller still.
+    tolerance = max(tolerance, 0.25 * float(jnp.finfo(states[0].dtype).eps))
+
+    def size(k):
+        return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
+
+    tiny = float(jnp.finfo(states[0].dtype).tiny)
+    moves = (size(0) > 0) | (size(1) > 0)
+
+    def reach(last):
+        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
+        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
+        end = jnp.maximum(size(last), tiny)
+        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1)]
+        return jnp.where(moves, jnp.maximum(*steps), jnp.inf)
+
+    return jnp.minimum(reach(order), reach(order - 1))
+
+
+def _march_to_roots(
+    c: list[Float[Array, " g"]],
+    rounding: list[Float[Array, " g"]] | None = None,
+    exact: Bool[Array, " g"] | None = None,
+) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
+    r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
+
+    March from zero by steps over which a root is impossible: a lower bound on the second derivative gives
+    $g + g' d - B_2 d^2 / 2 > 0$, and where $g$, $g'$ and $g''$ are positive, one on the third gives
+    $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is what gets away from the flat start after a lift-off. On [0, 1] negative
+    coefficients alone make the bounds. So no root is skipped, a dip below zero inside the interval is found at its first
+    crossing, and near a simple root the march converges quadratically. Zeros at the very start are divided out: the
+    root at which the status began; with an `exact` start, little is not nothing. A march that runs out of steps has still
+    shown how far the way is clear.
+    """
+    eps = jnp.finfo(c[0].dtype).eps
+    size = sum(jnp.abs(ck) for ck in c)
+    shares = ROUNDING[c[0].dtype.name]
+    shares = shares if exact is None else (jnp.where(exact, 0.0, shares[0]), *shares[1:])
+    rounding = [jnp.zeros_like(size)] * 3 if rounding is None else rounding
+    zero = [jnp.abs(ck) <= jnp.maximum(size * share, r) for ck, share, r in zip(c, shares, rounding, strict=False)]
+    none = jnp.zeros_like(size)
+    for starts_at_zero in reversed(_running_and(zero)):
+        c = [jnp.where(starts_at_zero, following, own) for own, following in zip(c, [*c[1:], none], strict=True)]
+    falling = [jnp.maximum(-ck, 0.0) for ck in c]
+    bound_2 = sum(k * (k - 1) * fk for k, fk in enumerate(falling) if k > 1)
+    bound_3 = sum(k * (k - 1) * (k - 2) * fk for k, fk in enumerate(falling) if k > 2)
+    huge = 1.0 / eps
+
+    # Already used up: as after a jump of the load, or where the last advance ended a rounding short of the root.
+    spent = c[0] < 0
+
+    def open_(x, step):
+        return ~spent & (x < 1) & (step > 2 * eps * x)
+
+    def going(carry):
+        x, step, count = carry
+        return jnp.any(open_(x, step)) & (count < MOST_ROOT_STEPS)
+
+    def march(carry):
+        x, step, count = carry
+        value, slope, bend = _value_slope_bend(c, x)
+        value = jnp.maximum(value, 0.0)
+        root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
+        # Two forms of one root, each free of cancellation where it is used.
+        falls = slope < 0
+        quadratic = _ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
+        cubic = _ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
+        onward = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(quadratic, cubic), quadratic)
+        onward = jnp.where(open_(x, step), onward, step)
+        return jnp.where(open_(x, step), x + onward, x), onward, count + 1
+
+    x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
+    found = spent | ((x < 1) & (step <= 2 * eps * x))
+    return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
+
+
+def _ratio(above, below, otherwise):
+    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), otherwise)
+
+
+def _value_slope_bend(c: list, x):
+    value, slope, half_bend = c[-1], jnp.zeros_like(c[-1]), jnp.zeros_like(c[-1])
+    for ck in reversed(c[:-1]):
+        half_bend = half_bend * x + slope
+        slope = slope * x + value
+        value = value * x + ck
+    return value, slope, 2 * half_bend
+
+
+def _running_and(conditions):
+    return list(itertools.accumulate(conditions, jnp.logical_and))
+
+
+def _implicit(scaled: list[Float[Array, "3"]], fires: Bool[Array, "3"], x: Float[Array, ""]) -> Float[Array, ""]:
+    """The root with the derivative of an implicit function: one Newton step from it, whose slope is taken as given."""
+    values, slopes = _value_and_slope(scaled, x)
+    chosen = jnp.arange(3) == jnp.argmax(fires)
+    value = jnp.sum(jnp.where(chosen, values, 0.0))
+    slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
+    correction = value / jnp.where(slope == 0, 1.0, slope)
+    # The root is converged; the value of the correction is rounding, its derivative is what is wanted.
+    return x - (correction - jax.lax.stop_gradient(correction))
+
+
+def _value_and_slope(c: list, x):
+    """A polynomial and its derivative, by Horner's rule; what is not used of them costs nothing once compiled."""
+    value, slope = c[-1], jnp.zeros_like(c[-1])
+    for ck in reversed(c[:-1]):
+        slope = slope * x + value
+        value = value * x + ck
+    return value, slope
+
+
+class _Restepped(AbstractLocalInterpolation):
+    """States inside a step, by stepping there anew: as exact as the step, through every event in it."""
+
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    y0: State
+    contact: Contact
+    mechanics: Mechanics
+    load: Float[Array, ""]
+    stepper: EventExact
+
+    def evaluate(self, t0, t1=None, left=True):
+        del left
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        y, _, _ = advance_by(
+            self.stepper, self.mechanics, self.contact, self.load, self.y0, t0 - self.t0, MOST_ADVANCES
+        )
+        return y

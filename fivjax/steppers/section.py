@@ -1,0 +1,33 @@
+"""The Poincaré section: the rises of the tangential velocity through zero, where motions are compared."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..contact import State
+
+
+class Resolution(eqx.Module):
+    """What a method's crossing states are good for."""
+
+    tight: Float[Array, ""]  # crossings this close, relative to the orbit's size, are the same
+    span: Int[Array, ""]  # crossings over which they have to stay the same
+    floor: Float[Array, ""]  # excursions below this may be the method's own error
+
+
+class Rise(NamedTuple):
+    """A rise of the tangential velocity through zero, where orbits are compared."""
+
+    happened: Bool[Array, ""]
+    at: State  # the state there; anything if there was none
+
+
+def rise_between(before: State, after: State, tangential: int) -> Rise:
+    """The rise between two states close to each other, on a straight line."""
+    velocity = before.shape[0] // 2 + tangential
+    speed = before[velocity], after[velocity]
+    rose = (speed[0] < 0) & (speed[1] >= 0)
+    share = speed[0] / jnp.where(rose, speed[0] - speed[1], 1.0)
+    return Rise(rose, before + jnp.where(rose, share, 0.0) * (after - before))

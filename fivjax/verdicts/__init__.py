@@ -1,0 +1,1 @@
+"""What can be proved about the end of a trajectory."""

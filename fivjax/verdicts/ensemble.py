@@ -1,0 +1,131 @@
+"""The proof that a limit cycle is reached: the orbit has come to where many others of the same structure have met.
+
+To see a lane's own orbit return (`orbit`) takes many cycles, most of all on a torus, whose beat has to be waited for. Lanes
+that differ in their kick only share their limit cycle; where it is known, a few cycles show that a lane has come to it.
+So an *ensemble* per structure is released from rest under loads of different sizes, whatever the lanes are. Its members have
+different energies, and they come to know the limit cycle by meeting on it (`met`): an unstable cycle is met by nobody.
+
+A lane has reached the limit cycle once its crossing states, one after the other, are as close to the known ones, and do
+not recede. A crossing is one of the tangential velocity through zero, upwards.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..contact import State
+from .recurrence import DECAYED, SUSTAINED
+
+# Loads that the ensemble is released from, in final loads.
+RELEASES = np.linspace(1.5, 6.0, 16)
+# Crossing states that a lane keeps: an ensemble is followed for as many looks at a time.
+SEEN = 4
+# When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
+TESTS = (32, 36, 40, 44, 48, 52, 60, 68, 76, 88, 104, 128)
+# The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
+EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
+# Members that have to meet.
+LEAST_MEMBERS = 5
+# Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
+KEPT = 192
+# This close, relative to the own distance from equilibrium, it is the same limit cycle.
+REACHED = 0.02
+# Distances between crossing states and the nearest that are kept scatter by this much where the states lie on one torus.
+SCATTER = 0.01
+# Crossing states in a row that have to be as close.
+LOOKS_NEAR = 4
+
+
+class Attractor(eqx.Module):
+    """A limit cycle that is known: what lanes are compared with."""
+
+    # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
+    crossings: Float[Array, "s 2n"]
+    amplitude: Float[Array, ""]  # its largest tangential speed, m/s; zero while it is not known
+
+    @property
+    def known(self) -> Bool[Array, ""]:
+        return self.amplitude > 0
+
+
+class Approach(eqx.Module):
+    """How near a lane has been to the known limit cycle lately."""
+
+    seen: Float[Array, "k 2n"]  # the crossing states that were looked at last, newest first
+    near: Int[Array, ""]  # crossing states in a row that were close
+    first: Float[Array, ""]  # relative distance of the first of these
+
+
+class Ensemble(NamedTuple):
+    """The last crossing states of `e` members, look by look; NaN where a member was not followed any more."""
+
+    deviations: Float[np.ndarray, "k e 2n"]  # weighted
+    peaks: Float[np.ndarray, "k e"]  # largest tangential speed since the look before, m/s
+    times: Float[np.ndarray, "k e"]  # s
+    moving: Bool[np.ndarray, " e"]  # members that are still followed: without another verdict
+
+
+def unknown(groups: int, size: int) -> Attractor:
+    """Of several groups (leading axis), none known yet; `size` is the state's."""
+    return Attractor(np.zeros((groups, KEPT, size)), np.zeros(groups))
+
+
+def no_approach(y: State) -> Approach:
+    none = jnp.full((SEEN, y.shape[0]), jnp.nan, y.dtype)
+    return Approach(none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
+
+
+def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
+    """The crossing states and the amplitude (m/s) of the limit cycle that the ensemble has met on, if it has.
+
+    Members have met when all their crossing states of late are close to states that *others* were in some time ago. In
+    between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
+    1/s); theirs has changed in size by no more than a tenth of that.
+    """
+    looks = len(ensemble.times)
+    earlier, later = (slice(*(round(looks * share) for share in stretch)) for stretch in (EARLIER, LATER))
+    if not np.all(np.isfinite(ensemble.deviations[earlier.start :, ensemble.moving])):
+        return None
+    members = []
+    for member in np.flatnonzero(ensemble.moving):
+        others = ensemble.moving & (np.arange(len(ensemble.moving)) != member)
+        known = ensemble.deviations[earlier, others].reshape(-1, ensemble.deviations.shape[-1])
+        if len(known) and np.all(_distance(known, ensemble.deviations[later, member]) <= REACHED):
+            members.append(member)
+    if len(members) < LEAST_MEMBERS:
+        return None
+    lasting = decay * (np.mean(ensemble.times[later, members]) - np.mean(ensemble.times[earlier, members]))
+    sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]
+    if lasting < DECAYED or abs(np.log(sizes[1] / sizes[0])) > SUSTAINED * lasting:
+        return None
+    states, before = (
+        ensemble.deviations[part][:, members].reshape(-1, ensemble.deviations.shape[-1]) for part in (later, earlier)
+    )
+    # The more of them, the closer together they are on a torus.
+    states = np.concatenate([before[_distance(states, before) <= REACHED], states])
+    chosen = np.linspace(0, len(states) - 1, KEPT).round().astype(int)
+    return states[chosen], float(np.max(ensemble.peaks[later][:, members]))
+
+
+def _distance(known: Float[np.ndarray, "k 2n"], states: Float[np.ndarray, "m 2n"]) -> Float[np.ndarray, " m"]:
+    size = np.sum(states**2, axis=-1)
+    apart = size[:, None] - 2 * states @ known.T + np.sum(known**2, axis=-1)
+    return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0) / size)
+
+
+def approached(approach: Approach, attractor: Attractor, crossing: State) -> tuple[Approach, Bool[Array, ""]]:
+    """The approach after a look at a crossing state (a weighted deviation), and whether the attractor is reached."""
+    size = jnp.sum(crossing**2)
+    apart = size - 2 * attractor.crossings @ crossing + jnp.sum(attractor.crossings**2, axis=-1)
+    distance = jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size)
+    close = attractor.known & (distance <= REACHED)
+    first = jnp.where(close & (approach.near == 0), distance, approach.first)
+    near = jnp.where(close, approach.near + 1, 0)
+    reached = (near >= LOOKS_NEAR) & (distance <= jnp.maximum(first, SCATTER))
+    fresh = jnp.any(crossing != approach.seen[0])
+    look = Approach(jnp.concatenate([crossing[None], approach.seen[:-1]]), near, first)
+    return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), look, approach), fresh & reached

@@ -1,0 +1,198 @@
+r"""The proof that sliding is reached: no contact event can happen again.
+
+While the contact slides and the load no longer changes, the deviation $z$ from the sliding equilibrium obeys
+$\dot z = A z$ (plus a remainder, for friction that depends on speed). Sliding ends when the pressing force or the slip
+speed runs out. Both are affine in $z$, so the proof is a bound on two signals $\sum_k a_k e^{λ_k t}$ over all the
+future. A quiet interval proves nothing: close to the stability limit two modes are almost parallel, and the answer to a
+kick grows for a second before it decays.
+
+- Constant friction: the exact envelope of the sum, the slow beat of the modes included (`envelope_peak`).
+- Speed-dependent friction: the linear motion with a bound on the remainder (`decays_nonlinearly`).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from ..contact import Contact, Mechanics, State, Status
+from ..linear.linearisation import LOWEST_SLIP, LinearSliding, sliding_coordinates
+
+ENVELOPE_DECADES = 12.0
+ENVELOPE_INSTANTS = 161
+# Modes this close, relative to the fastest, are near-parallel or may become so.
+CLOSE = 0.2
+
+
+class SlidingModes(eqx.Module):
+    """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper one is kept, counted twice."""
+
+    linear: LinearSliding
+    eigenvalues: Complex[Array, " k"]  # 1/s
+    to_modal: Complex[Array, "k m"]  # rows of V⁻¹
+    pressing: Complex[Array, " k"]  # shares of the modes in the two signals
+    slip: Complex[Array, " k"]
+    remainder: Complex[Array, " k"]
+    envelope: "Envelope"
+    slowest_decay: Float[Array, ""]  # of the structure on a belt without friction, 1/s; negative where it grows
+    stable: Bool[Array, ""]
+
+
+class Envelope(eqx.Module):
+    """What `envelope_peak` wants to know of the modes, at some instants; clusters are modes that are bounded together."""
+
+    growth: Complex[Array, "c i k"]  # of each mode relative to the mean of its cluster
+    bending: Float[Array, "c i k"]  # bounds on the second derivatives of that, 1/s²
+    decay: Float[Array, "c i-1"]  # of the cluster
+    chord: Float[Array, "c i-1"]  # how far a unit of bending departs from the chord, s²
+    last: Float[Array, "c k"]  # sizes of the modes at the last instant
+    members: Float[Array, "c k"]  # one for the modes of a cluster, else zero
+
+
+def sliding_modes(linear: LinearSliding) -> SlidingModes:
+    """Modal coordinates of a batch of sliding motions (leading axis), by NumPy.
+
+    They are wanted once per structure and friction, not once per step, and general eigenvectors are not to be had on
+    every accelerator.
+    """
+    linear = jax.tree.map(np.asarray, linear)
+    finite = np.all(np.isfinite(linear.matrix), axis=(-2, -1))
+    matrix = np.where(finite[:, None, None], linear.matrix, -np.eye(linear.matrix.shape[-1]))
+    eigenvalues, vectors = np.linalg.eig(matrix)
+    # A defective matrix has no modal coordinates. Infinite ones make every bound infinite, so nothing is proved.
+    inverse = np.full(vectors.shape, np.inf, complex)
+    regular = finite & (np.linalg.cond(vectors) < 1e12)
+    inverse[regular] = np.linalg.inv(vectors[regular])
+    # Conjugate pairs: the upper half plane first, then cut off what only repeats it.
+    order = np.argsort(-eigenvalues.imag, axis=-1, kind="stable")
+    kept = int(np.max(np.sum(eigenvalues.imag >= 0, axis=-1)))
+    eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)[:, :kept]
+    inverse = np.take_along_axis(inverse, order[:, :, None], axis=1)[:, :kept]
+    vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
+    count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
+    return SlidingModes(
+        linear=linear,
+        eigenvalues=eigenvalues.astype(complex),
+        to_modal=inverse,
+        pressing=count * np.einsum("li,lik->lk", linear.pressing, vectors),
+        slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
+        remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        envelope=envelope(eigenvalues, _clusters(eigenvalues)),
+        slowest_decay=_slowest_decay(linear.frictionless),
+        stable=regular & np.all(eigenvalues.real < 0, axis=-1),
+    )
+
+
+def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
+    finite = np.all(np.isfinite(matrix), axis=(-2, -1))
+    return np.where(finite, -np.max(np.linalg.eigvals(np.where(finite[:, None, None], matrix, 0)).real, axis=-1), 0.0)
+
+
+def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
+    """For each set of eigenvalues, in falling order of frequency, rows of ones where modes are close to each other."""
+    gaps = np.abs(np.diff(eigenvalues, axis=-1)) > CLOSE * np.abs(eigenvalues[:, :1])
+    number = np.cumsum(np.concatenate([np.zeros((len(gaps), 1), int), gaps], axis=-1), axis=-1)
+    return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
+
+
+def slides_forever(
+    mechanics: Mechanics,
+    modes: SlidingModes,
+    contact: Contact,
+    deviation: State,
+    under_final_load: Bool[Array, ""] | bool,
+) -> Bool[Array, ""]:
+    """Whether a bound shows that a contact which slides now, `under_final_load`, never stops sliding; from the state's
+    deviation from the equilibrium.
+    """
+    linear = modes.linear
+    z = deviation[sliding_coordinates(deviation.shape[0] // 2, mechanics.normal)]
+    modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
+    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & under_final_load
+    sliding = sliding & modes.stable & linear.exists
+    if not mechanics.friction.constant:
+        return sliding & decays_nonlinearly(modes, modal)
+    members = modes.envelope.members
+    signals = [modes.pressing * modal, modes.slip * modal]
+    margins = [linear.pressing_margin, linear.slip_margin]
+    # The bound is dear. In a batch a loop runs only if one of the lanes wants it: where both signals, each cluster of
+    # modes at its largest, are within their margins now.
+    for shares, margin in zip(signals, margins, strict=True):
+        sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
+
+    def prove(carry):
+        _, _, signals = carry
+        peaks = [envelope_peak(shares, modes.envelope) for shares in signals]
+        proved = (peaks[0] < margins[0]) & (peaks[1] < margins[1])
+        # The signals change, so that XLA cannot take what depends on them out of the loop and compute it every time.
+        return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
+
+    begin = sliding, jnp.zeros_like(sliding), signals
+    return jax.lax.while_loop(lambda carry: carry[0], prove, begin)[1]
+
+
+def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
+    """Tables for `envelope_peak`, of a batch of sets of decaying modes (leading axis), by NumPy.
+
+    Clusters are rows of ones and zeros.
+    """
+    members = clusters[:, :, None, :]  # [set, cluster, instant, mode]
+    own = np.where(np.isfinite(eigenvalues), eigenvalues, -1.0)[:, None, None, :]
+    mean = np.sum(members * own, axis=-1, keepdims=True) / np.maximum(np.sum(members, axis=-1, keepdims=True), 1.0)
+    offsets = members * (own - mean)
+    # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
+    slowest = 1e-6 * np.max(np.abs(own), axis=-1, keepdims=True) + 1e-300
+    horizon = ENVELOPE_DECADES / np.maximum(-mean.real, slowest)
+    t = horizon * np.linspace(0.0, 1.0, ENVELOPE_INSTANTS)[:, None] ** 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        growth = members * np.exp(offsets * t)
+        return Envelope(
+            growth=growth,
+            bending=np.abs(growth) * np.abs(offsets) ** 2,
+            decay=np.exp(mean.real * t[..., :-1, :])[..., 0],
+            chord=np.diff(t, axis=-2)[..., 0] ** 2 / 8,
+            last=(members * np.exp(own.real * horizon))[..., 0, :],
+            members=clusters,
+        )
+
+
+def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Array, ""]:
+    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes,
+    tight also for near-parallel ones.
+
+    Near a coalescence the shares $a_k$ are huge and cancel, so the sum of their sizes is a useless bound. With the mean
+    exponent $\bar λ$ of such a cluster of modes taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two
+    instants a distance $h$ apart it lies within $h^2 \max|u''| / 8$ of the chord, and
+    $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past the last instant the sum of sizes has decayed and is bound
+    enough. Clusters are bounded one by one.
+    """
+    sizes = jnp.abs(shares)
+    growth = envelope.growth
+    real, imag = (
+        growth.real @ shares.real - growth.imag @ shares.imag,
+        growth.real @ shares.imag + growth.imag @ shares.real,
+    )
+    slow = real**2 + imag**2
+    bend = envelope.bending @ sizes  # [cluster, instant]
+    chord = jnp.sqrt(jnp.maximum(slow[:, 1:], slow[:, :-1])) + envelope.chord * jnp.maximum(bend[:, 1:], bend[:, :-1])
+    peaks = jnp.maximum(jnp.max(envelope.decay * chord, axis=-1), envelope.last @ sizes)
+    bound = jnp.sum(jnp.minimum(peaks, envelope.members @ sizes))
+    return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
+
+
+def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
+    r"""Whether the motion decays although friction depends on speed.
+
+    The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
+    pressing acceleration by $E/κ$. The remainder that linearisation leaves out is then at most $C E^2$, so
+    $\dot E ≤ -r E + F C E^2$ with $r$ the slowest decay rate and $F = \sum e_k |f_k|$: once $F C E < r$, $E$ falls for ever.
+    """
+    linear = modes.linear
+    balance = linear.slip_margin / linear.pressing_margin
+    weights = jnp.abs(modes.slip) + balance * jnp.abs(modes.pressing)
+    size = jnp.sum(weights * jnp.abs(modal))
+    drive = jnp.sum(weights * jnp.abs(modes.remainder))
+    bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
+    rate = -jnp.max(modes.eigenvalues.real)
+    return (drive * bend * size < rate) & (size < LOWEST_SLIP * linear.slip_margin)

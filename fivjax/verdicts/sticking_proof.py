@@ -1,0 +1,79 @@
+r"""The proof that a contact sticks for ever, its forces growing without bound: a structure that has wedged itself.
+
+Where friction is strong and the structure leans into the belt, what sticks presses itself on ever harder, and the belt
+carries it along for ever: the model has no bounded motion then. While it sticks, $q_t = x + v s$ after the time $s$, and the
+other coordinates $q_r$ follow a drift $a + b s$ with a deviation $e$ that obeys
+$M_{rr} \ddot e + C_{rr} \dot e + K_{rr} e = 0$, so that $\tfrac12 \dot e^T M_{rr} \dot e + \tfrac12 e^T K_{rr} e$ never grows.
+The guards are affine in the state: they rise along the drift, and the deviation changes them by a bounded amount.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State, Status
+from ..model.scene import Scene
+
+
+class Wedge(eqx.Module):
+    """What the proof wants to know of a scene, worked out once."""
+
+    load: Float[Array, ""]  # N
+    base: Float[Array, " 2n"]  # the drift's state where the tangential displacement is zero
+    per_displacement: Float[Array, " 2n"]  # and how it changes with that displacement
+    slopes: Float[Array, "2"]  # how fast the guards rise along the drift, N/s
+    energy: Float[Array, "2n 2n"]  # the deviation's energy as a quadratic form, J
+    reach: Float[Array, "2"]  # how far a deviation of unit energy can move the guards, N/√J
+
+
+def wedge(scene: Scene) -> Wedge:
+    """The drift of a sticking contact under the final load, and what its guards do along it."""
+    structure, mechanics, load = scene.structure, Mechanics(scene), scene.load.final
+    n, t = structure.size, structure.tangential
+    rest = np.array([i for i in range(n) if i not in (t, structure.normal)], int)
+    block = np.ix_(rest, rest)
+    mass, damping, stiffness = structure.mass[block], structure.damping[block], structure.stiffness[block]
+    speed = scene.belt_speed
+    coupling, drag = structure.stiffness[rest, t], structure.damping[rest, t]
+    per_x = -_solve(stiffness, coupling)
+    rate = per_x * speed
+    base = _solve(stiffness, structure.load_direction[rest] * load - drag * speed - damping @ rate)
+    zero = jnp.zeros(n, structure.mass.dtype)
+    velocity = zero.at[rest].set(rate).at[t].set(speed)
+    contact = Contact(jnp.asarray(Status.STICK, jnp.int32), jnp.ones((), zero.dtype))
+
+    def guards(y):
+        return physics.guards(mechanics, contact, load, y)
+
+    at = jnp.concatenate([zero.at[rest].set(base), velocity])
+    along = jnp.concatenate([velocity, zero])
+    _, slopes = jax.jvp(guards, (at,), (along,))
+    rows = jax.jacfwd(guards)(at)
+    position, motion = rows[:, rest], rows[:, n + rest]
+    squares = jnp.sum(position * _solve(stiffness, position.T).T + motion * _solve(mass, motion.T).T, axis=-1)
+    energy = jnp.zeros((2 * n, 2 * n), zero.dtype).at[block].set(stiffness).at[np.ix_(n + rest, n + rest)].set(mass)
+    return Wedge(
+        load=load,
+        base=at,
+        per_displacement=jnp.concatenate([zero.at[rest].set(per_x).at[t].set(1.0), zero]),
+        slopes=slopes,
+        energy=energy,
+        reach=jnp.sqrt(jnp.where(squares >= 0, squares, jnp.inf)),
+    )
+
+
+def sticks_forever(wedge: Wedge, mechanics: Mechanics, contact: Contact, y: State) -> Bool[Array, ""]:
+    """Whether a bound shows that a contact which sticks now, under its final load, never comes free."""
+    drift = wedge.base + wedge.per_displacement * y[mechanics.tangential]
+    deviation = y - drift
+    size = jnp.sqrt(jnp.maximum(jnp.sum(deviation * jnp.sum(wedge.energy * deviation, axis=-1)), 0.0))
+    guards = physics.guards(mechanics, contact, wedge.load, drift)
+    sticking = contact.status == Status.STICK
+    return sticking & jnp.all(wedge.slopes > 0) & jnp.all(guards > wedge.reach * size)
+
+
+def _solve(matrix, right):
+    return right if matrix.shape[0] == 0 else jnp.linalg.solve(matrix, right)

@@ -1,0 +1,37 @@
+"""What can be said of a trajectory's end: proved, or withheld, or why not (the neighbouring modules hold the proofs)."""
+
+import enum
+
+from ..simulation.ending import Ending
+
+
+class Verdict(enum.IntEnum):
+    """The codes in a map. `MEANING` has a sentence for each."""
+
+    SLIDING = 0
+    LIMIT_CYCLE = 1
+    UNDECIDED = -1
+    NOT_FINITE = Ending.NOT_FINITE
+    NO_EQUILIBRIUM = -3
+    PAINLEVE = -4
+    NOT_RUN = -5
+    TOO_MANY_EVENTS = Ending.TOO_MANY_EVENTS
+    UNBOUNDED = -7
+    STEP_FAILURE = Ending.STEP_FAILURE
+
+
+MEANING = {
+    Verdict.SLIDING: "returns to steady sliding: a bound shows that no contact event can happen again",
+    Verdict.LIMIT_CYCLE: "stays on an orbit with contact events that was seen to return, or that many others have met on",
+    Verdict.UNDECIDED: "neither was proved before the time limit; raise `t_max`, or look at the lane with `simulate`",
+    Verdict.NOT_FINITE: "the state stopped being finite; take a smaller step or check the parameters",
+    Verdict.NO_EQUILIBRIUM: "no steady sliding to start from; change the load or the friction",
+    Verdict.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé); lower it",
+    Verdict.TOO_MANY_EVENTS: "contact events came without end at one instant; "
+    "change the restitution or the belt speed a little",
+    Verdict.UNBOUNDED: "grows without bound: it sticks for ever, pressed on ever harder, or has grown a billionfold; "
+    "lower the friction or the belt's inclination",
+    Verdict.STEP_FAILURE: "its fastest vibration needs more steps than `max_steps` to reach a verdict; raise that, "
+    "lower `t_max`, or soften what is stiffest",
+    Verdict.NOT_RUN: "interrupted before a verdict; run it again",
+}
