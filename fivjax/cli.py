@@ -202,7 +202,7 @@ class Cea:
         _say(data, picture)
         direction = 1 if self.scene.belt_speed >= 0 else -1
         limit = cea.stability_limit(scene.structure, direction=direction)
-        if limit.outcome is cea.Outcome.FOUND:
+        if limit.outcome is cea.StabilityOutcome.FOUND:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
             print(cea.sensitivity(scene.structure, direction=direction))
         else:

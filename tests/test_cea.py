@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize_scalar
 
 import fivjax as fj
+from fivjax import contact
 from fivjax.foundation.linear_solve import solve
-from fivjax.linear import cea
-from fivjax.linear import routh_hurwitz as stability
-from fivjax.linear.critical import Mechanism, Outcome
+from fivjax.linear import cea, linearisation, polynomials, routh_hurwitz
+from fivjax.linear.linearisation import linear_sliding
+from fivjax.linear.outcomes import Mechanism, StabilityOutcome
+from fivjax.model.scene import steady_sliding
 
 # μ_crit is a root where the growth rate has a slope of some 500/s and rounding of some 1e-12/s: both routes agree to 1e-14.
 MU_CRIT = reference.critical_friction()
@@ -48,7 +50,7 @@ def test_critical_friction_of_table_1():
     limit = cea.stability_limit(belt())
     assert abs(cea.critical_friction(belt()) - MU_CRIT) < 1e-13
     assert limit.mu == cea.critical_friction(belt())
-    assert limit.outcome is Outcome.FOUND
+    assert limit.outcome is StabilityOutcome.FOUND
     assert limit.mechanism is Mechanism.FLUTTER
     # 40 digits with mpmath: Re and Im det(-ω²M + iωC + K) = 0.
     assert abs(limit.mu - 0.22822534771804482) < 1e-15
@@ -87,6 +89,28 @@ def test_linearisation_with_falling_friction():
     np.testing.assert_allclose(cea.friction_slope(scene), slope, rtol=1e-14)
     rates = np.linalg.eigvals(expected).real
     np.testing.assert_allclose(cea.growth_rate(scene), rates.max(), rtol=1e-10)
+
+
+def test_the_sliding_motion_is_the_derivative_of_the_contact_physics():
+    """The projected matrices (Eq. 3, with the slope of friction) against automatic differentiation of `contact`."""
+    law = fj.ExponentialDecay(mu_static=0.4, mu_dynamic=0.2, decay=0.5)
+    scene = fj.Scene(belt(theta=0.3), law, belt_speed=-0.5, load=fj.ConstantLoad(100.0))
+    free = [0, 1, 3, 4]
+
+    @jax.jit
+    def derivative(scene):
+        mechanics, sliding = contact.Mechanics(scene), contact.Contact(np.int32(fj.Status.SLIDE), -1.0)
+        q, _ = steady_sliding(scene, 100.0)
+
+        def rates(z):
+            y = jax.numpy.concatenate([q, 0 * q]).at[np.array(free)].add(z)
+            return jax.numpy.concatenate([y[3:], contact.acceleration(mechanics, sliding, 100.0, y)])[np.array(free)]
+
+        return jax.jacfwd(rates)(jax.numpy.zeros(4)), linear_sliding(scene).matrix
+
+    with jax.enable_x64(True):
+        expected, found = derivative(scene)
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-9)
 
 
 def test_sensitivities_against_differences_of_the_scipy_route():
@@ -200,7 +224,7 @@ def test_damped_coalescence_is_the_closest_approach():
     closest = minimize_scalar(distance, bounds=(0.2262, 0.2265), method="bounded", options={"xatol": 1e-12})
     meeting = cea.coalescence(belt(), damped=True)
     assert meeting.damped
-    assert meeting.outcome is Outcome.FOUND
+    assert meeting.outcome is StabilityOutcome.FOUND
     # They differ by the square of the imperfection, 2e-4.
     assert abs(meeting.mu - closest.x) < 1e-8
     assert 0 < meeting.imperfection < 1e-3
@@ -280,14 +304,14 @@ def test_two_degrees_of_freedom(mass, damping, stiffness, mu, mechanism, frequen
     np.testing.assert_allclose(limit.mu, mu, rtol=1e-14)
     assert limit.mechanism is mechanism
     np.testing.assert_allclose(limit.frequency, frequency, rtol=1e-14)
-    assert limit.outcome is (Outcome.FOUND if np.isfinite(mu) else Outcome.NEVER_UNSTABLE)
+    assert limit.outcome is (StabilityOutcome.FOUND if np.isfinite(mu) else StabilityOutcome.NEVER_UNSTABLE)
 
 
 @pytest.mark.parametrize("parameters", [{"theta": 0.0}, {"theta": 0.0, "c1": 0.0, "c2": 0.0}, {"c1": 1e3, "c2": 1e3}])
 def test_never_unstable_is_said_by_name(parameters):
     structure = belt(**parameters)
     limit = cea.stability_limit(structure)
-    assert limit.outcome is Outcome.NEVER_UNSTABLE
+    assert limit.outcome is StabilityOutcome.NEVER_UNSTABLE
     assert limit.mu == np.inf
     assert np.max([reference.growth(mu, **parameters) for mu in np.linspace(0, 50, 501)]) < 1e-10
     with pytest.raises(ValueError, match="never unstable"):
@@ -307,11 +331,13 @@ def partly_damped(sign):
     return fj.Structure(np.eye(3), damping, stiffness, [0.0, 0.0, -1.0])
 
 
-@pytest.mark.parametrize(("sign", "outcome"), [(1, Outcome.ALWAYS_UNSTABLE), (-1, Outcome.NEVER_UNSTABLE)])
+@pytest.mark.parametrize(
+    ("sign", "outcome"), [(1, StabilityOutcome.ALWAYS_UNSTABLE), (-1, StabilityOutcome.NEVER_UNSTABLE)]
+)
 def test_a_mode_that_no_damper_reaches(sign, outcome):
     structure = partly_damped(sign)
     growth = np.linalg.eigvals(reference.general_state_matrix(0.1, **matrices(structure))).real.max()
-    assert (growth > 1e-7) == (outcome is Outcome.ALWAYS_UNSTABLE)
+    assert (growth > 1e-7) == (outcome is StabilityOutcome.ALWAYS_UNSTABLE)
     limit = cea.stability_limit(structure)
     assert limit.outcome is outcome
     assert limit.mu == (0.0 if sign > 0 else np.inf)
@@ -403,7 +429,7 @@ def test_random_structures(seed, n):
     top = min(1.05 * limit.mu, 20.0)
     expected = reference.general_critical_friction(top, 301, **matrices(structure))
     if np.isinf(expected):
-        assert limit.mu > top or limit.outcome is Outcome.NEVER_UNSTABLE
+        assert limit.mu > top or limit.outcome is StabilityOutcome.NEVER_UNSTABLE
     else:
         assert abs(limit.mu - expected) < 1e-10 * expected
     found = cea.eigenvalues(structure, 0.3)
@@ -438,16 +464,16 @@ def test_units_do_not_matter(mass, time, k1, theta):
 def test_margin_is_the_product_of_sums_of_eigenvalues():
     mu = 0.1
     with jax.enable_x64(True):
-        scale = float(stability.time_scale(belt()))
+        scale = float(linearisation.time_scale(belt()))
     values = reference.eigenvalues(mu) / scale
     product = np.prod([-(values[i] + values[j]) for i in range(4) for j in range(i)]).real
     # Third of the determinants of the polynomial, made of differences of terms 1e6 times larger.
     mass, damping, stiffness = reference.sliding(mu, **reference.TABLE_1)
     with jax.enable_x64(True):
-        coefficients = stability.characteristic_polynomial(mass, damping, stiffness, scale)
-        np.testing.assert_allclose(stability.hurwitz_determinants(coefficients)[2], product, rtol=1e-8)
+        coefficients = polynomials.characteristic_polynomial(mass, damping, stiffness, scale)
+        np.testing.assert_allclose(routh_hurwitz.hurwitz_determinants(coefficients)[2], product, rtol=1e-8)
         np.testing.assert_allclose(coefficients, np.poly(values).real, rtol=1e-12)
-        sums = np.linalg.eigvals(stability.bialternate_sum(reference.state_matrix(mass, damping, stiffness) / 400))
+        sums = np.linalg.eigvals(routh_hurwitz.bialternate_sum(reference.state_matrix(mass, damping, stiffness) / 400))
     expected = [(values[i] + values[j]) * scale / 400 for i in range(4) for j in range(i)]
     for value in expected:
         assert np.min(np.abs(sums - value)) < 1e-9
@@ -467,7 +493,7 @@ def test_roots_of_polynomials_in_a_batch():
     roots = np.concatenate([roots, roots.conj(), rng.normal(size=(500, 2))], axis=1)
     with jax.enable_x64(True):
         coefficients = [jax.numpy.asarray(c) for c in np.array([np.poly(r).real for r in roots]).T]
-        found = np.asarray(stability.polynomial_roots(coefficients)).T
+        found = np.asarray(polynomials.polynomial_roots(coefficients)).T
     # Some of 500 random sets have roots close together; each is then less well determined by its coefficients.
     distance = np.abs(found[:, :, None] - roots[:, None, :])
     assert distance.min(axis=1).max() < 1e-6

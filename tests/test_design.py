@@ -6,8 +6,8 @@ import pytest
 
 import fivjax as fj
 from fivjax.linear import cea, design
-from fivjax.linear.critical import Outcome
 from fivjax.linear.design import DesignOutcome
+from fivjax.linear.outcomes import StabilityOutcome
 
 ROUTES = ["eigenvalues", "routh-hurwitz"]
 STARTS = np.random.default_rng(2025).uniform(0.0, 1.0, 20)
@@ -18,7 +18,7 @@ MU_CRIT = reference.critical_friction()
 def test_the_search_converges_from_random_starts(route):
     for start in STARTS:
         found = design.search_critical_friction(fj.belt_oscillator(), start, route=route)
-        assert found.outcome is Outcome.FOUND
+        assert found.outcome is StabilityOutcome.FOUND
         # Along the eigenvalues what rounding may feign, 1e-12 of their size, is taken off the growth rate.
         assert abs(found.mu - MU_CRIT) < 1e-12
         assert found.steps <= 20
@@ -30,7 +30,7 @@ def test_the_search_converges_from_the_worst_starts(route):
     meeting, closest = cea.coalescence(structure).mu, cea.coalescence(structure, damped=True).mu
     for start in (meeting, closest, MU_CRIT, np.nextafter(MU_CRIT, 0), 1e-12, 99.0):
         found = design.search_critical_friction(structure, start, route=route)
-        assert found.outcome is Outcome.FOUND
+        assert found.outcome is StabilityOutcome.FOUND
         assert abs(found.mu - MU_CRIT) < 1e-12
 
 
@@ -53,13 +53,13 @@ def test_the_search_converges_where_modes_meet_exactly():
 @pytest.mark.parametrize("route", ROUTES)
 def test_never_unstable_is_an_outcome(route):
     found = design.search_critical_friction(fj.belt_oscillator(theta=0.0), 0.3, route=route)
-    assert found.outcome is Outcome.NEVER_UNSTABLE
+    assert found.outcome is StabilityOutcome.NEVER_UNSTABLE
     assert np.isnan(found.mu)
 
 
 def test_running_out_of_steps_is_an_outcome():
     found = design.search_critical_friction(fj.belt_oscillator(), 0.9, max_steps=2)
-    assert found.outcome is Outcome.UNDECIDED
+    assert found.outcome is StabilityOutcome.UNDECIDED
     assert np.isnan(found.mu)
 
 

@@ -1,4 +1,4 @@
-"""The sliding motion linearised about its equilibrium, by automatic differentiation of the one physics."""
+"""The sliding motion linearised about its equilibrium: its state matrix, and the signals that end it."""
 
 import equinox as eqx
 import jax
@@ -7,9 +7,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, Status
-from ..model.friction import Coulomb
+from ..contact import Mechanics
+from ..foundation.linear_solve import solve
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
+from ..model.structure import Structure
 
 # The proof for speed-dependent friction speaks of slip speeds above this share of the belt's.
 LOWEST_SLIP = 0.5
@@ -37,18 +39,20 @@ class LinearSliding(eqx.Module):
 
 
 def linear_sliding(scene: Scene) -> LinearSliding:
-    """The sliding motion's Jacobian and the two signals that end it, from `contact` by automatic differentiation."""
+    """The sliding motion's state matrix, and the two signals that end it.
+
+    The matrix is that of Eq. 3 (`model.sliding`), with the damping that friction which varies with speed adds. The signals
+    are derivatives of `contact`, by automatic differentiation.
+    """
     mechanics = Mechanics(scene)
     n, load = scene.structure.size, scene.load.final
     q, normal_force = steady_sliding(scene, load)
     equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
     direction = jnp.sign(scene.belt_speed)
-    contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), direction)
-    keep = sliding_coordinates(n, mechanics.normal)
-
-    def rates(z, mechanics):
-        y = equilibrium.at[keep].add(z)
-        return jnp.concatenate([y[n:], physics.acceleration(mechanics, contact, load, y)])[keep]
+    keep = sliding_states(n, mechanics.normal)
+    friction = direction * mechanics.friction(jnp.abs(scene.belt_speed))
+    mass, damping, stiffness = sliding_matrices(scene.structure, friction)
+    damping = damping + slope_damping(scene, normal_force) * tangential_corner(scene.structure)
 
     def pressing(z):
         return -physics.free_acceleration(mechanics, load, equilibrium.at[keep].add(z))[mechanics.normal]
@@ -68,9 +72,9 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     )
     return LinearSliding(
         equilibrium=equilibrium,
-        matrix=jax.jacfwd(rates)(rest, mechanics),
+        matrix=state_matrix(mass, damping, stiffness),
         # Whatever sustains a vibration, this damps it.
-        frictionless=jax.jacfwd(rates)(rest, eqx.tree_at(lambda m: m.friction, mechanics, Coulomb(0.0))),
+        frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(friction))),
         pressing=jax.grad(pressing)(rest),
         pressing_margin=pressing(rest),
         slip=jax.grad(slip)(rest),
@@ -84,6 +88,33 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     )
 
 
-def sliding_coordinates(n: int, normal: int) -> np.ndarray:
-    """Places in the state of what sliding leaves free: all but the normal coordinate and its rate."""
-    return np.array([i for i in range(2 * n) if i not in (normal, n + normal)])
+def state_matrix(
+    mass: Float[Array, "k k"], damping: Float[Array, "k k"], stiffness: Float[Array, "k k"]
+) -> Float[Array, "m m"]:
+    """A of ż = A z for M q̈ + C q̇ + K q = 0 with z = (q, q̇); not finite where M is singular (Painlevé's paradox)."""
+    k = mass.shape[0]
+    lower = -solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=mass.dtype), lower])
+
+
+def slope_damping(scene: Scene, normal_force: Float[Array, ""]) -> Float[Array, ""]:
+    """What friction that varies with slip speed adds to damping along the belt, N dμ/dv in N·s/m: negative where it falls."""
+    speed = jnp.abs(scene.belt_speed)
+    if scene.friction.constant:
+        # The sliding motion is linear then, about whatever state.
+        return jnp.zeros_like(speed)
+    return normal_force * jax.grad(lambda v: scene.friction(v))(speed)
+
+
+def tangential_corner(structure: Structure) -> np.ndarray:
+    """One on the tangential diagonal of a matrix of the sliding motion, zero elsewhere."""
+    along = sliding_coordinates(structure.size, structure.normal) == structure.tangential
+    return np.outer(along, along).astype(np.float64)
+
+
+def time_scale(structure: Structure) -> Float[Array, ""]:
+    """ω₀ in rad/s: the root mean square of the uncoupled frequencies of the sliding coordinates, 1 if all are zero."""
+    keep = sliding_coordinates(structure.size, structure.normal)
+    squares = jnp.diagonal(structure.stiffness)[keep] / jnp.diagonal(structure.mass)[keep]
+    mean = jax.lax.stop_gradient(jnp.mean(squares))
+    return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))

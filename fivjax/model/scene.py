@@ -9,6 +9,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real, returning_numpy
 from .friction import AbstractFriction
 from .load import AbstractLoad, ConstantLoad
+from .sliding import sliding_load, sliding_matrices
 from .structure import Structure
 
 IMPACT_LAWS = ("coulomb", "frictionless", "reset")
@@ -96,20 +97,6 @@ class Scene(eqx.Module):
         )
 
 
-def sliding_stiffness(scene: Scene, mu) -> tuple[Float[Array, "m m"], Float[Array, " m"]]:
-    """Stiffness and load direction of the steady sliding motion, normal coordinate left out (K and F of Eq. 3).
-
-    Rows are the structure's without the normal one, the tangential row less σμ times the normal row.
-    """
-    structure = scene.structure
-    t, n = structure.tangential, structure.normal
-    direction = jnp.sign(scene.belt_speed)
-    keep = np.array([i for i in range(structure.size) if i != n])
-    stiffness = structure.stiffness.at[t].add(-direction * mu * structure.stiffness[n])
-    load = structure.load_direction.at[t].add(-direction * mu * structure.load_direction[n])
-    return stiffness[keep][:, keep], load[keep]
-
-
 @returning_numpy
 def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
     r"""Displacements of steady sliding, $K^{-1}F$ of Eq. 3, under the load before any jump, in m.
@@ -137,8 +124,9 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
 def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is none."""
     structure = scene.structure
-    mu = scene.friction(jnp.abs(scene.belt_speed))
-    stiffness, load = sliding_stiffness(scene, mu)
+    friction = jnp.sign(scene.belt_speed) * scene.friction(jnp.abs(scene.belt_speed))
+    _, _, stiffness = sliding_matrices(structure, friction)
+    load = sliding_load(structure, friction)
     reduced = jnp.linalg.solve(stiffness, load * force)
     # A motion that is free but for rounding answers with displacements whose rounding alone outweighs the load.
     rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))

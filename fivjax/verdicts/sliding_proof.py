@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status
-from ..linear.linearisation import LOWEST_SLIP, LinearSliding, sliding_coordinates
+from ..linear.linearisation import LOWEST_SLIP, LinearSliding
+from ..model.sliding import sliding_states
 
 ENVELOPE_DECADES = 12.0
 ENVELOPE_INSTANTS = 161
@@ -107,7 +108,7 @@ def slides_forever(
     deviation from the equilibrium.
     """
     linear = modes.linear
-    z = deviation[sliding_coordinates(deviation.shape[0] // 2, mechanics.normal)]
+    z = deviation[sliding_states(deviation.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
     sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & under_final_load
     sliding = sliding & modes.stable & linear.exists

@@ -1,0 +1,143 @@
+"""Stability of steady sliding over two parameters, in one batch."""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
+from ..foundation.precision import in_double_precision, real
+from ..io.datasets import labelled
+from ..model.scene import Scene
+from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_rows
+from ..model.structure import Structure
+from .linearisation import linear_sliding, slope_damping, tangential_corner, time_scale
+from .polynomials import characteristic_polynomial, determinant, polynomial_roots
+from .routh_hurwitz import LARGEST_EXPANDED, hurwitz_determinants
+from .system import with_axes
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+POINTS_AT_ONCE = 8192
+# Where LAPACK is called: few enough that two parts of a batch do not wait for each other (see `foundation.linear_solve`).
+POINTS_AT_ONCE_BY_LAPACK = 64
+
+
+@in_double_precision
+def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr.Dataset":
+    r"""Growth rate of steady sliding over any two parameters, in one batch.
+
+        c = fj.cea.chart(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 1000), k1=np.linspace(80e3, 120e3, 1000))
+
+    The roots of the characteristic polynomial are found for all points together (`polynomial_roots`); stability itself
+    is judged by Routh–Hurwitz. Above 4 sliding coordinates both come from the eigenvalues of the Jacobian, point by
+    point.
+
+    **Arguments:**
+
+    - `system`: a structure, or a scene where friction depends on speed.
+    - `**parameters`: two axes, each one-dimensional and strictly increasing, by name: `mu` or a parameter of the
+      structure; for a scene, anything in `scene.parameters`. Single numbers replace the system's own value.
+    - `direction`: for a structure, +1 or -1: the way the belt moves.
+
+    **Returns:** a dataset over the two axes with `growth_rate` (1/s, of the fastest growing mode), `frequency` of
+    that mode (Hz), `margin` (the smallest Hurwitz determinant, positive where stable, without unit; up to 4 sliding
+    coordinates) and, for a scene, `normal_force` of steady sliding (N). NaN where there is no steady sliding, or no
+    unique one.
+
+    **Raises:** `ValueError` for anything but two axes, unknown names, and values that the structure or scene refuses.
+    """
+    import xarray as xr
+
+    scene, axes = with_axes(system, direction, parameters, count=2)
+    grid = np.meshgrid(*axes.values(), indexing="ij")
+    shape = grid[0].shape
+    columns = [values.ravel() for values in grid]
+    points = columns[0].size
+    expanded = scene.structure.size - 1 <= LARGEST_EXPANDED
+    batch = min(POINTS_AT_ONCE if expanded else POINTS_AT_ONCE_BY_LAPACK, points)
+    padding = -points % batch
+    columns = [np.concatenate([c, np.repeat(c[-1:], padding)]).reshape(-1, batch) for c in columns]
+    results = _chart(scene, tuple(axes), [real(c) for c in columns])
+    growth_rate, frequency, smallest, normal_force = (np.asarray(r).ravel()[:points].reshape(shape) for r in results)
+    variables = {
+        "growth_rate": (growth_rate, "growth rate of the fastest growing mode", "1/s"),
+        "frequency": (frequency, "frequency of the fastest growing mode", "Hz"),
+        "margin": (smallest, "smallest Hurwitz determinant, positive where stable", "1"),
+    }
+    if not expanded:
+        # A determinant with hundreds of rows at every point would take longer than all the rest.
+        del variables["margin"]
+    if isinstance(system, Scene):
+        variables["normal_force"] = (normal_force, "normal force of steady sliding", "N")
+    dataset = xr.Dataset(
+        {name: (tuple(axes), v, {"long_name": long, "units": unit}) for name, (v, long, unit) in variables.items()},
+        coords=axes,
+    )
+    return labelled(dataset, scene, analysis="stability chart", method="characteristic polynomial, Routh-Hurwitz")
+
+
+@compiled
+def _chart(scene, names, columns):
+    def polynomial(*values):
+        point = scene.replace(**dict(zip(names, values, strict=True)))
+        normal_force, exists = _steady_state(point)
+        friction = jnp.sign(point.belt_speed) * point.friction(jnp.abs(point.belt_speed))
+        mass, damping, stiffness = sliding_matrices(point.structure, friction)
+        damping = damping + slope_damping(point, normal_force) * tangential_corner(point.structure)
+        scale = time_scale(point.structure)
+        coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
+        ok = exists & (mass[0, 0] > 0)
+        smallest = jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
+        return [jnp.where(ok, c, jnp.nan) for c in coefficients], scale, jnp.where(ok, smallest, jnp.nan), normal_force
+
+    def by_polynomial(chunk):
+        coefficients, scale, smallest, normal_force = jax.vmap(polynomial)(*chunk)
+        roots = polynomial_roots(coefficients)
+        fastest = jnp.argmax(roots.real, axis=0)
+        growth_rate = jnp.max(roots.real, axis=0) * scale
+        frequency = jnp.abs(jnp.take_along_axis(roots.imag, fastest[None], axis=0)[0]) * scale / (2 * jnp.pi)
+        return growth_rate, jnp.where(jnp.isnan(growth_rate), jnp.nan, frequency), smallest, normal_force
+
+    def by_eigenvalues(*values):
+        point = scene.replace(**dict(zip(names, values, strict=True)))
+        normal_force, exists = _steady_state(point)
+        matrix = linear_sliding(point).matrix
+        ok = exists & jnp.all(jnp.isfinite(matrix))
+        roots = jnp.linalg.eigvals(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
+        fastest = jnp.argmax(roots.real)
+        results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan
+        return *(jnp.where(ok, r, jnp.nan) for r in results), normal_force
+
+    if scene.structure.size - 1 <= LARGEST_EXPANDED:
+        return jax.lax.map(by_polynomial, tuple(columns))
+    return jax.lax.map(lambda chunk: jax.vmap(by_eigenvalues)(*chunk), tuple(columns))
+
+
+def _steady_state(scene: Scene):
+    """Normal force (N) of steady sliding, by sums and products alone, and whether there is such a state."""
+    structure = scene.structure
+    speed = jnp.abs(scene.belt_speed)
+    n, keep = structure.normal, sliding_coordinates(structure.size, structure.normal)
+    friction = jnp.sign(scene.belt_speed) * scene.friction(speed)
+    # The sliding rows of [K, f], bordered by the normal row: by Cramer's rule N/F = -det[[K, f], [k_n, f_n]] / det K.
+    table = jnp.concatenate([structure.stiffness, structure.load_direction[:, None]], axis=1)
+    rows = sliding_rows(structure, table, friction)
+    columns = [*keep, structure.size]
+    if len(keep) <= LARGEST_EXPANDED:
+        stiffness = determinant([[[row[j]] for j in keep] for row in rows])[0][0]
+        bordered = determinant([[[row[j]] for j in columns] for row in [*rows, table[n]]])[0][0]
+    else:
+        stiffness, bordered = 1.0, None
+        reduced = rows[:, np.array(columns)]
+        solved = solve(reduced[:, :-1], reduced[:, -1])
+        bordered = table[n, -1] - table[n, keep] @ solved
+    normal_force = -bordered / stiffness * scene.load.final
+    needed = normal_force
+    if scene.friction.constant:
+        # The sliding motion is linear then, about whatever state.
+        needed = jnp.where(jnp.isfinite(normal_force), normal_force, 0.0)
+    return normal_force, (needed >= 0) & (speed > 0)

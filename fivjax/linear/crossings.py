@@ -1,0 +1,166 @@
+r"""All gains at which a feedback loop may lose its stability, and the first at which it does.
+
+Sliding can lose stability only where $1/γ = L(iω)$ for some real ω (see `feedback`), that is where $L(iω)$ is real. The
+frequencies where it is are eigenvalues of one small matrix: **all** crossings are found at once, and no narrow window of
+instability is stepped over. Between two crossings stability does not change, so one look at the eigenvalues there settles it.
+An undamped loop is real for all ω; it loses stability where two modes meet, $dL/dω = 0$, and those points come from another
+such matrix.
+
+The crossing is a solution of $L(iω; \text{parameters}) = 1/γ$, so it is differentiable by the implicit function theorem,
+also where the eigenvalues themselves are not.
+
+General eigenvalues (`jax.numpy.linalg.eig`) run on the CPU and, in recent versions of JAX, on some GPUs; what needs none is
+in `routh_hurwitz`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ..foundation.linear_solve import inverse, solve
+from .feedback import Loop
+from .gradients import significant_growth
+from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER, PAINLEVE
+
+
+class Limit(NamedTuple):
+    gain: Float[Array, ""]
+    omega: Float[Array, ""]
+    code: Float[Array, ""]  # index into CODES
+
+
+@jax.custom_jvp
+def first_limit(loop: Loop) -> Limit:
+    """The smallest gain above which the loop is unstable, by looking at every crossing."""
+    m = loop.mass.shape[0]
+    eye, none = np.eye(m), np.zeros((m, m))
+    solved = solve(loop.mass, jnp.concatenate([loop.stiffness, loop.damping, loop.column[:, None]], axis=1))
+    stiffness, damping, column = solved[:, :m], solved[:, m : 2 * m], solved[:, 2 * m]
+    row_position = loop.row_stiffness - loop.row_mass @ stiffness
+    row_velocity = loop.row_damping - loop.row_mass @ damping
+
+    static, impulsive = loop.limits
+
+    # Crossings: L(s) - L(-s) = 2s c (s² - A²)⁻¹ b with the loop's state matrix A. In units of the damping, so that
+    # light damping costs no digits.
+    unit = jnp.max(jnp.abs(damping)) + jnp.max(jnp.abs(row_velocity))
+    unit = jnp.where(unit > 0, unit, 1.0)
+    squared = jnp.block([[-stiffness, -damping / unit], [unit * damping @ stiffness, damping @ damping - stiffness]])
+    output = jnp.concatenate([row_position, row_velocity / unit])
+    # Coalescence of an undamped loop: dL/ds² = -c (s² + M⁻¹K)⁻² b.
+    chained = jnp.block([[-stiffness, eye], [none, -stiffness]])
+    chained_output = jnp.concatenate([row_position, jnp.zeros(m)])
+    input_ = jnp.concatenate([jnp.zeros(m), column])
+    squares = jax.vmap(_zeros, in_axes=(0, None, 0))(
+        jnp.stack([squared, chained]), input_, jnp.stack([output, chained_output])
+    ).ravel()
+    omega = jnp.sqrt(jnp.maximum(-squares.real, 0.0))
+    inverse_gain = jax.vmap(lambda w: loop(1j * w).real)(omega)
+    real_frequency = (squares.real < 0) & (jnp.abs(squares.imag) < 1e-6 * jnp.abs(squares))
+    inverse_gain = jnp.where(real_frequency, inverse_gain, 0.0)
+    inverse_gain = jnp.concatenate([inverse_gain, jnp.stack([static, impulsive])])
+    omega = jnp.concatenate([omega, jnp.array([0.0, jnp.inf])])
+    codes = jnp.array([FLUTTER] * (2 * m) + [COALESCENCE] * (2 * m) + [DIVERGENCE, PAINLEVE], jnp.int32)
+    state = jnp.block([[none, eye], [-stiffness, -damping]])
+    row = jnp.concatenate([row_position, row_velocity])
+    typical = 1 / (jnp.abs(impulsive) + jnp.linalg.norm(row) * jnp.linalg.norm(column))
+    typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
+    usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
+    # A mode that no damper reaches is on the imaginary axis at no gain at all, which is not a crossing.
+    marginal = jnp.max(jnp.linalg.eigvals(state).real) > -1e-11
+    usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
+    gains = jnp.where(usable, 1 / jnp.where(usable, inverse_gain, 1.0), jnp.inf)
+    gains, omega, codes = jax.lax.sort((gains, omega, codes), num_keys=1)
+
+    # Between two neighbouring crossings stability is the same everywhere. Any gain in between will do; one of ordinary
+    # size, because the next crossing may be very far off, or be rounding.
+    lower = jnp.concatenate([jnp.zeros(1), gains])
+    upper = jnp.concatenate([gains, jnp.array([jnp.inf])])
+    between = jnp.minimum(0.5 * (lower + upper), jnp.maximum(2 * lower, typical))
+    empty = ~jnp.isfinite(lower) | (upper <= lower * (1 + 1e-12))
+
+    def unstable(gain):
+        closed = state + jnp.outer(input_, row) * gain / (1 - gain * impulsive)
+        return significant_growth(closed) > 0
+
+    def searching(carry):
+        i, found = carry
+        return (i < lower.size) & ~found
+
+    def step(carry):
+        i, _ = carry
+        return i + 1, ~empty[i] & unstable(between[i])
+
+    i, found = jax.lax.while_loop(searching, step, (jnp.zeros((), jnp.int32), jnp.array(False)))
+    last = i - 1
+    code = jnp.where(found, jnp.where(last == 0, ALWAYS, codes[last - 1]), NEVER)
+    at = jnp.maximum(last - 1, 0)
+    return Limit(
+        gain=jnp.where(found, lower[last], jnp.inf),
+        omega=jnp.where(code >= FLUTTER, omega[at], jnp.nan),
+        code=code.astype(jnp.float64),
+    )
+
+
+@first_limit.defjvp
+def _(primals, tangents):
+    """The implicit function theorem, with dL = (db - y dD) x + y de, x = D⁻¹e, y = D⁻ᵀb, written out.
+
+    Every entry of the change of the loop appears once and linearly, so a gradient in all of them costs one evaluation.
+    """
+    (loop,), (change,) = primals, tangents
+    limit = first_limit(loop)
+    flutter, coalescence = limit.code == FLUTTER, limit.code == COALESCENCE
+    s = jax.lax.complex(jnp.zeros_like(limit.omega), jnp.where(flutter | coalescence, limit.omega, 0.0))
+
+    matrix, matrix_slope = loop.matrix(s), loop.matrix_slope(s)
+    row, row_slope = loop.row(s), loop.row_slope(s)
+    x, y = solve(matrix, loop.column.astype(complex)), solve(matrix.T, row)
+    value_change = change.row(s) @ x - y @ (change.matrix(s) @ x) + y @ change.column
+    # The same along s: x', y', L', L'' and the change of L'.
+    x_slope, y_slope = -solve(matrix, matrix_slope @ x), solve(matrix.T, row_slope - matrix_slope.T @ y)
+    slope = row_slope @ x - y @ (matrix_slope @ x)
+    bend = 2 * loop.row_mass @ x + row_slope @ x_slope - y_slope @ (matrix_slope @ x)
+    bend = bend - y @ (2 * loop.mass @ x + matrix_slope @ x_slope)
+    slope_change = change.row_slope(s) @ x + change.row(s) @ x_slope - y_slope @ (change.matrix(s) @ x)
+    slope_change = slope_change - y @ (change.matrix_slope(s) @ x + change.matrix(s) @ x_slope)
+    slope_change = slope_change + y_slope @ change.column
+    # Im L = 0 along a flutter boundary, Im L' = 0 along a coalescence.
+    omega_change = jnp.where(
+        flutter,
+        -value_change.imag / jnp.where(flutter, slope.real, 1.0),
+        jnp.where(coalescence, -slope_change.imag / jnp.where(coalescence, bend.real, 1.0), 0.0),
+    )
+    inverse_gain_change = value_change.real - slope.imag * omega_change
+    # An impulse instead: s is infinite.
+    x, y = solve(loop.mass, loop.column), solve(loop.mass.T, loop.row_mass)
+    impulsive_change = change.row_mass @ x - y @ (change.mass @ x) + y @ change.column
+    inverse_gain_change = jnp.where(limit.code == PAINLEVE, impulsive_change, inverse_gain_change)
+    tangent = Limit(-(limit.gain**2) * inverse_gain_change, omega_change, jnp.zeros_like(limit.code))
+    return limit, tangent
+
+
+def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[Array, " n"]) -> Complex[Array, " n"]:
+    """The zeros x of row (x - matrix)⁻¹ column: n - 1 of them or fewer; the others come out infinite."""
+    # Shifted and inverted, the zeros are the eigenvalues of the matrix seen through the projector that leaves out the
+    # column. The shift must not be a zero or an eigenvalue; of three the best is taken.
+    n = matrix.shape[0]
+    shifts = np.array([0.3719, 1.7133, 5.2917])
+
+    def seen_from(shift):
+        inverted = inverse(matrix - shift * np.eye(n))
+        seen = row @ inverted
+        through = seen @ column
+        quality = jnp.abs(through) / (jnp.linalg.norm(seen) * jnp.linalg.norm(column))
+        projected = inverted - jnp.outer(column, seen @ inverted) / through
+        return projected, jnp.where(jnp.all(jnp.isfinite(projected)), quality, 0.0)
+
+    projected, quality = jax.vmap(seen_from)(shifts)
+    # The first of the best. All are useless for a loop that is zero or undamped, and then so is the result.
+    chosen = (quality > 0) & (quality == jnp.max(quality))
+    chosen = chosen & (jnp.cumsum(chosen) == 1)
+    best = jnp.sum(jnp.where(chosen[:, None, None], projected, 0.0), axis=0)
+    return jnp.sum(jnp.where(chosen, shifts, 0.0)) + 1 / jnp.linalg.eigvals(best)

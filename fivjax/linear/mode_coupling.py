@@ -1,0 +1,86 @@
+"""Where two modes of steady sliding meet: the coalescence that mode coupling starts from."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.compiling import compiled
+from ..foundation.precision import in_double_precision
+from ..model.structure import Structure
+from .critical import bare
+from .crossings import first_limit
+from .feedback import friction_loop
+from .outcomes import COALESCENCE, StabilityOutcome
+from .system import check_direction
+
+
+class Coalescence(eqx.Module):
+    """Where two modes of steady sliding meet.
+
+    With damping they meet exactly only at a complex friction $\\mu + i\\mu'$: on the real axis they pass each other
+    closest at `mu`, and `imperfection` is $|\\mu'|$. Without damping it is 0.
+    """
+
+    mu: float
+    frequency: float  # Hz
+    growth_rate: float  # 1/s
+    imperfection: float
+    damped: bool = eqx.field(static=True)
+    outcome: StabilityOutcome = eqx.field(static=True)
+
+
+# Damping is brought in by this many steps, with as many Newton iterations at each.
+HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
+
+
+@compiled
+def _coalescence(structure, direction):
+    undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
+    loop, scale = friction_loop(undamped, direction)
+    limit = first_limit(loop)
+    full, _ = friction_loop(structure, direction)
+
+    def step(i, s):
+        share = (i // NEWTON_STEPS + 1) / HOMOTOPY_STEPS
+        partly = eqx.tree_at(
+            lambda x: (x.damping, x.row_damping), full, (share * full.damping, share * full.row_damping)
+        )
+        slope, curvature = jax.jvp(partly.slope, (s,), (jnp.ones_like(s),))
+        return s - slope / curvature
+
+    start = jax.lax.complex(jnp.zeros_like(limit.omega), limit.omega)
+    s = jax.lax.fori_loop(0, HOMOTOPY_STEPS * NEWTON_STEPS, step, start)
+    found = limit.code == COALESCENCE
+    kept = found & jnp.isfinite(s) & (jnp.abs(s - start) < 0.5 * jnp.abs(start))
+    return limit.gain, limit.omega * scale, 1 / full(s), s * scale, found, kept
+
+
+@in_double_precision
+def coalescence(structure: Structure, *, damped: bool = False, direction: int = 1) -> Coalescence:
+    r"""Where the two modes that become unstable together meet.
+
+    - `damped=False`: with the dampers left out (two frequencies become one, $dL/dω = 0$). This is what is usually
+      called coalescence, and what the paper's 0.22 is.
+    - `damped=True`: with them. The eigenvalues then meet exactly only at a complex friction: $L'(s) = 0$ for complex
+      $s$, $\mu + i\mu' = 1/L(s)$, followed from the undamped point as the damping is brought in. On the real axis they
+      pass closest at `mu` (to second order in `imperfection`).
+
+    **Returns:** a `Coalescence`. Where no two undamped modes meet its outcome is "never unstable" and its numbers are
+    NaN; where the damped point is lost on the way (heavy damping) it is "undecided".
+    """
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    arguments.instance("damped", damped, bool, "True or False")
+    check_direction(direction)
+    mu, omega, damped_mu, s, found, kept = jax.tree.map(
+        np.asarray, _coalescence(bare(structure), jnp.asarray(float(direction)))
+    )
+    if not found or (damped and not kept):
+        outcome = StabilityOutcome.UNDECIDED if found else StabilityOutcome.NEVER_UNSTABLE
+        return Coalescence(np.nan, np.nan, np.nan, np.nan, damped=damped, outcome=outcome)
+    if damped:
+        values = (damped_mu.real, abs(s.imag) / (2 * np.pi), s.real, abs(damped_mu.imag))
+    else:
+        values = (mu, omega / (2 * np.pi), 0.0, 0.0)
+    return Coalescence(*map(float, values), damped=damped, outcome=StabilityOutcome.FOUND)

@@ -1,0 +1,108 @@
+"""Frequencies and growth rates of the modes over one parameter, as a dataset (Fig. 3)."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..foundation.precision import in_double_precision
+from ..io.datasets import labelled
+from ..model.scene import Scene
+from ..model.sliding import sliding_coordinates
+from ..model.structure import Structure
+from .critical import stability_limit
+from .mode_coupling import coalescence
+from .mode_following import HALVINGS, LOOKS, Sampler, matched
+from .system import with_axes
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@in_double_precision
+def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr.Dataset":
+    r"""The modes of steady sliding along one parameter, each followed along the axis.
+
+        fj.cea.modes(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 501))
+        fj.cea.modes(scene, belt_speed=np.linspace(0.1, 3, 200))
+
+    A mode is a conjugate pair of eigenvalues, or two real ones where it is overdamped. Modes are numbered by frequency
+    at the start of the axis and followed by continuity: an interval in which an eigenvalue moves as far as to its
+    neighbour is halved until none does. Modes that cross without coupling are told apart by their shapes. Where two
+    modes truly meet (undamped coalescence) nothing tells which is which beyond; there the one of higher frequency goes
+    on as the one that grows.
+
+    **Arguments:** `system`; one axis by name, as in `chart`; single numbers replace the system's own value.
+
+    **Returns:** a dataset over the axis and `mode` with `frequency` (Hz, damped), `growth_rate` (1/s), `damping_ratio`
+    (-Re λ/|λ|), `eigenvalue` (that of the pair with positive imaginary part, or the larger of two real ones; 1/s),
+    `partner` (the other one) and `shape` (complex displacements over `coordinate`, normal one included, the largest
+    scaled to 1). NaN where there is no steady sliding. Along `mu`, and with constant friction, also the numbers of
+    `stability_limit` and `coalescence`: `mu_crit`, `frequency_crit` (Hz) and `mu_coalescence` (undamped).
+    """
+    scene, axes = with_axes(system, direction, parameters, count=1)
+    ((name, values),) = axes.items()
+    at = Sampler(scene, name)
+    samples = at.many(values)
+    followed = [samples[0]]
+    for k in range(1, len(values)):
+        before, now = followed[-1], samples[k]
+        at.looks = LOOKS
+        if before is not None and now is not None:
+            now = now.taken(matched(at, values[k - 1], before, values[k], now, HALVINGS))
+        followed.append(now)
+    dataset = _modes_dataset(scene, name, values, followed)
+    if name == "mu" and scene.friction.constant:
+        dataset = dataset.assign(_limits(scene))
+    return labelled(dataset, scene, analysis="modes of steady sliding", direction=direction)
+
+
+def _limits(scene: Scene) -> dict:
+    direction = 1 if scene.belt_speed > 0 else -1
+    limit = stability_limit(scene.structure, direction=direction)
+    meeting = coalescence(scene.structure, direction=direction)
+    said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}
+    return {
+        "mu_crit": ((), limit.mu, {"long_name": "critical friction", "units": "1", **said}),
+        "frequency_crit": ((), limit.frequency, {"long_name": "frequency at the critical friction", "units": "Hz"}),
+        "mu_coalescence": (
+            (),
+            meeting.mu,
+            {"long_name": "friction at the coalescence of the undamped modes", "units": "1"},
+        ),
+    }
+
+
+def _modes_dataset(scene: Scene, name: str, values: np.ndarray, followed: list) -> "xr.Dataset":
+    import xarray as xr
+
+    structure = scene.structure
+    n, m = structure.size, structure.size - 1
+    keep = sliding_coordinates(n, structure.normal)
+    eigenvalue, partner = np.full((2, len(values), m), np.nan, complex)
+    shape = np.full((len(values), m, n), np.nan, complex)
+    for k, sample in enumerate(followed):
+        if sample is not None:
+            eigenvalue[k], partner[k] = sample.eigenvalue, sample.partner
+            shape[k][:, keep] = sample.shape
+            shape[k][:, structure.normal] = 0
+    size = np.abs(eigenvalue)
+    ratio = -np.real(eigenvalue) / np.where(size > 0, size, 1.0)
+    variables = {
+        "frequency": (np.imag(eigenvalue) / (2 * np.pi), "frequency", "Hz"),
+        "growth_rate": (np.real(eigenvalue), "growth rate", "1/s"),
+        "damping_ratio": (ratio, "damping ratio", "1"),
+        "eigenvalue": (eigenvalue, "eigenvalue", "1/s"),
+        "partner": (partner, "the mode's other eigenvalue", "1/s"),
+    }
+    dataset = xr.Dataset(
+        {key: ((name, "mode"), v, {"long_name": long, "units": unit}) for key, (v, long, unit) in variables.items()},
+        coords={
+            name: values,
+            "mode": np.arange(m),
+            "coordinate": np.arange(n),
+        },
+    )
+    dataset["shape"] = ((name, "mode", "coordinate"), shape, {"long_name": "mode shape", "units": "1"})
+    dataset["mode"].attrs["long_name"] = "mode, by frequency at the start of the axis"
+    dataset["coordinate"].attrs["long_name"] = "coordinate of the structure"
+    return dataset

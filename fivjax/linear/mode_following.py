@@ -1,0 +1,141 @@
+"""The modes of steady sliding at points of an axis, and which of them is which from one point to the next, in NumPy."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation.compiling import compiled
+from ..foundation.precision import real
+from ..model.scene import Scene, steady_sliding
+from .linearisation import linear_sliding
+from .spectrum import POINTS_AT_ONCE
+
+# How often an interval of an axis is halved to tell two modes apart; beyond, they have met. Modes that are one and the
+# same all along the axis would be halved everywhere, so the looks taken at one interval are counted too.
+HALVINGS = 30
+LOOKS = 4 * HALVINGS
+
+
+class Modes(eqx.Module):
+    """The modes at one point, in NumPy."""
+
+    eigenvalue: np.ndarray  # (m,)
+    partner: np.ndarray  # (m,)
+    shape: np.ndarray  # (m, m), one row per mode
+    left: np.ndarray  # (m, 2m), what projects a state onto the mode
+    right: np.ndarray  # (m, 2m), the mode's state
+
+    def taken(self, order) -> "Modes":
+        return jax.tree.map(lambda array: array[order], self)
+
+
+class Sampler:
+    """The modes of a scene at values of one parameter."""
+
+    def __init__(self, scene: Scene, name: str):
+        self.scene, self.name = scene, name
+        self.looks = LOOKS
+
+    def many(self, values: np.ndarray) -> list[Modes | None]:
+        matrices, exist = map(np.asarray, _matrices(self.scene, self.name, real(values)))
+        return [_modes_of(matrix) if exists else None for matrix, exists in zip(matrices, exist, strict=True)]
+
+    def between(self, low: float, high: float) -> tuple[float, Modes | None]:
+        """The middle of an interval and the modes there; none once the looks are used up."""
+        middle = 0.5 * (low + high)
+        if self.looks <= 0 or not low < middle < high:
+            return middle, None
+        self.looks -= 1
+        return middle, self.many(np.array([middle]))[0]
+
+
+@compiled
+def _matrices(scene, name, values):
+    def at(value):
+        point = scene.replace(**{name: value})
+        matrix = linear_sliding(point).matrix
+        _, normal_force = steady_sliding(point, point.load.final)
+        # An unloaded structure presses with nothing, and its equilibrium need not exist: its linear motion does.
+        exists = jnp.all(jnp.isfinite(matrix)) & ~(normal_force < 0)
+        return matrix, exists
+
+    return jax.lax.map(at, values, batch_size=POINTS_AT_ONCE)
+
+
+def _modes_of(matrix: np.ndarray) -> Modes:
+    m = matrix.shape[0] // 2
+    found, vectors = np.linalg.eig(matrix)
+    upper = np.flatnonzero(np.imag(found) > 0)
+    # Real eigenvalues make modes of two neighbours each; conjugate ones come in pairs already.
+    single = np.flatnonzero(np.imag(found) == 0)
+    single = single[np.argsort(-np.real(found[single]), kind="stable")]
+    first = np.concatenate([single[0::2], upper])
+    second = np.concatenate([single[1::2], [np.argmin(np.abs(found - found[i].conj())) for i in upper]]).astype(int)
+    order = np.lexsort((np.real(found[first]), np.abs(np.imag(found[first]))))
+    first, second = first[order], second[order]
+    vectors = vectors / np.linalg.norm(vectors, axis=0)
+    left = np.linalg.pinv(vectors)
+    shape = vectors[:m, first].T
+    largest = shape[np.arange(m), np.argmax(np.abs(shape), axis=1)]
+    # A mode of a free coordinate at constant speed has displacements all the same; only an empty one would divide by 0.
+    shape = shape / np.where(largest == 0, 1.0, largest)[:, None]
+    return Modes(
+        eigenvalue=found[first].astype(complex),
+        partner=found[second].astype(complex),
+        shape=shape.astype(complex),
+        left=left[first],
+        right=vectors[:, first].T,
+    )
+
+
+def _assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pairs that together cost least."""
+    # Imported when wanted: it takes as long to load as much of the rest.
+    from scipy.optimize import linear_sum_assignment
+
+    return linear_sum_assignment(cost)
+
+
+def matched(at: Sampler, x0: float, a: Modes, x1: float, b: Modes, halvings: int) -> np.ndarray:
+    """For each mode of `a` the index of the same mode in `b`."""
+    distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
+    rows, order = _assigned(distance)
+    moved = distance[rows, order]
+    others = np.where(np.arange(len(order))[None, :] == order[:, None], np.inf, distance)
+    neighbours = np.minimum(others.min(axis=1, initial=np.inf), _gaps(a.eigenvalue))
+    if np.all(moved <= 0.3 * neighbours):
+        return order
+    middle, half = at.between(x0, x1) if halvings else (x0, None)
+    if half is not None:
+        first = matched(at, x0, a, middle, half, halvings - 1)
+        second = matched(at, middle, half, x1, b, halvings - 1)
+        return second[first]
+    return _met(a, b)
+
+
+def _gaps(eigenvalues: np.ndarray) -> np.ndarray:
+    between = np.abs(eigenvalues[:, None] - eigenvalues[None, :])
+    return np.where(np.eye(len(eigenvalues), dtype=bool), np.inf, between).min(axis=1, initial=np.inf)
+
+
+def _met(a: Modes, b: Modes) -> np.ndarray:
+    """The same as `_matched` where two modes of `a` have come together at one point."""
+    # Modes that merely cross keep their shapes: what projects onto one before finds one only afterwards.
+    share = np.abs(a.left @ b.right.T)
+    rows, order = _assigned(-share)
+    rest = np.where(np.arange(len(order))[None, :] == order[:, None], 0.0, share)
+    if np.all(share[rows, order] > 0.9) and np.all(rest.max(axis=1, initial=0.0) < 0.5):
+        return order
+    # They truly met: by frequency before and by growth rate after, or the other way round; the rest by distance.
+    distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
+    _, order = _assigned(distance)
+    close = np.flatnonzero(_gaps(a.eigenvalue) <= 10 * distance.max(axis=1))
+    if len(close) > 1:
+        order[close[_ranks(a.eigenvalue[close])]] = order[close][_ranks(b.eigenvalue[order[close]])]
+    return order
+
+
+def _ranks(eigenvalues: np.ndarray) -> np.ndarray:
+    by_frequency = np.ptp(np.imag(eigenvalues)) > np.ptp(np.real(eigenvalues))
+    return np.argsort(np.imag(eigenvalues) if by_frequency else np.real(eigenvalues), kind="stable")

@@ -1,0 +1,34 @@
+"""What the search for a stability limit comes to, by name."""
+
+import enum
+
+
+class StabilityOutcome(enum.StrEnum):
+    """What came of the search for a stability limit."""
+
+    FOUND = "found"
+    NEVER_UNSTABLE = "never unstable"
+    ALWAYS_UNSTABLE = "always unstable"
+    UNDECIDED = "undecided"
+
+
+class Mechanism(enum.StrEnum):
+    """How stability is lost at the limit."""
+
+    NONE = "none"
+    FLUTTER = "flutter"  # a damped pair of eigenvalues crosses the imaginary axis
+    COALESCENCE = "coalescence"  # two undamped modes meet and part into a growing and a decaying one
+    DIVERGENCE = "divergence"  # an eigenvalue crosses zero: the springs no longer hold
+    PAINLEVE = "Painlevé's paradox"  # an eigenvalue passes through infinity: no unique contact force
+
+
+# What the compiled search returns: an index into this table.
+CODES = [
+    (StabilityOutcome.NEVER_UNSTABLE, Mechanism.NONE),
+    (StabilityOutcome.ALWAYS_UNSTABLE, Mechanism.NONE),
+    (StabilityOutcome.FOUND, Mechanism.FLUTTER),
+    (StabilityOutcome.FOUND, Mechanism.COALESCENCE),
+    (StabilityOutcome.FOUND, Mechanism.DIVERGENCE),
+    (StabilityOutcome.FOUND, Mechanism.PAINLEVE),
+]
+NEVER, ALWAYS, FLUTTER, COALESCENCE, DIVERGENCE, PAINLEVE = range(len(CODES))

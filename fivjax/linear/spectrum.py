@@ -1,0 +1,102 @@
+r"""Eigenvalues of steady sliding, point by point.
+
+The linearised motion has eigenvalues $λ$ with a frequency $|\mathrm{Im}\,λ|/2π$ and a growth rate $\mathrm{Re}\,λ$. Friction
+that falls with speed enters as a damper of negative rate (`linearisation`).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ..foundation import arguments
+from ..foundation.compiling import compiled
+from ..foundation.precision import is_known, real, returning_numpy
+from ..model.scene import Scene, sliding_equilibrium
+from ..model.structure import Structure
+from .gradients import with_own_gradient
+from .linearisation import linear_sliding
+from .system import as_scene, check_direction
+
+# Few enough that LAPACK calls on two parts of a batch do not wait for each other (see `foundation.linear_solve`).
+POINTS_AT_ONCE = 256
+
+
+@returning_numpy
+def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> Float[Array, "m m"]:
+    """State matrix A of small motions about steady sliding, ż = A z: the Jacobian of `contact`, by autodiff.
+
+    z holds the deviations of the displacements (m) without the normal coordinate, then their velocities (m/s);
+    m = 2(n - 1).
+
+    **Arguments:** `system`, a scene, or a structure with constant friction `mu`; `direction`, for a structure, +1 for a
+    belt that moves along the tangential coordinate, -1 against it.
+
+    **Raises:** `ValueError` for a scene that has no steady sliding, or where friction is missing or given twice.
+    """
+    return _matrix(_checked(system, mu, direction))
+
+
+_matrix = compiled(lambda scene: linear_sliding(scene).matrix)
+
+
+def _checked(system, mu, direction) -> Scene:
+    if mu is not None:
+        arguments.real_number("mu", mu, minimum=0)
+    scene = as_scene(system, mu, direction)
+    if isinstance(system, Scene):
+        sliding_equilibrium(scene)
+    return scene
+
+
+@returning_numpy
+def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Complex[Array, "... m"]:
+    """The 2(n - 1) eigenvalues of steady sliding, in 1/s, sorted by frequency.
+
+    Order: by |Im λ|, then by Re λ, then Im λ; so the two of a conjugate pair are neighbours, the one with negative
+    imaginary part first.
+
+    **Arguments:** as in `linearisation`; for a structure `mu` may also be an array, whose shape then comes first in the
+    result. Differentiable where the eigenvalues are distinct; near a coalescence the derivative grows without bound. In
+    a process without double precision, differentiate `growth_rate` instead (JAX cannot carry complex double precision
+    through its backward pass there).
+    """
+    if mu is not None and np.ndim(mu) > 0:
+        arguments.instance("system", system, Structure, "a Structure where `mu` is an array")
+        check_direction(direction)
+        _check_frictions(mu)
+        mu = real(mu)
+        return _eigenvalues_over(system, mu.ravel(), direction).reshape(*mu.shape, -1)
+    return _eigenvalues(_checked(system, mu, direction))
+
+
+def _check_frictions(mu) -> None:
+    if is_known(mu):
+        values = arguments.numeric_array("mu", mu)
+        bad = values[~(np.isfinite(values) & (values >= 0))]
+        if bad.size:
+            raise ValueError(f"Argument `mu` must be non-negative and finite, but holds {bad[0]:g}.")
+
+
+@compiled
+def _eigenvalues(scene):
+    found = jnp.linalg.eigvals(linear_sliding(scene).matrix)
+    return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
+
+
+@compiled
+def _eigenvalues_over(structure, mu, direction):
+    return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
+
+
+_growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(linear_sliding(scene).matrix).real)))
+
+
+@returning_numpy
+def growth_rate(system: Structure | Scene, mu=None, *, direction: int = 1) -> Float[Array, ""]:
+    """The largest real part of the eigenvalues of steady sliding, in 1/s: positive where it is unstable.
+
+    Arguments as in `linearisation`. Differentiable in everything (through the eigenvalues, so the derivative grows
+    without bound towards a coalescence), in any process; see `margin` for a measure that is smooth there.
+    """
+    return _growth_rate(_checked(system, mu, direction))

@@ -1,0 +1,64 @@
+"""The system that an analysis is asked about: a scene, or a structure under constant friction, and its axes."""
+
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.precision import is_known
+from ..model.friction import Coulomb
+from ..model.load import ConstantLoad
+from ..model.scene import Scene
+from ..model.structure import Structure
+
+
+def check_direction(direction) -> None:
+    """Refuse anything but the two ways a belt can move."""
+    if direction not in (1, -1):
+        raise ValueError(f"Argument `direction` must be 1 or -1, but is {direction!r}.")
+
+
+def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
+    """The scene whose sliding state is asked for: a given one, or a structure under constant friction.
+
+    A structure is not loaded: its linear motion with constant friction is the same under any load.
+    """
+    arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
+    check_direction(direction)
+    if isinstance(system, Structure):
+        if mu is None:
+            raise ValueError("Argument `mu` must be given with a structure; a scene carries its own friction.")
+        return Scene(system, Coulomb(mu), belt_speed=float(direction), load=ConstantLoad(0.0))
+    if mu is not None:
+        raise ValueError("Argument `mu` must not be given with a scene; use `scene.replace(mu=...)`.")
+    if direction != 1:
+        raise ValueError("Argument `direction` must not be given with a scene: the sign of its belt speed says it.")
+    if is_known(system.belt_speed) and system.belt_speed == 0:
+        raise ValueError("Argument `belt_speed` must not be zero: nothing slides steadily on a belt at rest.")
+    return system
+
+
+def with_axes(
+    system: Structure | Scene, direction: int, parameters: dict, *, count: int
+) -> tuple[Scene, dict[str, np.ndarray]]:
+    """The scene with the single numbers put in, and the checked axes, as many as `count`."""
+    arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
+    if isinstance(system, Structure):
+        if "mu" not in parameters:
+            raise ValueError("Argument `mu` must be given with a structure, as a number or an axis.")
+        scene = as_scene(system, 0.0, direction)
+        known = ["mu", *system.parameters]
+    else:
+        scene = as_scene(system, None, direction)
+        known = sorted(scene.parameters)
+    unknown = [name for name in parameters if name not in known]
+    if unknown:
+        raise ValueError(f"Unknown parameter `{unknown[0]}`; this system has: {', '.join(known)}.")
+    axes = {name: arguments.axis(name, values) for name, values in parameters.items() if np.ndim(values) > 0}
+    if len(axes) != count:
+        wanted = "one axis, such as `mu=np.linspace(0, 0.5, 501)`" if count == 1 else "two axes"
+        given = ", ".join(axes) or "none"
+        raise ValueError(f"Give exactly {wanted}, as arrays; here the axes are: {given}.")
+    scene = scene.replace(**{name: value for name, value in parameters.items() if name not in axes})
+    # Every rule on a parameter is a bound, or an order between two, so the ends of the axes stand for all of them.
+    for end in (0, -1):
+        scene.replace(**{name: values[end] for name, values in axes.items()})
+    return scene, axes
