@@ -21,7 +21,8 @@ from jaxtyping import Array, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..model.scene import Scene, steady_sliding
-from ..steppers.base import MOST_ADVANCES, AbstractStepper, Within, advance_adding
+from ..steppers.base import AbstractStepper, Within
+from ..steppers.core import Segment, follow
 
 # From its first, arbitrary state a motion is followed for so many periods before it is taken for nearly periodic.
 SETTLING_PERIODS = 80
@@ -69,11 +70,9 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
 
     def to_next(carry, h):
         y, contact = carry
-        y, contact, _, reached = advance_adding(
-            method, mechanics, contact, load, y, h, MOST_ADVANCES, None, lambda *_: None, "lax"
-        )
-        y = jnp.where(reached, y, jnp.nan)
-        return (y, contact), (y, contact)
+        after = follow(method, mechanics, contact, load, y, h, kind="lax")
+        y = jnp.where(after.enough, after.y, jnp.nan)
+        return (y, after.contact), (y, after.contact)
 
     longest = int(LONGEST * LOOKS) + 1
     spans = jnp.full(2 * longest + 1, 1 / (LOOKS * frequency)).at[0].set(SETTLING_PERIODS / frequency)
@@ -96,20 +95,18 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable, forward."""
     mechanics, load = Mechanics(scene), scene.load.final
     codes = jnp.array([Status.STICK, Status.DETACH])
-    none = jnp.zeros_like(cycle.period)
 
-    def add(total, contact, y, after):
-        t, lines, spent = total
-        within = method.within(mechanics, contact, load, y, after.h)
-        spent = spent + jnp.where(contact.status == codes, after.h, 0.0)
-        return t + after.h, lines + _integrals(within, t, cycle.period, count), spent
+    def add(total, segment: Segment):
+        lines, spent = total
+        within = method.within(mechanics, segment.contact, load, segment.y, segment.after.h)
+        spent = spent + jnp.where(segment.contact.status == codes, segment.after.h, 0.0)
+        return lines + _integrals(within, segment.t, cycle.period, count), spent
 
-    total = (none, jnp.zeros((count, 2, scene.structure.size)), jnp.zeros(2))
-    y, contact, (_, lines, spent), reached = advance_adding(
-        method, mechanics, cycle.contact, load, cycle.y, cycle.period, MOST_ADVANCES, total, add, "lax"
-    )
+    total = (jnp.zeros((count, 2, scene.structure.size)), jnp.zeros(2))
+    after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
+    lines, spent = after.total
     lines = (2 / cycle.period) * (lines[:, 0] - 1j * lines[:, 1])
-    return Around(jnp.where(reached, y, jnp.nan), contact, lines, spent / cycle.period)
+    return Around(jnp.where(after.enough, after.y, jnp.nan), after.contact, lines, spent / cycle.period)
 
 
 def _integrals(within: Within, t, period, count: int) -> Float[Array, "count 2 n"]:

@@ -18,6 +18,7 @@ from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
 from ..simulation.energy import Books, Ledger, enter, mechanical_energy, open_ledger
 from ..steppers.base import AbstractStepper, Advance
+from ..steppers.core import Segment
 from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
 from ..verdicts import recurrence as orbits
@@ -132,8 +133,8 @@ def step(course: Course, lane: Lane) -> Lane:
     longest = method.dt if lane.account is None else min(method.dt, LONGEST_ENTRY)
     t = next_step_end(scene.load, lane.t, longest)
     load = scene.load(0.5 * (lane.t + t)) - scene.load.final
-    after = method.advance(course.prepared, lane.contact, load, lane.y, t - lane.t)
-    y, contact, h, peak, rise = after
+    after = method.advance(course.prepared, lane.contact, load, lane.y, t - lane.t, at_section=True)
+    y, contact, h, peak, rise, *_ = after
     t = jnp.where(h >= t - lane.t, t, lane.t + h)
     changed = contact.status != lane.contact.status
     orbit = orbits.observe(
@@ -162,7 +163,8 @@ def step(course: Course, lane: Lane) -> Lane:
 
 def _entered(course: Course, account: Account, before: Lane, load, after: Advance, t) -> Account:
     scene = course.scene
-    ledger = enter(Books(scene), course.method, course.mechanics, load, account.ledger, before.contact, before.y, after)
+    segment = Segment(before.t, load, before.contact, before.y, after)
+    ledger = enter(Books(scene), course.method, course.mechanics, account.ledger, segment)
     kick_ends = jnp.max(scene.load.jumps, initial=0.0)
     just_kicked = (t >= kick_ends) & jnp.isnan(account.vibration)
     vibration = mechanical_energy(scene.structure, after.y)

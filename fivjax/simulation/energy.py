@@ -50,7 +50,8 @@ from ..contact import Contact, Mechanics, State, Status
 from ..foundation.precision import returning_numpy
 from ..model.scene import Scene
 from ..model.structure import Springs, Structure
-from ..steppers.base import AbstractStepper, Advance, Within
+from ..steppers.base import AbstractStepper, Within
+from ..steppers.core import Segment
 
 
 class Flows(eqx.Module):
@@ -286,13 +287,10 @@ def enter(
     books: Books,
     method: AbstractStepper,
     mechanics: Mechanics,
-    load: Float[Array, ""],
     ledger: Ledger,
-    contact: Contact,
-    y: State,
-    after: Advance,
+    segment: Segment,
 ) -> Ledger:
-    """The ledger with one advance entered, from `contact` and `y` under `load` to what it reached.
+    """The ledger with one segment entered.
 
     The scene's "reset" impact law is no impulse of the contact; there, `impact_dissipated` is only the loss with the work that
     the belt would do if it were.
@@ -301,6 +299,7 @@ def enter(
     """
     structure = books.structure
     n, normal, tangential = structure.size, structure.normal, structure.tangential
+    contact, load, y, after = segment.contact, segment.load, segment.y, segment.after
     within = method.within(mechanics, contact, load, y, after.h)
     work, beyond_rest = _work(books, mechanics, contact, load, within)
     # While detached, velocities jump at re-contact and at nothing else. The difference of squares, free of cancellation.

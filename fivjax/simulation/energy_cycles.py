@@ -20,7 +20,7 @@ from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
 from ..model.scene import Scene
-from ..steppers.base import MOST_ADVANCES
+from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .energy import Books, Energy, Ledger
@@ -149,24 +149,37 @@ def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Calla
     """The first `most` instants after each start at which the count goes up, not beyond each end."""
     mechanics, books, method = Mechanics(scene), Books(scene), EventExact()
 
-    def advance(carry, end):
-        (t, y, contact, ledger), _, steps = carry
-        jumps = jnp.where(scene.load.jumps > t, scene.load.jumps, jnp.inf)
-        stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
-        load = scene.load(0.5 * (t + stop))
-        after = method.advance(mechanics, contact, load, y, stop - t)
-        ledger = accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
-        t = jnp.where(after.h >= stop - t, stop, t + after.h)
-        return _Instant(t, after.y, after.contact, ledger), contact.status, steps + 1
-
     def to_next(start: _Instant, end):
-        def going(carry):
-            now, _, steps = carry
-            return (count(now.ledger) == count(start.ledger)) & (now.t < end) & (steps < MOST_ADVANCES)
+        def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
+            """On to the next such instant, the next jump of the load or the end, whichever comes first."""
+            jumps = jnp.where(scene.load.jumps > now.t, scene.load.jumps, jnp.inf)
+            stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
 
-        found, before, _ = jax.lax.while_loop(
-            going, lambda carry: advance(carry, end), (start, start.contact.status, jnp.zeros((), jnp.int32))
-        )
+            def enter(total, segment: Segment):
+                return accounts.enter(books, method, mechanics, total[0], segment), segment.contact.status
+
+            found = follow(
+                method,
+                mechanics,
+                now.contact,
+                scene.load(0.5 * (now.t + stop)),
+                now.y,
+                stop - now.t,
+                total=(now.ledger, now.contact.status),
+                observe=enter,
+                until=lambda total: count(total[0]) != count(start.ledger),
+                kind="lax",
+            )
+            t = jnp.where(found.left <= 0, stop, stop - found.left)
+            ledger, before = found.total
+            return _Instant(t, found.y, found.contact, ledger), before, ~found.enough
+
+        def going(carry):
+            now, _, failed = carry
+            return (count(now.ledger) == count(start.ledger)) & (now.t < end) & ~failed
+
+        begin = start, start.contact.status, jnp.zeros((), bool)
+        found, before, _ = jax.lax.while_loop(going, lambda carry: stretch(carry[0]), begin)
         return found, (found, before)
 
     def of_row(start: _Instant, end):

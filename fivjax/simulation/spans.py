@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact, Mechanics, State
-from ..steppers.base import AbstractStepper, advance_adding
+from ..steppers.base import AbstractStepper
+from ..steppers.core import Segment, follow
 from . import energy as accounts
 from .energy import Books, Ledger
 
@@ -48,10 +49,22 @@ def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str = "
 def _advances(begin: Begin, method: AbstractStepper, most: int, kind: str) -> End:
     mechanics, load, books = begin.mechanics, begin.load, begin.books
 
-    def enter(ledger, contact, y, after):
-        return None if books is None else accounts.enter(books, method, mechanics, load, ledger, contact, y, after)
+    def enter(ledger, segment: Segment):
+        return None if books is None else accounts.enter(books, method, mechanics, ledger, segment)
 
-    return advance_adding(method, mechanics, begin.contact, load, begin.y, begin.h, most, begin.ledger, enter, kind)
+    after = follow(
+        method,
+        mechanics,
+        begin.contact,
+        load,
+        begin.y,
+        begin.h,
+        total=begin.ledger,
+        observe=enter,
+        most=most,
+        kind=kind,
+    )
+    return after.y, after.contact, after.total, after.enough
 
 
 def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:

@@ -12,8 +12,7 @@ The state `y` is the displacements followed by the velocities, in m and m/s; the
 """
 
 import abc
-from collections.abc import Callable
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -27,8 +26,6 @@ from .section import Resolution, Rise, rise_between
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
-
-Total = TypeVar("Total")
 
 
 class StepperState(eqx.Module):
@@ -59,12 +56,22 @@ class Advance(NamedTuple):
     h: Float[Array, ""]  # how far it came, s
     peak: Float[Array, ""]  # largest tangential speed it saw, m/s
     rise: Rise
+    end: State  # where the mode's own motion ended, before anything that follows from its end
+    ended: Bool[Array, "2"]  # which of the guards ran out there
 
 
-def advance_between(before: State, y: State, contact: Contact, h: Float[Array, ""], tangential: int) -> Advance:
+def advance_between(
+    before: State,
+    end: State,
+    ended: Bool[Array, "2"],
+    y: State,
+    contact: Contact,
+    h: Float[Array, ""],
+    tangential: int,
+) -> Advance:
     """An advance from one state to another that knows of what lay between only what these two say."""
     peak = jnp.abs(y[y.shape[0] // 2 + tangential])
-    return Advance(y, contact, h, peak, rise_between(before, y, tangential))
+    return Advance(y, contact, h, peak, rise_between(before, y, tangential), end, ended)
 
 
 class Within(NamedTuple):
@@ -96,9 +103,18 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
     @abc.abstractmethod
     def advance(
-        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+        self,
+        mechanics: Mechanics,
+        contact: Contact,
+        load: Float[Array, ""],
+        y: State,
+        h: Float[Array, ""],
+        at_section: bool = False,
     ) -> Advance:
-        """Go on from a state under a load that does not change, by `h` (s) or less."""
+        """Go on from a state under a load that does not change, by `h` (s) or less.
+
+        `at_section` asks for the advance to end on the Poincaré section as well (see `section`), if the method can.
+        """
 
     @abc.abstractmethod
     def within(
@@ -112,50 +128,3 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
     def func(self, terms, t0, y0: State, args: Scene) -> State:
         return terms.vf(t0, y0, args)
-
-
-def advance_by(
-    stepper: AbstractStepper,
-    mechanics: Mechanics,
-    contact: Contact,
-    load: Float[Array, ""],
-    y: State,
-    h: Float[Array, ""],
-    most: int,
-) -> tuple[State, Contact, Bool[Array, ""]]:
-    """As many advances as it takes to get `h` (s) further; last, whether `most` of them were enough."""
-    y, contact, _, arrived = advance_adding(stepper, mechanics, contact, load, y, h, most, None, lambda *_: None)
-    return y, contact, arrived
-
-
-def advance_adding(
-    stepper: AbstractStepper,
-    mechanics: Mechanics,
-    contact: Contact,
-    load: Float[Array, ""],
-    y: State,
-    h: Float[Array, ""],
-    most: int,
-    total: Total,
-    add: Callable[[Total, Contact, State, Advance], Total],
-    kind: str = "bounded",
-) -> tuple[State, Contact, Total, Bool[Array, ""]]:
-    """`advance_by`, with a `total` to which `add` adds what each advance contributes, from its start and what it reached.
-
-    `kind` of loop: "bounded" can be differentiated in both modes; "lax" in forward mode only, and costs less.
-    """
-
-    def body(carry):
-        y, contact, left, total = carry
-        # Equal parts; the allowance keeps rounding from adding one more, vanishingly short.
-        parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
-        after = stepper.advance(mechanics, contact, load, y, left / parts)
-        arrived = (parts == 1) & (after.h >= left)
-        total = add(total, contact, y, after)
-        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
-
-    start = (y, contact, jnp.asarray(h, y.dtype), total)
-    y, contact, left, total = eqx.internal.while_loop(
-        lambda carry: carry[2] > 0, body, start, max_steps=most, kind=kind
-    )
-    return y, contact, total, left <= 0

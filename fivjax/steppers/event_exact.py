@@ -21,7 +21,8 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation import arguments
 from ..model.scene import Scene
-from .base import MOST_ADVANCES, AbstractStepper, Advance, StepperState, Within, advance_between, advance_by
+from .base import AbstractStepper, Advance, StepperState, Within, advance_between
+from .core import follow
 from .section import Resolution
 
 # A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
@@ -83,43 +84,52 @@ class EventExact(AbstractStepper):
         mechanics, contact = solver_state.mechanics, solver_state.contact
         # No step straddles a jump, so the load in its middle is the load of the whole step.
         load = args.load(0.5 * (t0 + t1))
-        y1, next_contact, reached = advance_by(self, mechanics, contact, load, y0, t1 - t0, MOST_ADVANCES)
+        after = follow(self, mechanics, contact, load, y0, t1 - t0)
         dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
-        result = diffrax.RESULTS.where(reached, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
-        return y1, None, dense_info, StepperState(mechanics, next_contact), result
+        result = diffrax.RESULTS.where(after.enough, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        return after.y, None, dense_info, StepperState(mechanics, after.contact), result
 
     def advance(
-        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+        self,
+        mechanics: Mechanics,
+        contact: Contact,
+        load: Float[Array, ""],
+        y: State,
+        h: Float[Array, ""],
+        at_section: bool = False,
     ) -> Advance:
-        # The last row watches the tangential velocity rise through zero: not an event of the contact, but where orbits
-        # are compared, see `orbit`.
         unit = _time_unit(mechanics)
         states, guards = _series(mechanics, contact, load, y, self.order_, unit)
         rounding = _rounding(mechanics, contact, load, y, unit)
+        exact = physics.exactly_zero(contact)
+        n, tangential = y.shape[0] // 2, mechanics.tangential
+        if at_section:
+            # One more row watches the tangential velocity rise through zero: not an event of the contact.
+            guards = [jnp.append(guard, -state[n + tangential]) for guard, state in zip(guards, states, strict=True)]
+            rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, False)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
             scaled.append(guard * power)
             power = power * reach
-        exact = jnp.append(physics.exactly_zero(contact), False)
         safe, fires = _march_to_roots(
             [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )
-        watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
-        safe, fires = jnp.where(watching, safe, 1.0), fires & watching
+        if at_section:
+            watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
+            safe, fires = jnp.where(watching, safe, 1.0), fires & watching
         first = jnp.min(safe)
         # Guards that run out at the same instant, but for rounding, do so together.
         fires = fires & (safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps))
         x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
         ended = fires[:2]
         reached, _ = _value_and_slope(states, x * reach)
-        n = y.shape[0] // 2
-        rising = jnp.arange(2 * n) == n + mechanics.tangential
-        reached = jnp.where(rising & fires[2], 0.0, reached)
+        if at_section:
+            reached = jnp.where((jnp.arange(2 * n) == n + tangential) & fires[2], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        return advance_between(y, y_next, next_contact, x * reach * unit, mechanics.tangential)
+        return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, tangential)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -148,8 +158,8 @@ def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
 
 def _series(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
-) -> tuple[list[State], list[Float[Array, "3"]]]:
-    """Taylor coefficients in time of the state, and of the guards with the (negative) tangential velocity; time in units.
+) -> tuple[list[State], list[Float[Array, "2"]]]:
+    """Taylor coefficients in time of the state and of the guards; time in units.
 
     The physics is linear in the state but for friction, so it maps coefficients to coefficients, the constant parts
     (load, belt) entering with the first. Only T = σμN and N (G_nn + σμ G_nt) = -a_n multiply two series.
@@ -175,8 +185,7 @@ def _series(
             normal_forces.append(normal)
             sliding = contact.direction * (friction[0] * normal + varying), normal
         forces = physics.forces_by_status(own, contact, free, sliding)
-        own_guards = physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k]))
-        guards.append(jnp.concatenate([own_guards, -states[k][n + mechanics.tangential, None]]))
+        guards.append(physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k])))
         rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
         states.append(rate * (unit / (k + 1)))
     return states[: order + 1], guards
@@ -184,7 +193,7 @@ def _series(
 
 def _rounding(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, unit: Float[Array, ""]
-) -> list[Float[Array, "3"]]:
+) -> list[Float[Array, "2"]]:
     """What rounding leaves of the first three coefficients of the guards where they are zero."""
     eps = jnp.finfo(y.dtype).eps
     mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
@@ -192,7 +201,7 @@ def _rounding(
     for k in range(3):
         own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
         guards, rates = physics.magnitudes(own, contact, force, sizes)
-        found.append(ROUNDINGS * eps * jnp.concatenate([guards, jnp.zeros_like(guards[:1])]))
+        found.append(ROUNDINGS * eps * guards)
         sizes = rates * (unit / (k + 1))
     return found
 
@@ -293,10 +302,10 @@ def _running_and(conditions):
     return list(itertools.accumulate(conditions, jnp.logical_and))
 
 
-def _implicit(scaled: list[Float[Array, "3"]], fires: Bool[Array, "3"], x: Float[Array, ""]) -> Float[Array, ""]:
+def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
     """The root with the derivative of an implicit function: one Newton step from it, whose slope is taken as given."""
     values, slopes = _value_and_slope(scaled, x)
-    chosen = jnp.arange(3) == jnp.argmax(fires)
+    chosen = jnp.arange(fires.shape[0]) == jnp.argmax(fires)
     value = jnp.sum(jnp.where(chosen, values, 0.0))
     slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
     correction = value / jnp.where(slope == 0, 1.0, slope)
@@ -328,7 +337,4 @@ class _Restepped(AbstractLocalInterpolation):
         del left
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
-        y, _, _ = advance_by(
-            self.stepper, self.mechanics, self.contact, self.load, self.y0, t0 - self.t0, MOST_ADVANCES
-        )
-        return y
+        return follow(self.stepper, self.mechanics, self.contact, self.load, self.y0, t0 - self.t0).y

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import diffrax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
@@ -64,7 +64,7 @@ class WhereSwitched(AbstractStepper):
         # No step straddles a jump, so the load in its middle is the load of the whole step.
         load, h = args.load(0.5 * (t0 + t1)), t1 - t0
         smooth, error = self._smooth_step(mechanics, contact, load, y0, h)
-        y1, next_contact = self._switched(mechanics, contact, load, smooth, h)
+        y1, next_contact, _ = self._switched(mechanics, contact, load, smooth, h)
         dense_info = {
             "y0": y0,
             "y1": y1,
@@ -74,11 +74,18 @@ class WhereSwitched(AbstractStepper):
         return y1, error, dense_info, StepperState(mechanics, next_contact), diffrax.RESULTS.successful
 
     def advance(
-        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+        self,
+        mechanics: Mechanics,
+        contact: Contact,
+        load: Float[Array, ""],
+        y: State,
+        h: Float[Array, ""],
+        at_section: bool = False,
     ) -> Advance:
+        del at_section  # its steps end where they end
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
-        y_next, next_contact = self._switched(mechanics, contact, load, smooth, h)
-        return advance_between(y, y_next, next_contact, h, mechanics.tangential)
+        y_next, next_contact, ended = self._switched(mechanics, contact, load, smooth, h)
+        return advance_between(y, smooth, ended, y_next, next_contact, h, mechanics.tangential)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -106,13 +113,13 @@ class WhereSwitched(AbstractStepper):
             stages.append(rates(mechanics, contact, load, states[-1]))
         return states, stages
 
-    def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact]:
+    def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact, Bool[Array, "2"]]:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
         # An impact noticed up to a step late is that much too fast, which keeps rebounds of up to e/(1 - e) steps alive.
         e = mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
         next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
-        return y, next_contact
+        return y, next_contact, ended
 
 
 def _weighted(weights, stages: list[State]) -> State:

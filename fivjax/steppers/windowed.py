@@ -67,8 +67,15 @@ class Windowed(eqx.Module):
         return propagators(mechanics)
 
     def advance(
-        self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+        self,
+        prepared: Propagators,
+        contact: Contact,
+        load: Float[Array, ""],
+        y: State,
+        h: Float[Array, ""],
+        at_section: bool = False,
     ) -> Advance:
+        del at_section  # the crossing is read off the window's samples
         return _advance_one(prepared, contact, load, y, h)
 
 
@@ -131,15 +138,16 @@ def _advance(
         at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
         jumps = (reached[velocity] < 0) & (y_next[velocity] >= 0)
         rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
-        return jnp.maximum(peak, jnp.abs(reached[velocity])), next_contact, y_next, rise
+        return jnp.maximum(peak, jnp.abs(reached[velocity])), next_contact, y_next, rise, reached
 
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
     def over_lanes(reached, contact, load, fires):
         state = physics.on_constraint(mechanics, contact, reached)
         return physics.transition(mechanics, contact, load, state, fires, RESTING * prepared.interval)
 
-    peak, next_contact, y_next, rise = computed_once(follow, (none, contact, no_state, Rise(none > 0, no_state)))
-    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise)
+    like = none, contact, no_state, Rise(none > 0, no_state), no_state
+    peak, next_contact, y_next, rise, end = computed_once(follow, like)
+    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise, end, fires)
 
 
 def _rise(

@@ -1,0 +1,85 @@
+"""The stepping core: a trajectory from one segment to the next, with observers.
+
+A *segment* is one advance of a stepper: motion in one contact mode under one load, up to where a guard runs out, a trusted
+step ends, or the asked-for time has passed. `follow` strings segments together. Whatever wants to know what happens on the way
+(the energy ledger, derivatives, a Poincaré section, Fourier coefficients) is an observer: a function that adds what one segment
+tells to a total.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..contact import Contact, Mechanics, State
+from .base import MOST_ADVANCES, AbstractStepper, Advance
+
+Total = TypeVar("Total")
+
+
+class Segment(NamedTuple):
+    """Motion in one contact mode, and what follows from its end."""
+
+    t: Float[Array, ""]  # when it began, s after the start of `follow`
+    load: Float[Array, ""]  # N
+    contact: Contact
+    y: State  # where it began
+    after: Advance
+
+
+class Followed(NamedTuple):
+    """Where `follow` has come to."""
+
+    y: State
+    contact: Contact
+    left: Float[Array, ""]  # of the asked-for time, s; zero where it was reached
+    total: object
+    enough: Bool[Array, ""]  # whether the segments allowed were enough
+
+
+def nothing(total: Total, segment: Segment) -> Total:
+    """The observer that looks away."""
+    del segment
+    return total
+
+
+def follow(
+    stepper: AbstractStepper,
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    h: Float[Array, ""],
+    *,
+    total: Total = None,
+    observe: Callable[[Total, Segment], Total] = nothing,
+    until: Callable[[Total], Bool[Array, ""]] | None = None,
+    at_section: bool = False,
+    most: int = MOST_ADVANCES,
+    kind: str = "bounded",
+) -> Followed:
+    """A trajectory under a constant load, segment by segment, for a time `h` (s).
+
+    `observe` adds each segment to `total`; `until` may end the motion early, after the segment that makes it true.
+    `at_section` asks for segments to end on the Poincaré section, too. At most `most` segments are taken. `kind` of loop:
+    "bounded" can be differentiated in both modes; "lax" in forward mode only, and costs less.
+    """
+    h = jnp.asarray(h, y.dtype)
+
+    def body(carry):
+        y, contact, left, total = carry
+        # Equal parts; the allowance keeps rounding from adding one more, vanishingly short.
+        parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
+        after = stepper.advance(mechanics, contact, load, y, left / parts, at_section)
+        arrived = (parts == 1) & (after.h >= left)
+        total = observe(total, Segment(h - left, load, contact, y, after))
+        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
+
+    def going(carry):
+        _, _, left, total = carry
+        return (left > 0) if until is None else (left > 0) & ~until(total)
+
+    y, contact, left, total = eqx.internal.while_loop(going, body, (y, contact, h, total), max_steps=most, kind=kind)
+    return Followed(y, contact, left, total, ~going((y, contact, left, total)))
