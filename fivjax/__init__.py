@@ -1,10 +1,27 @@
 """fivjax: friction-induced vibration in JAX: slide, stick, detach, squeal; differentiable and in batches."""
 
+import sys
 from importlib import metadata
 
 import lazy_loader
+
+from .io.accessor import draw_with as _draw_with
 
 # A name is imported when it is first used: `import fivjax` costs nothing, and a map loads no optimiser.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = metadata.version("fivjax")
+
+
+def _show(dataset, **options):
+    from .notebook.display import show
+
+    return show(dataset, **options)
+
+
+# What a lower room may not import is handed down to it here: who draws a dataset, and who shows results in a notebook.
+_draw_with(_show)
+if "IPython" in sys.modules:
+    from .notebook.registration import register as _register
+
+    _register()

@@ -4,8 +4,9 @@ from . import plot as plot
 from .calibration.fit import Calibration as Calibration
 from .calibration.fit import calibrate as calibrate
 from .contact import Status as Status
+from .io.datasets import open as open
 from .io.datasets import save as save
-from .io.datasets import save_figure as save_figure
+from .io.files import save_figure as save_figure
 from .io.recordings import Recording as Recording
 from .io.recordings import read_recording as read_recording
 from .linear import cea as cea

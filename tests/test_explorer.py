@@ -1,4 +1,4 @@
-"""Displays and the explorer without a browser: what sliders do, that nothing is compiled again, what is refused."""
+"""The explorer without a browser: what sliders do, that nothing is compiled again, what is refused."""
 
 import io
 import sys
@@ -6,12 +6,11 @@ import sys
 import jax
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
+import xarray as xr
 from PIL import Image
 
 import fivjax as fj
-from fivjax.io import datasets as results
-from fivjax.notebook import display
+from fivjax.io.datasets import labelled
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +24,7 @@ def a_map(scene):
     mu, p = np.array([0.1, 0.1511, 0.22]), np.array([1.0, 1.3, 1.7, 2.0])
     verdict = (mu[:, None] * p > 0.25).astype(np.int8)
     fields = {"verdict": (("mu", "p"), verdict), "amplitude": (("mu", "p"), 3.0 * verdict)}
-    return results.labelled(results.xr.Dataset(fields, {"mu": mu, "p": p}), scene)
+    return labelled(xr.Dataset(fields, {"mu": mu, "p": p}), scene)
 
 
 @pytest.fixture(scope="module")
@@ -116,40 +115,3 @@ def test_wrong_arguments_are_refused(scene, a_map):
         fj.explorer(scene, a_map.isel(mu=0, drop=True))
     with pytest.raises(TypeError, match="a map"):
         fj.explorer(scene, 3)
-
-
-def test_a_scene_shows_its_parameters_with_units(scene):
-    table = display.scene_table(scene)
-    for name, value, unit in (("k1", "100000", "N/m"), ("belt_speed", "3", "m/s"), ("mu", "0.2", "")):
-        row = next(row for row in table.split("<tr>") if f">{name}<" in row)
-        assert f">{value}<" in row
-        assert f">{unit}<" in row
-
-
-def test_results_show_their_pictures(scene, a_map):
-    """Trajectories, maps and modes have a picture; what fivjax did not make shows as ever."""
-    run = fj.simulate(scene, 0.4, 1 / 2000, energy=True)
-    assert "data:image/png;base64," in display.trajectory_summary(run)
-    assert "energy residual" in display.trajectory_summary(run)
-    assert "data:image/png;base64," in display.dataset_summary(a_map)
-    plain = results.xr.Dataset({"verdict": (("mu", "p"), np.zeros((2, 2)))})
-    assert display.dataset_summary(plain).split("</style>")[0] == plain._repr_html_().split("</style>")[0]
-    assert "data:image" not in display.dataset_summary(plain)
-    assert isinstance(fj.show(a_map), Figure)
-    with pytest.raises(TypeError, match="can draw"):
-        fj.show(plain)
-
-
-def test_displays_are_registered_in_a_running_ipython(scene, monkeypatch):
-    """A running IPython asks fivjax how things show; without one nothing happens."""
-    from IPython.core.interactiveshell import InteractiveShell
-
-    monkeypatch.setattr("IPython.get_ipython", lambda: None)
-    assert not display.register()
-    shell = InteractiveShell()
-    monkeypatch.setattr("IPython.get_ipython", lambda: shell)
-    assert display.register()
-    data, _ = shell.display_formatter.format(scene)
-    assert "belt inclination" in data["text/html"]
-    data, _ = shell.display_formatter.format(Figure())
-    assert data["image/png"]

@@ -18,6 +18,7 @@ from ..linear.critical import critical_friction
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
+from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import MEANING, Verdict
@@ -368,9 +369,3 @@ def _check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: floa
     batched = [name for name, value in scene.parameters.items() if np.shape(value) != ()]
     if batched:
         raise ValueError(f"Parameter `{batched[0]}` of the scene must be one number; pass its values as an axis.")
-
-
-def describe_method(method: AbstractStepper) -> str:
-    """The method in words, for provenance."""
-    inner = getattr(method, "solver", None)
-    return f"{type(method).__name__}({'' if inner is None else type(inner).__name__ + ', '}dt={method.dt:g})"

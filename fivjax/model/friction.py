@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
+from .printing import as_call
 
 
 class AbstractFriction(eqx.Module):
@@ -42,6 +43,9 @@ class AbstractFriction(eqx.Module):
     @abc.abstractmethod
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Bounds on |μ'| and |μ''| at and above this slip speed, for proofs about the future."""
+
+    def __repr__(self) -> str:
+        return as_call(type(self).__name__, vars(self))
 
 
 class Coulomb(AbstractFriction):

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, real
+from .printing import as_call
 
 
 class AbstractLoad(eqx.Module):
@@ -33,6 +34,9 @@ class AbstractLoad(eqx.Module):
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The load at an instant that is not a jump, in N."""
+
+    def __repr__(self) -> str:
+        return as_call(type(self).__name__, vars(self))
 
 
 class ConstantLoad(AbstractLoad):

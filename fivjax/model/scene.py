@@ -1,5 +1,7 @@
 """A scene: a structure pressed onto a moving belt, with a friction law and a load."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,10 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real, returning_numpy
+from . import description
 from .friction import AbstractFriction
 from .load import AbstractLoad, ConstantLoad
+from .printing import as_call
 from .sliding import sliding_load, sliding_matrices
 from .structure import Structure
 
@@ -95,6 +99,25 @@ class Scene(eqx.Module):
             restitution=changes.get("restitution", self.restitution),
             impact_law=self.impact_law,
         )
+
+    @classmethod
+    def from_dataset(cls, dataset) -> "Scene":
+        """The scene that a dataset of fivjax's came from: a map, a saved trajectory, modes, …
+
+            scene = fj.Scene.from_dataset(fj.open("map.nc"))
+
+        Friction laws and loads of your own must be defined or imported first. A structure that a function of your own made
+        comes back as its matrices.
+
+        **Raises:** `ValueError` for a dataset without a scene in its attributes, or with parts of unknown classes.
+        """
+        return cls(**description.arguments_of_scene(description.description_in(dataset)))
+
+    def __repr__(self) -> str:
+        return as_call("Scene", {field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
+
+    def _repr_html_(self) -> str:
+        return description.as_table(self)
 
 
 @returning_numpy

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
+from .printing import as_call
 
 
 class Springs(eqx.Module):
@@ -138,6 +139,12 @@ class Structure(eqx.Module):
     def weights(self) -> Float[Array, " 2n"]:
         """What makes the squares of displacements and velocities comparable energies: the square roots of the diagonals."""
         return jnp.sqrt(jnp.concatenate([jnp.diag(self.stiffness), jnp.diag(self.mass)]))
+
+    def __repr__(self) -> str:
+        if self.builder is not None:
+            return as_call(getattr(self.builder, "__name__", "Structure"), self.parameters)
+        shown = ("mass", "damping", "stiffness", "load_direction", "tangential", "normal")
+        return as_call("Structure", {name: getattr(self, name) for name in shown})
 
     def replace(self, **changes) -> "Structure":
         """The structure rebuilt with other values of the parameters that made it: `structure.replace(k1=90e3)`.

@@ -1,5 +1,6 @@
 """One trajectory, with everything that can be read off it."""
 
+import json
 import math
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from ..foundation.precision import in_double_precision, is_known, known_to_numpy
 from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
+from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .ending import ENDING, Ending
@@ -43,6 +45,8 @@ class Trajectory(eqx.Module):
     scene: Scene
     energy: Energy | None = None  # the ledger, when asked for
     outcome: Int[Array, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
+    # How it was computed, as pairs of a name and a value: method, dt, dt_save, t1, start.
+    settings: tuple[tuple[str, str | float], ...] = eqx.field(static=True, default=())
 
     @property
     def meaning(self) -> str:
@@ -58,6 +62,18 @@ class Trajectory(eqx.Module):
     def gap(self) -> Float[Array, " T"]:
         """Distance from the belt, in m."""
         return self.displacement[:, self.scene.structure.normal]
+
+    @classmethod
+    def from_dataset(cls, dataset: xr.Dataset) -> "Trajectory":
+        """A trajectory from its dataset, such as `fj.open("run.nc")`; its energy ledger stays behind.
+
+        **Raises:** `ValueError` for a dataset without a scene in its attributes.
+        """
+        scene = Scene.from_dataset(dataset)
+        rows = ("t", "displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load")
+        settings = tuple(json.loads(dataset.attrs.get("settings", "{}")).items())
+        outcome = np.int8(Ending[dataset.attrs["outcome"].upper()])
+        return cls(**{name: dataset[name].values for name in rows}, scene=scene, outcome=outcome, settings=settings)
 
     def to_dataset(self) -> xr.Dataset:
         """The trajectory with names, units and the scene it came from."""
@@ -76,7 +92,7 @@ class Trajectory(eqx.Module):
         )
         if self.energy is not None:
             dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
-        return labelled(dataset, self.scene).assign_attrs(
+        return labelled(dataset, self.scene, **dict(self.settings)).assign_attrs(
             outcome=Ending(int(self.outcome)).name.lower(), meaning=self.meaning
         )
 
@@ -127,6 +143,7 @@ def simulate(
             f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
             f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
         )
+    start = "sliding equilibrium" if y0 is None else "given by y0"
     y0 = start_state(scene, y0)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
@@ -139,7 +156,14 @@ def simulate(
     found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
     # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
-    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most))
+    settings = (
+        ("method", describe_method(method)),
+        ("dt", float(method.dt)),
+        ("dt_save", float(dt_save)),
+        ("t1", float(t1)),
+        ("start", start),
+    )
+    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most), settings=settings)
 
 
 def _compiled_rows(count: int) -> int:

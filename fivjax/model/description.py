@@ -1,0 +1,122 @@
+"""A scene in plain values, as datasets carry it, and back again; and as a table for notebooks.
+
+A dataset's attributes hold everything that defines its scene, so that `Scene.from_dataset` needs no other file.
+"""
+
+import dataclasses
+import html
+import json
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from ..foundation.quantities import QUANTITIES
+from .friction import AbstractFriction
+from .load import AbstractLoad
+from .structure import Structure, belt_oscillator
+
+# Functions that make a structure from named parameters.
+BUILDERS = {"belt_oscillator": belt_oscillator}
+MATRICES = ("mass", "damping", "stiffness", "load_direction")
+
+
+def describe(scene) -> dict:
+    """Everything that defines a scene, as plain Python values."""
+    structure = scene.structure
+    return {
+        "structure": getattr(structure.builder, "__name__", "Structure"),
+        "friction": type(scene.friction).__name__,
+        "load": type(scene.load).__name__,
+        "impact_law": scene.impact_law,
+        "parameters": {name: np.asarray(value).tolist() for name, value in scene.parameters.items()},
+        **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
+        "tangential": structure.tangential,
+        "normal": structure.normal,
+    }
+
+
+def description_in(dataset) -> dict:
+    """The description that a dataset's attributes hold.
+
+    **Raises:** `ValueError` for a dataset without one.
+    """
+    try:
+        found = json.loads(dataset.attrs["scene"])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        found = None
+    if not isinstance(found, Mapping) or "parameters" not in found:
+        raise ValueError(
+            "Argument `dataset` must carry a scene in its attributes, as what fivjax computed does; this one has none. "
+            "Results of arithmetic lose them: `xarray.set_options(keep_attrs=True)` keeps them."
+        )
+    return dict(found)
+
+
+def arguments_of_scene(description: Mapping) -> dict:
+    """The arguments of `Scene` that a description stands for.
+
+    A structure made by a function that fivjax does not know comes back as its matrices: the same motion, without the
+    names of its parameters.
+
+    **Raises:** `ValueError` for a friction law or a load of a class that is nowhere defined, or that its own numbers do not
+    make again.
+    """
+    parameters = description["parameters"]
+    return {
+        "structure": _structure(description),
+        "friction": _part(AbstractFriction, "friction law", description["friction"], parameters),
+        "belt_speed": parameters["belt_speed"],
+        "load": _part(AbstractLoad, "load", description["load"], parameters),
+        "restitution": parameters["restitution"],
+        "impact_law": description["impact_law"],
+    }
+
+
+def _structure(description: Mapping) -> Structure:
+    matrices = {name: np.asarray(description[name]) for name in MATRICES}
+    builder = BUILDERS.get(description["structure"])
+    if builder is not None:
+        names = builder().parameters
+        if set(names) <= set(description["parameters"]):
+            structure = builder(**{name: description["parameters"][name] for name in names})
+            # Matrices that were changed by hand say more than the parameters that they were made of.
+            if all(np.array_equal(np.asarray(getattr(structure, name)), matrix) for name, matrix in matrices.items()):
+                return structure
+    return Structure(**matrices, tangential=description["tangential"], normal=description["normal"])
+
+
+def _part(kind: type, what: str, name: str, parameters: Mapping):
+    found = next((part for part in _descendants(kind) if part.__name__ == name), None)
+    if found is None:
+        raise ValueError(
+            f"The scene's {what} is a `{name}`, which is not defined here. Import or define that class first, then ask again."
+        )
+    own = {field.name: parameters[field.name] for field in dataclasses.fields(found) if field.name in parameters}
+    try:
+        return found(**own)
+    except TypeError as error:
+        raise ValueError(
+            f"The scene's {what}, a `{name}`, cannot be made again from its numbers ({error}). Its constructor must take its "
+            f"fields by name; or build the scene by hand."
+        ) from None
+
+
+def _descendants(kind: type) -> Iterator[type]:
+    for child in kind.__subclasses__():
+        yield child
+        yield from _descendants(child)
+
+
+def as_table(scene) -> str:
+    """A scene as an HTML table: each parameter with its meaning, value and unit."""
+    about = describe(scene)
+    rows = []
+    for name, value in about["parameters"].items():
+        meaning, unit = QUANTITIES.get(name, (name, ""))
+        shown = f"{value:g}" if isinstance(value, int | float) else f"{np.size(value)} values"
+        rows.append([name, meaning, shown, "" if unit == "1" else unit])
+    left = "style='text-align:left'"
+    body = "".join(f"<tr>{''.join(f'<td {left}>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    head = "".join(f"<th {left}>{title}</th>" for title in ("parameter", "meaning", "value", "unit"))
+    parts = f"{about['structure']}, {about['friction']}, {about['load']}; impact law “{about['impact_law']}”"
+    return f"<b>Scene</b>: {html.escape(parts)}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
