@@ -4,6 +4,7 @@ import numpy as np
 import oracle
 import pytest
 import reference
+from reference import cycles
 from scipy.linalg import expm
 
 pytestmark = pytest.mark.skipif(not reference.available(), reason="The reference solver needs the compiler g++.")
@@ -98,3 +99,45 @@ def test_a_small_motion_keeps_its_digits(law):
     t, x1, v1 = reference.crossing_map(scene, x, v, crossings=20)
     linear = expm(reference.linear(scene).matrix * t) @ [*x[:2], *v[:2]]
     np.testing.assert_allclose([*x1[:2], *v1[:2] / 400.0], linear / [1, 1, 400, 400], atol=1e-11 * np.abs(x).max())
+
+
+def benchmark_a(belt_speed, **start):
+    law = dict(mu=None, mu_static=1.0, mu_dynamic=0.5, decay=2.0)
+    return {**BLOCK, **law, "damping": np.diag([0.1, 0.0]), "belt_speed": belt_speed, **start}
+
+
+@pytest.mark.parametrize("speed", ["1.2", "1.8"])
+def test_cycles_of_benchmark_a_are_those_of_a_general_solver(speed):
+    """The stored values are DOP853's; the C++ solver uses Taylor series."""
+    cycle = cycles.stored()["benchmark_a"]["stick_slip"][speed]
+    v = float(speed)
+    run = reference.trajectory(benchmark_a(v, y0=([cycle["stick_ends"] - 0.1, 0.0], [v, 0.0])), 3.0 * cycle["period"])
+    stops = [t for t, _, after in run.events if after == reference.STICK]
+    starts = [t for t, before, _ in run.events if before == reference.STICK]
+    np.testing.assert_allclose(stops[0] - starts[0], cycle["slip_time"], atol=1e-12)
+    np.testing.assert_allclose(starts[1] - stops[0], cycle["stick_time"], atol=1e-12)
+
+    cycle = cycles.stored()["benchmark_a"]["sliding"][speed]
+    scene = benchmark_a(v)
+    x = [cycle["lowest"] - reference.linear(scene).q_eq[0], 0.0]
+    t, again, _ = reference.crossing_map(scene, x, [0.0, 0.0])
+    assert t == pytest.approx(cycle["period"], abs=1e-12)
+    np.testing.assert_allclose(again, x, atol=1e-12)
+    step = 1e-5
+    beside = [reference.crossing_map(scene, [x[0] + h, 0.0], [0.0, 0.0])[1][0] for h in (step, -step)]
+    assert (beside[0] - beside[1]) / (2.0 * step) == pytest.approx(cycle["multiplier"], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_stored_cycles_are_found_again():
+    found, stored = cycles.find(), cycles.stored()
+
+    def leaves(tree):
+        if isinstance(tree, dict | list):
+            for branch in tree.values() if isinstance(tree, dict) else tree:
+                yield from leaves(branch)
+        else:
+            yield tree
+
+    for a, b in zip(leaves(found), leaves(stored), strict=True):
+        assert a == (b if isinstance(b, str) else pytest.approx(b, rel=1e-9, abs=1e-9))

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 SOURCE = Path(__file__).with_name("solver.cpp")
-FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-pthread")
+FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-std=c++17", "-shared", "-fPIC", "-pthread")
 STICK, SLIDE, DETACH = 0, 1, 2
 IMPACT_LAWS = ("coulomb", "frictionless", "reset")
 FATES = ("slides", "sustained", "unbounded", "gave up")

@@ -12,7 +12,7 @@
 // sliding comes from the recurrences of the product and of the exponential.
 //
 // Roots: a guard g > 0 is followed from the left with the bound g(u + s) >= g + g' s - B s^2 / 2, where B bounds |g''|
-// on the whole step. No zero can be stepped over, a dip inside a step included. A guard that starts from zero (after
+// up to the end of the step. No zero can be stepped over, a dip inside a step included. A guard that starts from zero (after
 // lift-off the gap, its rate and its acceleration are zero) is divided by its leading power of u first.
 #include <algorithm>
 #include <atomic>
@@ -30,7 +30,7 @@ static const int NMAX = 8, ORD = 24, OB = ORD / 8;
 
 enum Mode { STICK = 0, SLIDE = 1, DETACH = 2 };
 enum Fate { SLIDES = 0, SUSTAINED = 1, UNBOUNDED = 2, GAVE_UP = 3 };
-enum Trouble { NONE = 0, NO_EQUILIBRIUM = 1, PAINLEVE = 2, ZENO = 3, BELOW_THE_BELT = 4, STEPS = 5 };
+enum Trouble { NONE = 0, NO_EQUILIBRIUM = 1, PAINLEVE = 2, ZENO = 3, BELOW_THE_BELT = 4, STEPS = 5, NO_ROOT = 6 };
 
 extern "C" {
 struct SceneData {
@@ -328,7 +328,7 @@ static const Curvature CURVATURE;
 static inline double first_zero(const double* c, int terms, double bound, double end) {
     double g = c[0], slope = c[1], u = 0;
     if (g <= 0) return 0;
-    for (int i = 0; i < 500; i++) {
+    for (int i = 0; i < 1000; i++) {
         if (g + slope * (end - u) - 0.5 * bound * (end - u) * (end - u) > 0) return 2;
         double root = std::sqrt(slope * slope + 2 * bound * g);
         double s = slope >= 0 ? (slope + root) / bound : 2 * g / (root - slope);
@@ -337,7 +337,7 @@ static inline double first_zero(const double* c, int terms, double bound, double
         value_and_slope(c, terms, u, g, slope);
         if (g <= 0 || s < 1e-15) return u;
     }
-    return u;
+    return NAN;
 }
 
 // a zero of the polynomial (or of its slope) between two points where it has different signs
@@ -644,9 +644,10 @@ struct Solver {
             const double* c = guard[g].c + lead;
             double bound;
             double reach = std::min(end, best);
-            if (lead) {
+            if (lead || end < 0.9) {
                 bound = 0;
-                for (int k = 2; k < ORD - lead; k++) bound += k * (k - 1.0) * std::fabs(c[k]);
+                double power = 1;
+                for (int k = 2; k < ORD - lead; k++, power *= end) bound += k * (k - 1.0) * std::fabs(c[k]) * power;
             } else {
                 v8 sum = {};
                 for (int b = 0; b < OB; b++) sum += absolute(guard[g].b[b]) * CURVATURE.w[b];
@@ -654,6 +655,7 @@ struct Solver {
                 if (c[0] + std::min(0.0, c[1]) - 0.5 * bound > 0) continue;
             }
             double u = first_zero(c, ORD - lead, bound, reach);
+            if (!(u >= 0)) trouble = NO_ROOT;
             if (u < best) best = u;
         }
         return best;
@@ -728,6 +730,7 @@ struct Solver {
             bool at_jump = false;
             if ((horizon - t) <= end * tb.h) end = (horizon - t) / tb.h, at_jump = true;
             double u = root(tb, end, nonlinear);
+            if (trouble) break;
             bool event = u <= end;
             if (event) at_jump = false;
             else u = end;
