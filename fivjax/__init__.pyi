@@ -12,7 +12,7 @@ from .io.recordings import read_recording as read_recording
 from .linear import cea as cea
 from .linear import design as design
 from .maps.bistability import bistability_map as bistability_map
-from .maps.bistability import critical_perturbation as critical_perturbation
+from .maps.threshold import critical_perturbation as critical_perturbation
 from .maps.tradeoff_study import tradeoff as tradeoff
 from .model.friction import Coulomb as Coulomb
 from .model.friction import ExponentialDecay as ExponentialDecay

@@ -270,7 +270,7 @@ class Tradeoff:
 
     t1: float = 0.5
     """time after which states are compared (s)"""
-    lanes: int = 256
+    trajectories: int = 256
     """trajectories side by side when cost is measured"""
     boundary: bool = True
     """compare p_crit and verdicts too, which takes minutes"""
@@ -280,7 +280,7 @@ class Tradeoff:
 
     def run(self) -> None:
         data, picture = _outputs(self.out)
-        dataset = tradeoff(self.scene.scene(), t1=self.t1, lanes=self.lanes, boundary=self.boundary)
+        dataset = tradeoff(self.scene.scene(), t1=self.t1, trajectories=self.trajectories, boundary=self.boundary)
         save(dataset, data)
         save_figure(plot.tradeoff(dataset), picture)
         _say(data, picture)

@@ -2,7 +2,7 @@
 
     python tests/killed_map.py FOLDER SIGNAL DELAY
 
-Runs a small map with the checkpoint FOLDER/map.part and saves it as FOLDER/map.nc. DELAY seconds after the first lanes
+Runs a small map with the checkpoint FOLDER/map.part and saves it as FOLDER/map.nc. DELAY seconds after the first trajectories
 are kept the process sends SIGNAL to itself ("none" for never).
 """
 
@@ -30,9 +30,9 @@ def run(folder: Path, name: str = "none", delay: float = 0.0, cache: Path | None
 def main(folder: str, name: str, delay: str) -> int:
     from fivjax import cli
     from fivjax.maps import bistability as maps
-    from fivjax.maps import engine as lanes
+    from fivjax.maps import engine
 
-    lanes.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
+    engine.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
     keep = maps.checkpoint.keep
     started = []
 

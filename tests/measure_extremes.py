@@ -28,7 +28,8 @@ import refusing
 import xarray as xr
 
 import fivjax as fj
-from fivjax.maps import engine as engine
+from fivjax.maps import engine
+from fivjax.maps.results import Verdicts
 from fivjax.simulation.trajectory import start_state, states_at
 from fivjax.steppers.base import MOST_ADVANCES
 from fivjax.verdicts.verdict import Verdict
@@ -41,7 +42,7 @@ PATIENCE = 5  # s that the oracle gets for one lane
 TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest step of its own
 
 
-def decided(lanes: dict, energy: bool = False) -> engine.Outcome:
+def decided(lanes: dict, energy: bool = False) -> Verdicts:
     start = extremes.FALLING if "decay" in lanes else extremes.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
         return engine.run_to_verdict(

@@ -1,4 +1,4 @@
-"""Limit cycles that ensembles meet on, and lanes that come to them."""
+"""Limit cycles that ensembles meet on, and trajectories that come to them."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps import engine as lanes
+from fivjax.maps import rounds
 from fivjax.verdicts.ensemble import KEPT, REACHED, SEEN, Approach, Attractor, Ensemble, approached, met, no_approach
 
 LOOKS, MEMBERS, DECAY = 60, 16, 1.0
@@ -57,7 +57,7 @@ def test_too_few_members_or_too_short_a_time_prove_nothing():
 
 
 def looks_until_reached(distances):
-    """The look at which a lane has reached a cycle of one crossing state, seen at these relative distances from it."""
+    """The look at which a trajectory has reached a cycle of one crossing state, seen at these relative distances from it."""
     with jax.enable_x64(True):
         attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0))
         approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
@@ -69,11 +69,11 @@ def looks_until_reached(distances):
     return None
 
 
-def test_a_lane_that_stays_close_has_reached_it():
+def test_a_trajectory_that_stays_close_has_reached_it():
     assert looks_until_reached([0.3, 0.1, 0.019, 0.015, 0.01, 0.005, 0.002]) == 5
 
 
-def test_a_lane_that_passes_by_or_recedes_has_not():
+def test_a_trajectory_that_passes_by_or_recedes_has_not():
     assert looks_until_reached([0.3, 0.019, 0.015, 0.018, 0.03] * 3) is None
     assert looks_until_reached(0.011 * 1.1 ** np.arange(6)) is None
     assert looks_until_reached([0.021] * 20) is None and REACHED < 0.021
@@ -92,10 +92,10 @@ def test_nothing_known_is_never_reached():
 
 
 def test_known_limit_cycles_change_no_verdict(paper_scene, monkeypatch):
-    """A map with lanes enough to be worth an ensemble, and its halves, whose lanes see their own orbits return."""
+    """A map with trajectories enough to be worth an ensemble, and its halves, whose trajectories see their own orbits return."""
     axes = {"mu": [0.1, 0.16, 0.22], "p": np.linspace(1.05, 3.9, 36)}
-    assert len(axes["p"]) // 2 < lanes.WORTH_KNOWING <= len(axes["p"])
-    monkeypatch.setattr(lanes, "ENSEMBLES", 2)  # the three are not followed at once
+    assert len(axes["p"]) // 2 < rounds.WORTH_KNOWING <= len(axes["p"])
+    monkeypatch.setattr(rounds, "ENSEMBLES", 2)  # the three are not followed at once
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
     halves = [fj.bistability_map(paper_scene, progress=False, mu=axes["mu"], p=axes["p"][k::2]) for k in (0, 1)]
     verdict, amplitude, when = (

@@ -13,15 +13,16 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.maps import engine as lanes
+from fivjax.maps import engine, rounds
 from fivjax.maps import store as checkpoint
+from fivjax.maps.results import Verdicts, record
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 
 
 @pytest.fixture
 def at_once(monkeypatch):
-    monkeypatch.setattr(lanes, "KEEP_EVERY", 0.0)
+    monkeypatch.setattr(engine, "KEEP_EVERY", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +39,11 @@ def same(a: xr.Dataset, b: xr.Dataset) -> bool:
 
 
 @pytest.mark.parametrize("calls", [1, 4, 9])
-def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
+def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
     paper_scene, whole, tmp_path, monkeypatch, at_once, calls
 ):
-    """Were a lane's result to depend on what runs beside it, or half a record kept, the maps would differ."""
-    real, made = lanes._follow_tile, []
+    """A trajectory's result does not depend on what runs beside it, and no half record is kept."""
+    real, made = rounds._follow_block, []
 
     def interrupted(*args):
         made.append(1)
@@ -51,7 +52,7 @@ def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
         return real(*args)
 
     path = tmp_path / "map.part"
-    monkeypatch.setattr(lanes, "_follow_tile", interrupted)
+    monkeypatch.setattr(rounds, "_follow_block", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         first = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     open_ = first["verdict"] == fj.Verdict.NOT_RUN
@@ -62,28 +63,28 @@ def test_a_map_interrupted_between_any_two_tiles_is_resumed_bit_for_bit(
     resumed = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     assert same(resumed, whole)
     # A finished map runs nothing again.
-    monkeypatch.setattr(lanes, "_run_block", None)
+    monkeypatch.setattr(rounds, "follow_all", None)
     assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
 
 
-def test_an_interrupt_inside_a_record_makes_no_lane_look_finished():
-    """Were the verdict written first, an interrupt behind it would leave a lane with a verdict and no amplitude."""
+def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
+    """The verdict is written last: an interrupt before it leaves the trajectory as not run."""
 
     class Unreadable:
         verdict = np.array([1])
-        account = None
+        energy = None
 
         @property
-        def orbit(self):
+        def recurrence(self):
             raise KeyboardInterrupt
 
-    outcome = lanes.Outcome(
+    verdicts = Verdicts(
         np.full(1, fj.Verdict.NOT_RUN, np.int8), np.ones(1), np.ones(1), np.ones(1, np.int32), np.ones(1), {}
     )
     with pytest.raises(KeyboardInterrupt):
-        lanes._record(outcome, np.array([0]), Unreadable())
-    assert outcome.verdict[0] == fj.Verdict.NOT_RUN
+        record(verdicts, np.array([0]), Unreadable())
+    assert verdicts.verdict[0] == fj.Verdict.NOT_RUN
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_a_full_disk_costs_nothing_that_was_finished(paper_scene, whole, tmp_pat
             raise OSError(errno.ENOSPC, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr("fivjax.results.os.fsync", full)
+    monkeypatch.setattr("fivjax.io.datasets.os.fsync", full)
     with pytest.warns(UserWarning, match="No space left on device"):
         m = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     assert same(m, whole)

@@ -15,7 +15,7 @@ from test_simulate import CASES, scene_of
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
 from fivjax.maps.engine import run_to_verdict
-from fivjax.maps.lane import measured_from_rest
+from fivjax.maps.progress import measured_from_rest
 from fivjax.plot import energy as plot_energy
 from fivjax.simulation import energy as accounts
 from fivjax.verdicts.verdict import Verdict

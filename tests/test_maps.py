@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.maps import engine as lanes
+from fivjax.maps import engine, rounds
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
 TABLE_2 = np.array([1.06, 1.11, 1.17, 1.20, 1.20, 1.20, 1.20])
@@ -58,7 +58,7 @@ def test_p_1_193_is_a_limit_cycle_whose_first_event_comes_a_second_late(paper_sc
 
 
 def confirm(m: xr.Dataset, count: int, seed: int) -> None:
-    """Randomly chosen lanes must have the oracle's verdict."""
+    """Randomly chosen trajectories must have the oracle's verdict."""
     rng = np.random.default_rng(seed)
     cells = rng.choice(m["verdict"].size, count, replace=False)
     wrong = []
@@ -74,7 +74,7 @@ def confirm(m: xr.Dataset, count: int, seed: int) -> None:
 
 
 def test_a_small_map_has_the_oracles_verdicts(paper_scene):
-    """The paper's plane on a coarse grid: no lane failed, at most one in a hundred undecided, the others confirmed."""
+    """The paper's plane on a coarse grid: no trajectory failed, at most one in a hundred undecided, the others confirmed."""
     m = fj.bistability_map(paper_scene, mu=np.linspace(0.05, 0.228, 12), p=np.linspace(1.0, 4.0, 12), progress=False)
     assert set(np.unique(m["verdict"])) <= {-1, 0, 1}
     assert np.sum(m["verdict"] == -1) <= 1
@@ -84,8 +84,8 @@ def test_a_small_map_has_the_oracles_verdicts(paper_scene):
 
 
 @pytest.mark.slow
-def test_the_papers_map_64_by_64_with_200_lanes_confirmed(paper_scene):
-    """No failed lane, fewer than 1 % undecided, 200 random lanes confirmed."""
+def test_the_papers_map_64_by_64_with_200_trajectories_confirmed(paper_scene):
+    """No failed trajectory, fewer than 1 % undecided, 200 random ones confirmed."""
     m = fj.bistability_map(paper_scene, mu=np.linspace(0.05, 0.228, 64), p=np.linspace(1.0, 4.0, 64), progress=False)
     counts = json.loads(m.attrs["counts"])
     print(counts)
@@ -111,7 +111,7 @@ def test_the_papers_map_by_where_switching_differs_at_the_boundary_only(paper_sc
 
 
 def test_other_axes_by_name_and_three_of_them(paper_scene):
-    """Any numeric parameter can be an axis, the structure's own included; a lane is what a scene of its own would be."""
+    """Any numeric parameter can be an axis, the structure's own included; a trajectory is what a scene of its own would be."""
     m = fj.bistability_map(paper_scene, theta=[0.005, 0.02], belt_speed=[1.0, 5.0], p=[1.05, 2.0], progress=False)
     assert m["verdict"].dims == ("theta", "belt_speed", "p")
     alone = fj.bistability_map(paper_scene.replace(theta=0.02, belt_speed=1.0), p=[1.05, 2.0], progress=False)
@@ -128,11 +128,11 @@ def test_speed_dependent_friction_has_verdicts_too():
     assert gentle["verdict"].values.tolist() == [0, 0]
 
 
-def test_lanes_do_not_know_each_other(paper_scene, monkeypatch):
-    """Neither the order of lanes nor the size of tiles and blocks may change a verdict; a poisoned lane harms no other."""
+def test_trajectories_do_not_know_each_other(paper_scene, monkeypatch):
+    """Neither their order nor the size of blocks and portions may change a verdict; a poisoned one harms no other."""
     axes = {"mu": [0.1, 0.2, 0.227], "p": [1.1, 1.5, 2.0, 3.0]}
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
-    scene_bytes = lanes.bytes_per_lane(paper_scene, sharing=4)
+    scene_bytes = engine.bytes_per_trajectory(paper_scene, sharing=4)
     blocks = fj.bistability_map(paper_scene, progress=False, memory=5 * scene_bytes, **axes)
     for name in ("verdict", "amplitude", "decided_at", "contact_events"):
         np.testing.assert_array_equal(whole[name], blocks[name])
@@ -140,18 +140,18 @@ def test_lanes_do_not_know_each_other(paper_scene, monkeypatch):
     def decided(mu, p):
         with np.errstate(all="ignore"), jax.enable_x64(True):
             values = {"mu": np.array(mu), "p": np.array(p)}
-            return lanes.run_to_verdict(
+            return engine.run_to_verdict(
                 paper_scene, values, fj.EventExact(), t_max=20.0, memory=1e9, progress=False, label=""
             )
 
     healthy = whole.sel(mu=0.2)
-    # Poison in the history of the load, among lanes of the same mechanics, and in the mechanics of a neighbour.
+    # Poison in the history of the load, among others of the same mechanics, and in the mechanics of a neighbour.
     among = decided([0.2] * 4, [1.1, 1.5, np.nan, 3.0])
     assert among.verdict.tolist() == [0, 1, fj.Verdict.NOT_FINITE, 1]
     beside = decided([0.2, np.nan, 0.2, 0.2, 0.2], [1.1, 2.0, 1.5, 2.0, 3.0])
     assert beside.verdict.tolist() == [0, fj.Verdict.NOT_FINITE, 1, 1, 1]
     np.testing.assert_array_equal(among.decided_at[[0, 1, 3]], healthy["decided_at"][[0, 1, 3]])
-    # Fewer lanes to a group, or one at a time: other shapes of the same products, which round differently.
+    # Fewer to a group, or one at a time: other shapes of the same products, which round differently.
     np.testing.assert_allclose(beside.decided_at[[0, 2, 3, 4]], healthy["decided_at"], rtol=1e-9)
     alone = decided([0.2], [2.0])
     np.testing.assert_allclose(alone.decided_at, healthy["decided_at"].sel(p=2.0), rtol=1e-9)
@@ -159,7 +159,7 @@ def test_lanes_do_not_know_each_other(paper_scene, monkeypatch):
 
 
 def test_failures_are_verdicts_of_their_own(paper_scene):
-    """Friction beyond Painlevé's limit, and a load that pulls: named lanes beside healthy ones."""
+    """Friction beyond Painlevé's limit, and a load that pulls: named verdicts beside healthy ones."""
     steep = paper_scene.replace(theta=0.8)
     m = fj.bistability_map(steep, mu=[0.05, 1.2], p=[1.1], progress=False)
     assert m["verdict"].sel(mu=1.2).item() == fj.Verdict.PAINLEVE
@@ -169,7 +169,7 @@ def test_failures_are_verdicts_of_their_own(paper_scene):
     assert unloaded["verdict"].sel(belt_speed=3.0).item() == fj.Verdict.SLIDING
 
 
-def test_a_structure_that_wedges_itself_grows_without_bound():
+def test_a_structure_that_jams_grows_without_bound():
     """Leaning into the belt, with more friction at rest than sliding: the oracle sticks for ever, pressed on ever harder."""
     scene = fj.Scene(fj.belt_oscillator(theta=-0.8, m2=0.5), fj.Coulomb(0.3, 1.3), 0.5, fj.Pulse(100.0, 3.0))
     m = fj.bistability_map(scene, p=[1.5, 3.0, 10.0, 30.0], t_max=5.0, progress=False)
@@ -179,15 +179,15 @@ def test_a_structure_that_wedges_itself_grows_without_bound():
     assert np.all(run.status == oracle.STICK) and np.all(np.diff(run.N) > 1e3)
 
 
-def test_lanes_that_run_out_of_steps_say_so(paper_scene):
-    """Were they called undecided, a longer `t_max` would be the wrong remedy."""
+def test_trajectories_that_run_out_of_steps_say_so(paper_scene):
+    """They are not called undecided: a longer `t_max` would be the wrong remedy."""
     m = fj.bistability_map(paper_scene, p=[1.05, 1.193], max_steps=64, progress=False)
     assert m["verdict"].sel(p=1.193).item() == fj.Verdict.STEP_FAILURE
     assert "max_steps" in json.loads(m["verdict"].attrs["meaning"])[str(int(fj.Verdict.STEP_FAILURE))]
 
 
-def test_undecided_lanes_are_labelled_and_counted(paper_scene):
-    """Given too little time, a lane says so instead of guessing."""
+def test_undecided_trajectories_are_labelled_and_counted(paper_scene):
+    """Given too little time, a trajectory is called undecided, not guessed."""
     m = fj.bistability_map(paper_scene, p=[1.05, 1.193], t_max=0.5, progress=False)
     assert m["verdict"].values.tolist() == [0, -1]
     assert json.loads(m.attrs["counts"])["undecided"] == 1
@@ -195,8 +195,8 @@ def test_undecided_lanes_are_labelled_and_counted(paper_scene):
 
 
 def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
-    """Ctrl-C in the middle of a run: the decided lanes are returned, the others labelled, and the user is told."""
-    real, calls = lanes._follow_tile, []
+    """Ctrl-C in the middle of a run: the decided trajectories are returned, the others labelled, and the user is told."""
+    real, calls = rounds._follow_block, []
 
     def interrupted(*args):
         calls.append(1)
@@ -204,7 +204,7 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(lanes, "_follow_tile", interrupted)
+    monkeypatch.setattr(rounds, "_follow_block", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, p=[1.02, 1.19], progress=False)
     assert m["verdict"].values.tolist() == [0, fj.Verdict.NOT_RUN]

@@ -10,7 +10,7 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
-from fivjax.maps.lane import next_step_end
+from fivjax.maps.progress import next_step_end
 from fivjax.model.scene import steady_sliding
 from fivjax.steppers.windowed import Windowed, propagators
 

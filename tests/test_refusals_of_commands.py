@@ -136,7 +136,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
     ("arguments", "fragments"),
     [
         (["tradeoff", "--t1", "0"], ["`t1`", "positive"]),
-        (["tradeoff", "--lanes", "0"], ["`lanes`", "at least 1"]),
+        (["tradeoff", "--trajectories", "0"], ["`trajectories`", "at least 1"]),
         (["tradeoff", "--mu", "-1"], ["`mu`", "non-negative"]),
         (["tradeoff", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
         (["tradeoff", "--mu", "200"], ["Painlevé", "200"]),
@@ -156,7 +156,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["simulate", "--k1", "0", "--k2", "0"], ["singular"]),
         (["simulate", "--t1", "1e9", "--dt-save", "1e-9"], ["`dt_save`", "rows"]),
         (["map", "--force", "nan"], ["`force`", "finite"]),
-        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["lanes", "memory"]),
+        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "memory"]),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip

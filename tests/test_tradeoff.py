@@ -15,7 +15,7 @@ def measured():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
     methods = {"coarse": fj.WhereSwitched(dt=2e-4), "exact": fj.EventExact()}
     return fj.tradeoff(
-        scene, methods=methods, t1=0.15, lanes=4, precisions=("float64",), boundary=False, progress=False
+        scene, methods=methods, t1=0.15, trajectories=4, precisions=("float64",), boundary=False, progress=False
     )
 
 
@@ -59,8 +59,8 @@ def test_bad_input_is_refused():
         fj.tradeoff(scene, methods=[fj.EventExact()])
     with pytest.raises(TypeError, match="must be a stepper"):
         fj.tradeoff(scene, methods={"x": 3}, boundary=False)
-    with pytest.raises(ValueError, match="`lanes` must be a whole number"):
-        fj.tradeoff(scene, lanes=0, boundary=False)
+    with pytest.raises(ValueError, match="`trajectories` must be a whole number"):
+        fj.tradeoff(scene, trajectories=0, boundary=False)
     with pytest.raises(ValueError, match="`t1`"):
         fj.tradeoff(scene, t1=-1.0, boundary=False)
     with pytest.raises(ValueError, match="`precisions`"):
@@ -71,7 +71,7 @@ def test_bad_input_is_refused():
 def test_the_boundary_of_each_method(paper_scene):
     """Verdicts and p_crit: exact for the exact method, first order in the step for where-switching."""
     methods = {"coarse": fj.WhereSwitched(dt=2e-4), "fine": fj.WhereSwitched(dt=5e-5), "exact": fj.EventExact()}
-    found = fj.tradeoff(paper_scene, methods=methods, precisions=("float64",), lanes=4, progress=False).sel(
+    found = fj.tradeoff(paper_scene, methods=methods, precisions=("float64",), trajectories=4, progress=False).sel(
         precision="float64"
     )
     assert found["wrong_verdicts"].sel(stepper="exact") == 0

@@ -10,7 +10,7 @@ import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.steppers.section import Resolution, rise_between
-from fivjax.verdicts.recurrence import new_orbit, observe
+from fivjax.verdicts.recurrence import new_recurrence, observe
 from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
 
 
@@ -100,8 +100,8 @@ def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True, decay=1.0):
     with jax.enable_x64(True):
         resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
         step = jax.jit(
-            lambda orbit, before, after, changed, t: observe(
-                orbit,
+            lambda memory, before, after, changed, t: observe(
+                memory,
                 jnp.ones(4),
                 jnp.zeros(4),
                 rise_between(before, after, 0),
@@ -112,12 +112,12 @@ def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True, decay=1.0):
                 resolution,
             )
         )
-        orbit, when = new_orbit(jnp.zeros(4)), None
+        memory, when = new_recurrence(jnp.zeros(4)), None
         for count, state in enumerate(states):
             after = jnp.asarray(state, float).at[2].set(0.0)
-            orbit = step(orbit, after.at[2].set(-1.0), after, jnp.asarray(events), 1.0 * count)
-            orbit = step(orbit, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False), count + 0.5)
-            if when is None and bool(orbit.returned):
+            memory = step(memory, after.at[2].set(-1.0), after, jnp.asarray(events), 1.0 * count)
+            memory = step(memory, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False), count + 0.5)
+            if when is None and bool(memory.returned):
                 when = count
         return when
 

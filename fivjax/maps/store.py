@@ -1,9 +1,9 @@
 """What a long run has finished, kept on disk while it goes on.
 
-A checkpoint is a file with one value per lane of each result, and a description of the run it belongs to. It is written anew
-as a whole and appears under its name only then (`results.save`), so at any instant, also that of a power cut, the file
-is some earlier state of the run. A lane's result does not depend on which other lanes run beside it; so what a resumed
-run adds is, bit for bit, what the interrupted one would have found.
+A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is
+written anew as a whole and appears under its name only then (`io.datasets.save`), so at any instant, also that of a power
+cut, the file is some earlier state of the run. A trajectory's result does not depend on which others run beside it; so what a
+resumed run adds is, bit for bit, what the interrupted one would have found.
 """
 
 import json
@@ -49,7 +49,7 @@ def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
 
 def keep(path: str | Path, run: dict, results: dict[str, np.ndarray]) -> None:
     """Write the checkpoint; where the disk does not take it, say so and leave the earlier one."""
-    dataset = xr.Dataset({name: ("lane", values) for name, values in results.items()})
+    dataset = xr.Dataset({name: ("trajectory", values) for name, values in results.items()})
     dataset.attrs.update(kind=KIND, run=json.dumps(run))
     try:
         save(dataset, path)

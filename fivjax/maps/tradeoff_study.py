@@ -25,7 +25,8 @@ from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
-from .bistability import bistability_map, critical_perturbation
+from .bistability import bistability_map
+from .threshold import critical_perturbation
 
 # Accuracies of the state that a recommendation is given for.
 WANTED = (1e-1, 1e-2, 1e-3, 1e-6, 1e-9)
@@ -46,7 +47,7 @@ def tradeoff(
     *,
     methods: dict[str, AbstractStepper] | None = None,
     t1: float = 0.5,
-    lanes: int = 256,
+    trajectories: int = 256,
     p: np.ndarray | None = None,
     precisions: tuple[str, ...] = ("float64", "float32"),
     boundary: bool = True,
@@ -59,12 +60,12 @@ def tradeoff(
     - `scene`: the scene; its load must be a `Pulse` for `boundary`.
     - `methods`: steppers by the name they are to have in the table, `default_methods()` unless given.
     - `t1`: time after which states are compared, in s: long enough for several contact events.
-    - `lanes`: trajectories that run side by side when cost is measured.
+    - `trajectories`: trajectories that run side by side when cost is measured.
     - `p`: kicks of the map whose verdicts are compared, 24 around the critical one unless given.
     - `precisions`: "float64", "float32". Maps always compute in double precision, so `p_crit` and verdicts have only that.
     - `boundary`: whether to compare p_crit and verdicts too, which takes most of the time.
 
-    **Returns:** a dataset over `stepper` and `precision`: `cost` (s per lane-cycle: one trajectory over one period of the
+    **Returns:** a dataset over `stepper` and `precision`: `cost` (s per trajectory-cycle: one trajectory over one period of the
     least stable sliding mode, on this machine, compilation left out), `state_error` (of the worst coordinate relative to
     the largest of its kind), `p_crit_error`, `wrong_verdicts` and `undecided` (shares of the map). All errors are against
     `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is what parts of the work cost, in units of
@@ -75,7 +76,7 @@ def tradeoff(
     without a pulse where the boundary is asked for.
     """
     methods = default_methods() if methods is None else methods
-    _check(scene, methods, t1, lanes, precisions, boundary)
+    _check(scene, methods, t1, trajectories, precisions, boundary)
     frequency = _frequency(scene)
     rows = {(name, kind): method for (name, method), kind in itertools.product(methods.items(), precisions)}
     measures = ("cost", "state_error", "p_crit_error", "wrong_verdicts", "undecided")
@@ -89,7 +90,7 @@ def tradeoff(
         place = list(methods).index(name), precisions.index(kind)
         own = scene if kind == "float64" else _single(scene)
         table["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
-        table["cost"][place] = _cost(own, method, t1, lanes) / (lanes * t1 * frequency)
+        table["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
         if edge is not None and kind == "float64":
             for measure, value in edge(method).items():
                 table[measure][place] = value
@@ -102,7 +103,9 @@ def tradeoff(
         coords={"stepper": list(methods), "precision": list(precisions), "part": list(parts)},
     )
     dataset.attrs["recommendation"] = json.dumps({f"{wanted:g}": recommend(dataset, wanted) for wanted in WANTED})
-    return labelled(dataset, scene, t1=t1, lanes=lanes, frequency=frequency, device=jax.devices()[0].device_kind)
+    return labelled(
+        dataset, scene, t1=t1, trajectories=trajectories, frequency=frequency, device=jax.devices()[0].device_kind
+    )
 
 
 def recommend(dataset: xr.Dataset, accuracy: float) -> str:
@@ -141,15 +144,15 @@ def table(dataset: xr.Dataset) -> str:
     return "\n".join(lines)
 
 
-def _check(scene, methods, t1, lanes, precisions, boundary) -> None:
+def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
     for name, method in methods.items():
         arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
-    if isinstance(lanes, bool) or not isinstance(lanes, int | np.integer) or lanes < 1:
-        raise ValueError(f"Argument `lanes` must be a whole number of at least 1, but is {lanes!r}.")
+    if isinstance(trajectories, bool) or not isinstance(trajectories, int | np.integer) or trajectories < 1:
+        raise ValueError(f"Argument `trajectories` must be a whole number of at least 1, but is {trajectories!r}.")
     refuse_painleve(scene)
     for kind in precisions:
         arguments.one_of("precisions", kind, ("float64", "float32"))
@@ -192,13 +195,13 @@ def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:
     return float(error) if np.isfinite(error) else np.inf
 
 
-def _cost(scene: Scene, method: AbstractStepper, t1: float, lanes: int) -> float:
-    """Wall time for `lanes` trajectories that differ a little in their kick, or are copies where there is none."""
+def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -> float:
+    """Wall time for `trajectories` trajectories that differ a little in their kick, or are copies where there is none."""
     if isinstance(scene.load, Pulse):
-        kicks = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, lanes)
+        kicks = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
         run = jax.jit(jax.vmap(lambda p: _run(scene, method, t1, p)[0][-1]))
     else:
-        kicks = np.ones(lanes)
+        kicks = np.ones(trajectories)
         run = jax.jit(
             jax.vmap(
                 lambda one: _run(jax.tree.map(lambda leaf: leaf * one.astype(leaf.dtype), scene), method, t1)[0][-1]

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ..io.datasets import labelled
 from ..linear import cea
-from ..maps.bistability import critical_perturbation
+from ..maps.threshold import critical_perturbation
 from ..model.scene import Scene, sliding_equilibrium
 from ..plot import energy as plot_energy
 from ..plot import linear as plot_linear

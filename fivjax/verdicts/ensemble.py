@@ -1,12 +1,12 @@
-"""The proof that a limit cycle is reached: the orbit has come to where many others of the same structure have met.
+"""Evidence for a limit cycle: the trajectory has come to where many others of the same structure have met.
 
-To see a lane's own orbit return (`orbit`) takes many cycles, most of all on a torus, whose beat has to be waited for. Lanes
-that differ in their kick only share their limit cycle; where it is known, a few cycles show that a lane has come to it.
-So an *ensemble* per structure is released from rest under loads of different sizes, whatever the lanes are. Its members have
-different energies, and they come to know the limit cycle by meeting on it (`met`): an unstable cycle is met by nobody.
+To see a trajectory's own orbit return (`recurrence`) takes many cycles, most of all on a torus, whose beat has to be waited
+for. Trajectories that differ in their kick only share their limit cycle; where it is known, a few cycles show that one has
+come to it. So an *ensemble* per structure is released from rest under loads of different sizes. Its members have different
+energies, and they come to know the limit cycle by meeting on it (`met`): an unstable cycle is met by nobody.
 
-A lane has reached the limit cycle once its crossing states, one after the other, are as close to the known ones, and do
-not recede. A crossing is one of the tangential velocity through zero, upwards.
+A trajectory has reached the limit cycle once its crossing states, one after the other, are as close to the known ones, and
+do not recede. A crossing is one of the tangential velocity through zero, upwards.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from .recurrence import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
 RELEASES = np.linspace(1.5, 6.0, 16)
-# Crossing states that a lane keeps: an ensemble is followed for as many looks at a time.
+# Crossing states that a trajectory keeps: an ensemble is followed for as many looks at a time.
 SEEN = 4
 # When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
 TESTS = (32, 36, 40, 44, 48, 52, 60, 68, 76, 88, 104, 128)
@@ -41,7 +41,7 @@ LOOKS_NEAR = 4
 
 
 class Attractor(eqx.Module):
-    """A limit cycle that is known: what lanes are compared with."""
+    """A limit cycle that is known: what trajectories are compared with."""
 
     # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
     crossings: Float[Array, "s 2n"]
@@ -53,7 +53,7 @@ class Attractor(eqx.Module):
 
 
 class Approach(eqx.Module):
-    """How near a lane has been to the known limit cycle lately."""
+    """How near a trajectory has been to the known limit cycle lately."""
 
     seen: Float[Array, "k 2n"]  # the crossing states that were looked at last, newest first
     near: Int[Array, ""]  # crossing states in a row that were close

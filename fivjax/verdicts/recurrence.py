@@ -1,4 +1,4 @@
-"""The proof of a limit cycle: the orbit is seen to return.
+"""The recurrence test: the orbit is seen to return to its section.
 
 The state at successive upward zero crossings of the tangential velocity comes back to within a tolerance, at the same
 lag again and again, with contact events in between and without drifting off. Two kinds of return count:
@@ -30,8 +30,8 @@ LONGEST_SEARCH = 64
 # A loose return: this close relative to the orbit's size, and to how far it had gone meanwhile.
 LOOSE_DISTANCE = 0.02
 LOOSE_SHARE = 0.15
-LOOSE_SPAN = 16
-ROOM = 1.5
+LOOSE_CROSSINGS = 16
+ALLOWANCE = 1.5
 # Loose returns go on for so long that what is not sustained would have decayed by this much: more than they may be apart.
 DECAYED = 0.2
 # And what is sustained does not change in size by more than this share of what it would have decayed by.
@@ -40,13 +40,13 @@ SUSTAINED = 0.1
 DRIFT = 0.02
 
 
-class Orbit(eqx.Module):
-    """What has to be remembered of a trajectory to see that its orbit returns: one earlier state and a few counts."""
+class Recurrence(eqx.Module):
+    """What has to be remembered of a trajectory to see that it returns: one earlier state and a few counts."""
 
     latest: Float[Array, " 2n"]  # the last crossing state
     anchor: Float[Array, " 2n"]  # the crossing state that later ones are compared with
     crossings: Int[Array, ""]  # since the anchor was set
-    patience: Int[Array, ""]  # crossings after which a search starts again from a newer anchor
+    search_length: Int[Array, ""]  # crossings after which a search starts again from a newer anchor
     changes: Int[Array, ""]  # status changes since the anchor was set
     lag: Int[Array, ""]  # crossings per return; 0 while none is known
     returns: Int[Array, ""]  # returns in a row at that lag
@@ -62,14 +62,14 @@ class Orbit(eqx.Module):
     returned: Bool[Array, ""]  # seen to return: a limit cycle
 
 
-def new_orbit(y: State) -> Orbit:
+def new_recurrence(y: State) -> Recurrence:
     zero, none = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
-    # No anchor yet: an infinite one is never returned to, and a patience of one replaces it at the first crossing.
-    return Orbit(
+    # No anchor yet: an infinite one is never returned to, and a search of one crossing replaces it at the first crossing.
+    return Recurrence(
         latest=jnp.full_like(y, jnp.nan),
         anchor=jnp.full_like(y, jnp.inf),
         crossings=none,
-        patience=none + 1,
+        search_length=none + 1,
         changes=none,
         lag=none,
         returns=none,
@@ -87,7 +87,7 @@ def new_orbit(y: State) -> Orbit:
 
 
 def observe(
-    orbit: Orbit,
+    memory: Recurrence,
     weights: Float[Array, " 2n"],
     equilibrium: State,
     rise: Rise,
@@ -96,8 +96,8 @@ def observe(
     t: Float[Array, ""],
     decay: Float[Array, ""],
     resolution: Resolution,
-) -> Orbit:
-    """The orbit's memory after one more step, in which the velocity rose through zero or not.
+) -> Recurrence:
+    """The memory after one more step, in which the velocity rose through zero or not.
 
     `weights` make displacements and velocities comparable; distances are relative to that from `equilibrium`. `changed`
     says whether the status changed in the step, `peak` is the largest tangential speed in it, `t` is the time at its end,
@@ -105,70 +105,70 @@ def observe(
     """
     crossed, at = rise
     distance = computed_once(
-        lambda: _length(weights * (at - orbit.anchor)) / _length(weights * (at - equilibrium)), jnp.zeros_like(peak)
+        lambda: _length(weights * (at - memory.anchor)) / _length(weights * (at - equilibrium)), jnp.zeros_like(peak)
     )
 
-    crossings = orbit.crossings + 1
-    changes = orbit.changes + changed
-    peak = jnp.maximum(orbit.peak, peak)
+    crossings = memory.crossings + 1
+    changes = memory.changes + changed
+    peak = jnp.maximum(memory.peak, peak)
     # While the anchor is not set, the distance is infinite and says nothing.
-    excursion = jnp.where(jnp.isfinite(distance), jnp.maximum(orbit.excursion, distance), orbit.excursion)
-    # On a torus distances at one lag scatter a little; a lag once found is given some room.
-    room = jnp.where(orbit.lag == 0, 1.0, ROOM)
-    loose = (distance <= room * LOOSE_DISTANCE) & (distance <= room * LOOSE_SHARE * excursion)
+    excursion = jnp.where(jnp.isfinite(distance), jnp.maximum(memory.excursion, distance), memory.excursion)
+    # On a torus distances at one lag scatter a little; a lag once found may scatter by more.
+    allowance = jnp.where(memory.lag == 0, 1.0, ALLOWANCE)
+    loose = (distance <= allowance * LOOSE_DISTANCE) & (distance <= allowance * LOOSE_SHARE * excursion)
     loose = loose & (excursion >= resolution.floor)
     close = ((distance <= resolution.tight) | loose) & (changes > 0)
-    searching = orbit.lag == 0
-    due = crossings == orbit.lag
+    searching = memory.lag == 0
+    due = crossings == memory.lag
     again = ~searching & due & close
     found = searching & close
     lost = ~searching & due & ~close
-    tired = searching & ~close & (crossings >= orbit.patience)
+    in_vain = searching & ~close & (crossings >= memory.search_length)
 
-    returns = jnp.where(found, 1, jnp.where(lost, 0, orbit.returns + again))
-    lag = jnp.where(found, crossings, jnp.where(lost, 0, orbit.lag))
-    span = jnp.where(loose, LOOSE_SPAN, resolution.span)
-    needed = jnp.maximum(LEAST_RETURNS, -(-span // jnp.maximum(lag, 1)))
+    returns = jnp.where(found, 1, jnp.where(lost, 0, memory.returns + again))
+    lag = jnp.where(found, crossings, jnp.where(lost, 0, memory.lag))
+    crossings_needed = jnp.where(loose, LOOSE_CROSSINGS, resolution.span)
+    needed = jnp.maximum(LEAST_RETURNS, -(-crossings_needed // jnp.maximum(lag, 1)))
     # A vibration that merely decays slowly comes back loosely, too.
-    faded = (t - orbit.since) * decay
-    change = jnp.abs(jnp.log(peak / jnp.where(orbit.first_peak > 0, orbit.first_peak, 1.0)))
+    faded = (t - memory.since) * decay
+    change = jnp.abs(jnp.log(peak / jnp.where(memory.first_peak > 0, memory.first_peak, 1.0)))
     sustained = (faded >= DECAYED) & (change <= SUSTAINED * faded)
     complete = again & (returns >= needed) & (~loose | sustained)
     # Below a hundredth of the method's error there is nothing left to drift.
-    further = distance > jnp.maximum(orbit.first_distance, 0.01 * resolution.tight)
-    rising = jnp.where(again, orbit.rising & (distance > (1 + DRIFT) * orbit.last_distance), orbit.rising)
+    further = distance > jnp.maximum(memory.first_distance, 0.01 * resolution.tight)
+    rising = jnp.where(again, memory.rising & (distance > (1 + DRIFT) * memory.last_distance), memory.rising)
     drifting = jnp.where(loose, rising, further)
     restart = found | (complete & drifting)
-    amplitude = jnp.where(found, peak, jnp.where(again, jnp.maximum(orbit.amplitude, peak), orbit.amplitude))
-    new_anchor = found | again | lost | tired
-    patience = jnp.where(
+    amplitude = jnp.where(found, peak, jnp.where(again, jnp.maximum(memory.amplitude, peak), memory.amplitude))
+    new_anchor = found | again | lost | in_vain
+    search_length = jnp.where(
         lost,
         SHORTEST_SEARCH,
-        jnp.where(tired, jnp.clip(2 * orbit.patience, SHORTEST_SEARCH, LONGEST_SEARCH), orbit.patience),
+        jnp.where(in_vain, jnp.clip(2 * memory.search_length, SHORTEST_SEARCH, LONGEST_SEARCH), memory.search_length),
     )
-    seen = Orbit(
+    seen = Recurrence(
         latest=at,
-        anchor=jnp.where(new_anchor, at, orbit.anchor),
+        anchor=jnp.where(new_anchor, at, memory.anchor),
         crossings=jnp.where(new_anchor, 0, crossings),
-        patience=patience,
+        search_length=search_length,
         changes=jnp.where(new_anchor, 0, changes),
         lag=lag,
         returns=jnp.where(restart, 1, returns),
-        since=jnp.where(restart, orbit.set_out, orbit.since),
-        set_out=jnp.where(new_anchor, t, orbit.set_out),
-        first_distance=jnp.where(restart, distance, orbit.first_distance),
-        last_distance=jnp.where(found | again, distance, orbit.last_distance),
+        since=jnp.where(restart, memory.set_out, memory.since),
+        set_out=jnp.where(new_anchor, t, memory.set_out),
+        first_distance=jnp.where(restart, distance, memory.first_distance),
+        last_distance=jnp.where(found | again, distance, memory.last_distance),
         rising=restart | rising,
         excursion=jnp.where(new_anchor, 0.0, excursion),
         peak=jnp.where(new_anchor, 0.0, peak),
-        first_peak=jnp.where(restart, peak, orbit.first_peak),
+        first_peak=jnp.where(restart, peak, memory.first_peak),
         amplitude=amplitude,
-        returned=orbit.returned | (complete & ~drifting),
+        returned=memory.returned | (complete & ~drifting),
     )
-    between = eqx.tree_at(lambda o: (o.changes, o.peak), orbit, (changes, peak))
+    between = eqx.tree_at(lambda m: (m.changes, m.peak), memory, (changes, peak))
     return jax.tree.map(lambda new, old: jnp.where(crossed, new, old), seen, between)
 
 
 def _length(x: Float[Array, " k"]) -> Float[Array, ""]:
-    # Term by term: in a batch that is one fused loop over lanes.
+    # Term by term: in a batch that is one fused loop over trajectories.
     return jnp.sqrt(sum(x[k] ** 2 for k in range(x.shape[0])))

@@ -117,7 +117,7 @@ def slides_forever(
     members = modes.envelope.members
     signals = [modes.pressing * modal, modes.slip * modal]
     margins = [linear.pressing_margin, linear.slip_margin]
-    # The bound is dear. In a batch a loop runs only if one of the lanes wants it: where both signals, each cluster of
+    # The bound is dear. In a batch a loop runs only if one of the trajectories wants it: where both signals, each cluster of
     # modes at its largest, are within their margins now.
     for shares, margin in zip(signals, margins, strict=True):
         sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)

@@ -1,4 +1,4 @@
-r"""The proof that a contact sticks for ever, its forces growing without bound: a structure that has wedged itself.
+r"""The proof that a contact sticks for ever, its forces growing without bound: it jams on the belt.
 
 Where friction is strong and the structure leans into the belt, what sticks presses itself on ever harder, and the belt
 carries it along for ever: the model has no bounded motion then. While it sticks, $q_t = x + v s$ after the time $s$, and the
@@ -18,7 +18,7 @@ from ..contact import Contact, Mechanics, State, Status
 from ..model.scene import Scene
 
 
-class Wedge(eqx.Module):
+class StickingDrift(eqx.Module):
     """What the proof wants to know of a scene, worked out once."""
 
     load: Float[Array, ""]  # N
@@ -29,7 +29,7 @@ class Wedge(eqx.Module):
     reach: Float[Array, "2"]  # how far a deviation of unit energy can move the guards, N/√J
 
 
-def wedge(scene: Scene) -> Wedge:
+def sticking_drift(scene: Scene) -> StickingDrift:
     """The drift of a sticking contact under the final load, and what its guards do along it."""
     structure, mechanics, load = scene.structure, Mechanics(scene), scene.load.final
     n, t = structure.size, structure.tangential
@@ -55,7 +55,7 @@ def wedge(scene: Scene) -> Wedge:
     position, motion = rows[:, rest], rows[:, n + rest]
     squares = jnp.sum(position * _solve(stiffness, position.T).T + motion * _solve(mass, motion.T).T, axis=-1)
     energy = jnp.zeros((2 * n, 2 * n), zero.dtype).at[block].set(stiffness).at[np.ix_(n + rest, n + rest)].set(mass)
-    return Wedge(
+    return StickingDrift(
         load=load,
         base=at,
         per_displacement=jnp.concatenate([zero.at[rest].set(per_x).at[t].set(1.0), zero]),
@@ -65,14 +65,14 @@ def wedge(scene: Scene) -> Wedge:
     )
 
 
-def sticks_forever(wedge: Wedge, mechanics: Mechanics, contact: Contact, y: State) -> Bool[Array, ""]:
+def sticks_forever(drift: StickingDrift, mechanics: Mechanics, contact: Contact, y: State) -> Bool[Array, ""]:
     """Whether a bound shows that a contact which sticks now, under its final load, never comes free."""
-    drift = wedge.base + wedge.per_displacement * y[mechanics.tangential]
-    deviation = y - drift
-    size = jnp.sqrt(jnp.maximum(jnp.sum(deviation * jnp.sum(wedge.energy * deviation, axis=-1)), 0.0))
-    guards = physics.guards(mechanics, contact, wedge.load, drift)
+    carried = drift.base + drift.per_displacement * y[mechanics.tangential]
+    deviation = y - carried
+    size = jnp.sqrt(jnp.maximum(jnp.sum(deviation * jnp.sum(drift.energy * deviation, axis=-1)), 0.0))
+    guards = physics.guards(mechanics, contact, drift.load, carried)
     sticking = contact.status == Status.STICK
-    return sticking & jnp.all(wedge.slopes > 0) & jnp.all(guards > wedge.reach * size)
+    return sticking & jnp.all(drift.slopes > 0) & jnp.all(guards > drift.reach * size)
 
 
 def _solve(matrix, right):

@@ -23,7 +23,7 @@ class Verdict(enum.IntEnum):
 MEANING = {
     Verdict.SLIDING: "returns to steady sliding: a bound shows that no contact event can happen again",
     Verdict.LIMIT_CYCLE: "stays on an orbit with contact events that was seen to return, or that many others have met on",
-    Verdict.UNDECIDED: "neither was proved before the time limit; raise `t_max`, or look at the lane with `simulate`",
+    Verdict.UNDECIDED: "neither was proved before the time limit; raise `t_max`, or look at the trajectory with `simulate`",
     Verdict.NOT_FINITE: "the state stopped being finite; take a smaller step or check the parameters",
     Verdict.NO_EQUILIBRIUM: "no steady sliding to start from; change the load or the friction",
     Verdict.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé); lower it",
@@ -35,3 +35,6 @@ MEANING = {
     "lower `t_max`, or soften what is stiffest",
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",
 }
+
+# Where a trajectory could not be followed, as opposed to followed without a proof.
+FAILURES = frozenset(Verdict) - {Verdict.SLIDING, Verdict.LIMIT_CYCLE, Verdict.UNDECIDED, Verdict.NOT_RUN}

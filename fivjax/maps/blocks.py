@@ -1,7 +1,7 @@
-"""Batches of lanes cut into tiles of one size, so that a scene is compiled once for any number of lanes.
+"""Batches of trajectories cut into blocks of one size, so that a scene is compiled once for any number of trajectories.
 
-A tile is a number of rows of lanes side by side. The lanes of a row belong to one *group* and share what is worked out
-once for it; tiles run in threads, one per core.
+A block is a number of rows of trajectories side by side. Those of a row belong to one *group* and share what is worked
+out once for it; blocks run in threads, one per core.
 """
 
 import os
@@ -10,65 +10,65 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from .packed import Packed
+from .flattened import Flattened
 
-# Lanes that a tile holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
-TILE_ON_CPU = 128
-LARGE_TILE_ON_CPU = 512
-TILE_ELSEWHERE = 65536
-# Lanes from which on it pays to compile the larger tile.
+# Trajectories that a block holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
+BLOCK_ON_CPU = 128
+LARGE_BLOCK_ON_CPU = 512
+BLOCK_ELSEWHERE = 65536
+# Trajectories from which on it pays to compile the larger block.
 MANY = 8192
 
 
 def workers() -> int:
-    # A tile is too small for XLA to split among cores; tiles side by side use them all.
+    # A block is too small for XLA to split among cores; blocks side by side use them all.
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def in_tiles(
+def in_blocks(
     function,
-    shared: Packed,
+    shared: Flattened,
     group: np.ndarray,
-    lanes: Packed,
+    trajectories: Flattened,
     width: int,
     pool: ThreadPoolExecutor,
     in_place: bool = False,
-) -> Packed:
-    """`function(shared, lanes)` of all lanes, in tiles of one size, so that a scene is compiled once for any map.
+) -> Flattened:
+    """`function(shared, trajectories)` of all trajectories, in blocks of one size: a scene is compiled once for any map.
 
-    `group` says which row of `shared` is each lane's. In a tile, `shared` has an axis of rows, `lanes` one more. With
-    `in_place` the results, of the same form, take the place of `lanes`.
+    `group` says which row of `shared` is each trajectory's. In a block, `shared` has an axis of rows,
+    `trajectories` one more. With `in_place` the results, of the same form, take the place of `trajectories`.
     """
     slots, filled = _side_by_side(group, width)
-    size = TILE_ELSEWHERE
+    size = BLOCK_ELSEWHERE
     if jax.default_backend() == "cpu":
-        size = LARGE_TILE_ON_CPU if len(group) >= MANY else TILE_ON_CPU
+        size = LARGE_BLOCK_ON_CPU if len(group) >= MANY else BLOCK_ON_CPU
     rows = max(1, size // width)
 
-    def run(start: int, numbers: np.ndarray | None) -> Packed:
-        # The last tile is filled up with copies of its first row.
+    def run(start: int, numbers: np.ndarray | None) -> Flattened:
+        # The last block is filled up with copies of its first row.
         chosen = np.arange(start, start + rows)
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
         place = slots[np.where(chosen < len(slots), chosen, start)]
         with jax.enable_x64(True):  # the setting is a thread's own
-            own = Packed(shared.numbers[group[place[:, 0]]], shared.form)
-            result = function(own, Packed(lanes.numbers[place], lanes.form))
+            own = Flattened(shared.numbers[group[place[:, 0]]], shared.form)
+            result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
             part = np.asarray(result.numbers)
         numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers
         # Into place at once, so that parts are not kept beside the whole.
         numbers[place[real]] = part[real]
-        return Packed(numbers, result.form)
+        return Flattened(numbers, result.form)
 
-    results = lanes if in_place else run(0, None)
+    results = trajectories if in_place else run(0, None)
     for _ in pool.map(lambda start: run(start, results.numbers), range(0 if in_place else rows, len(slots), rows)):
         pass
     return results
 
 
 def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `width` lanes of one group each, as places in `group`; what is left over repeats the row's first lane.
+    """Rows of `width` trajectories of one group each, as places in `group`; what is left over repeats the row's first.
 
     Second, which of the places are not such repetitions.
     """

@@ -1,8 +1,8 @@
-"""A tree of arrays as one array: nothing is lost on the way, and rows close up in place."""
+"""A tree of arrays as one array: nothing is lost on the way, and rows are compacted in place."""
 
 import numpy as np
 
-from fivjax.maps.packed import MOVED_AT_ONCE, packed
+from fivjax.maps.flattened import MOVED_AT_ONCE, flatten
 
 
 def tree_of(rows: int):
@@ -17,25 +17,25 @@ def tree_of(rows: int):
 
 def test_a_tree_comes_back_as_it_was():
     tree = tree_of(7)
-    back = packed(tree).tree
+    back = flatten(tree).tree
     for name, leaf in tree.items():
         np.testing.assert_array_equal(back[name], leaf)
         assert back[name].dtype == leaf.dtype
 
 
 def test_what_is_written_to_a_real_leaf_is_written_to_the_array():
-    numbers = packed(tree_of(7))
+    numbers = flatten(tree_of(7))
     numbers.tree["real"][3, 1, 2] = 42.0
     assert numbers.tree["real"][3, 1, 2] == 42.0
 
 
-def test_rows_close_up_in_place():
+def test_rows_are_compacted_in_place():
     """More rows than are moved at a time, so that one move writes where the next one reads."""
     rows = 3 * MOVED_AT_ONCE
-    numbers = packed(tree_of(rows))
+    numbers = flatten(tree_of(rows))
     before = numbers.numbers.copy()
     kept = np.flatnonzero(np.random.default_rng(2).random(rows) < 0.7)
-    closed = numbers.closed_up(kept)
-    np.testing.assert_array_equal(closed.numbers, before[kept])
-    assert np.shares_memory(closed.numbers, numbers.numbers)
-    assert numbers.closed_up(np.arange(rows)) is numbers
+    kept_rows = numbers.compacted(kept)
+    np.testing.assert_array_equal(kept_rows.numbers, before[kept])
+    assert np.shares_memory(kept_rows.numbers, numbers.numbers)
+    assert numbers.compacted(np.arange(rows)) is numbers

@@ -1,4 +1,4 @@
-"""A tree of arrays as one array of numbers, one row per lane: a call that takes few arrays starts faster than one of many."""
+"""A tree of arrays as one array of numbers, one row per trajectory: calls that take few arrays start faster."""
 
 import math
 
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, PyTree
 MOVED_AT_ONCE = 4096
 
 
-class Packed(eqx.Module):
+class Flattened(eqx.Module):
     """The leaves of a tree side by side; they are real, complex, whole or truth values, which double precision holds."""
 
     numbers: Float[Array, "*rows m"]
@@ -34,7 +34,7 @@ class Packed(eqx.Module):
             start += size
         return jax.tree.unflatten(structure, leaves)
 
-    def closed_up(self, rows: Int[np.ndarray, " r"]) -> "Packed":
+    def compacted(self, rows: Int[np.ndarray, " r"]) -> "Flattened":
         """Only these rows, in rising order, moved to the array's beginning in place: there is never a second array."""
         if len(rows) == len(self.numbers):
             return self
@@ -42,10 +42,10 @@ class Packed(eqx.Module):
             chosen = rows[start : start + MOVED_AT_ONCE]
             # None of them lies before the place that it comes to, so nothing is written over that is still wanted.
             self.numbers[start : start + len(chosen)] = self.numbers[chosen]
-        return Packed(self.numbers[: len(rows)], self.form)
+        return Flattened(self.numbers[: len(rows)], self.form)
 
 
-def packed(tree: PyTree, row_axes: int = 1) -> Packed:
+def flatten(tree: PyTree, row_axes: int = 1) -> Flattened:
     """A tree whose leaves have this many leading axes in common."""
     leaves, structure = jax.tree.flatten(tree)
     xp = np if all(isinstance(leaf, np.ndarray) for leaf in leaves) else jnp
@@ -57,4 +57,4 @@ def packed(tree: PyTree, row_axes: int = 1) -> Packed:
 
     shapes = tuple(leaf.shape[row_axes:] for leaf in leaves)
     types = tuple(np.dtype(leaf.dtype).name for leaf in leaves)
-    return Packed(xp.concatenate([flat(leaf) for leaf in leaves], axis=-1), (structure, shapes, types))
+    return Flattened(xp.concatenate([flat(leaf) for leaf in leaves], axis=-1), (structure, shapes, types))

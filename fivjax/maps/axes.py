@@ -1,0 +1,43 @@
+"""What maps and critical kicks have in common: their axes and arguments, checked, and what their datasets say of the run."""
+
+import itertools
+
+import numpy as np
+import xarray as xr
+
+from ..foundation import arguments
+from ..linear.critical import critical_friction
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+
+
+def add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
+    """Note the critical friction of linear theory where friction is an axis and nothing else changes it."""
+    changes_it = {*scene.structure.parameters, "belt_speed"} & set(dataset.dims)
+    if "mu" not in dataset.dims or changes_it or float(scene.belt_speed) == 0:
+        return
+    limit = float(critical_friction(scene.structure, direction=1 if scene.belt_speed > 0 else -1))
+    if np.isfinite(limit):
+        dataset.attrs["mu_crit"] = limit
+
+
+def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
+    unknown = [name for name in axes if name not in scene.parameters]
+    if unknown:
+        hint = " Give the scene a Pulse as its load." if unknown[0] in ("p", "duration", "start") else ""
+        raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
+    checked = {name: arguments.axis(name, values) for name, values in axes.items()}
+    # Every rule on a parameter is a bound, or an order between two, so the corners of the grid stand for all of it.
+    for corner in itertools.product(*((values[0], values[-1]) for values in checked.values())):
+        scene.replace(**dict(zip(checked, corner, strict=True)))
+    return checked
+
+
+def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    arguments.real_number("t_max", t_max, above=0)
+    arguments.real_number("memory", memory, above=0)
+    batched = [name for name, value in scene.parameters.items() if np.shape(value) != ()]
+    if batched:
+        raise ValueError(f"Parameter `{batched[0]}` of the scene must be one number; pass its values as an axis.")

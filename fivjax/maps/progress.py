@@ -1,0 +1,166 @@
+"""One trajectory on its way to a verdict: where it begins, and one step of it.
+
+Everything here is written for one trajectory; `rounds` makes many of it. States are deviations from the sliding
+equilibrium under the final load: crossing states, kicks and events are then as exact as they are small.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, Rest, State
+from ..model.load import AbstractLoad
+from ..model.scene import Scene, steady_sliding
+from ..simulation.energy import Books, Ledger, enter, mechanical_energy, open_ledger
+from ..steppers.base import AbstractStepper, Advance
+from ..steppers.core import Segment
+from ..steppers.windowed import Windowed
+from ..verdicts import ensemble as attractors
+from ..verdicts import recurrence
+from ..verdicts.ensemble import Approach, Attractor
+from ..verdicts.recurrence import Recurrence
+from ..verdicts.sliding_proof import SlidingModes
+from ..verdicts.sticking_proof import StickingDrift
+from ..verdicts.verdict import Verdict
+
+# The longest advance that a ledger is asked to enter, s.
+LONGEST_ENTRY = 1.0
+
+
+class Progress(eqx.Module):
+    """One trajectory on its way to a verdict."""
+
+    t: Float[Array, ""]
+    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
+    contact: Contact
+    recurrence: Recurrence
+    events: Int[Array, ""]  # status changes so far
+    last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
+    approach: Approach
+    verdict: Int[Array, ""]
+    energy: "EnergyRecord | None" = None  # where its energy went, when asked for
+
+
+class Setting(eqx.Module):
+    """What a trajectory is followed with."""
+
+    scene: Scene
+    method: AbstractStepper | Windowed
+    resolution: recurrence.Resolution
+    mechanics: Mechanics  # see `measured_from_rest`
+    prepared: Any  # the method's own, see `AbstractStepper.prepare`
+    modes: SlidingModes
+    drift: StickingDrift
+    attractor: Attractor
+
+
+class EnergyRecord(eqx.Module):
+    """Where the energy of one trajectory went."""
+
+    ledger: Ledger
+    vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
+
+
+def measured_from_rest(scene: Scene) -> Mechanics:
+    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
+
+    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
+    would be decided, and the balance of energy upset, by noise.
+    """
+    load = scene.load.final
+    _, normal_force = steady_sliding(scene, load)
+    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
+
+
+def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Progress:
+    """A trajectory at the sliding equilibrium of its scene, just before anything happens."""
+    q, _ = steady_sliding(scene, scene.load.force)
+    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
+    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
+    verdict = jnp.where(
+        ~modes.linear.solvable,
+        Verdict.PAINLEVE,
+        jnp.where(modes.linear.exists, Verdict.UNDECIDED, Verdict.NO_EQUILIBRIUM),
+    )
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
+    return Progress(
+        t=jnp.zeros((), y.dtype),
+        y=y,
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
+        recurrence=recurrence.new_recurrence(y),
+        events=jnp.zeros((), jnp.int32),
+        last_event=jnp.full((), jnp.nan, y.dtype),
+        approach=attractors.no_approach(y),
+        verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
+        energy=EnergyRecord(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
+    )
+
+
+def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array, ""]) -> Progress:
+    """The trajectory at rest under so many times its final load, which jumps to its final value now, after all kicks; not a
+    number, and the trajectory stays as it is.
+    """
+    q, _ = steady_sliding(scene, load * scene.load.final)
+    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
+    after = deviation, jnp.max(scene.load.jumps, initial=0.0)
+    chosen = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(load), old, new), after, (now.y, now.t))
+    return eqx.tree_at(lambda now: (now.y, now.t), now, chosen)
+
+
+def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
+    """The end of a step from `t`: at most `dt` on, never across a jump of the load, and exactly on it when one is reached."""
+    ahead = load.jumps > t
+    jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
+    # Equal steps up to the jump; the allowance keeps rounding from adding one more, vanishingly short.
+    steps = jnp.ceil((jump - t) / dt - 1e-6)
+    return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
+
+
+def step(setting: Setting, now: Progress) -> Progress:
+    """One step further, which ends at the next event at the latest."""
+    scene, structure, method = setting.scene, setting.scene.structure, setting.method
+    # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
+    longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
+    t = next_step_end(scene.load, now.t, longest)
+    load = scene.load(0.5 * (now.t + t)) - scene.load.final
+    after = method.advance(setting.prepared, now.contact, load, now.y, t - now.t, at_section=True)
+    y, contact, h, peak, rise, *_ = after
+    t = jnp.where(h >= t - now.t, t, now.t + h)
+    changed = contact.status != now.contact.status
+    memory = recurrence.observe(
+        now.recurrence,
+        structure.weights,
+        jnp.zeros_like(y),
+        rise,
+        changed,
+        peak,
+        t,
+        setting.modes.slowest_decay,
+        setting.resolution,
+    )
+    return Progress(
+        t=t,
+        y=y,
+        contact=contact,
+        recurrence=memory,
+        events=now.events + changed,
+        last_event=jnp.where(changed, t, now.last_event),
+        approach=now.approach,
+        verdict=now.verdict,
+        energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
+    )
+
+
+def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
+    scene = setting.scene
+    segment = Segment(before.t, load, before.contact, before.y, after)
+    ledger = enter(Books(scene), setting.method, setting.mechanics, energy.ledger, segment)
+    kick_ends = jnp.max(scene.load.jumps, initial=0.0)
+    just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
+    vibration = mechanical_energy(scene.structure, after.y)
+    return EnergyRecord(ledger, jnp.where(just_kicked, vibration, energy.vibration))

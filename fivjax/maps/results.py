@@ -1,0 +1,76 @@
+"""What is known of many trajectories at their ends, as arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..simulation.energy import exchanged
+from ..verdicts.verdict import Verdict
+from .progress import Progress
+
+# What a ledger leaves of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
+ENERGIES = (
+    "stick_work",
+    "slide_work",
+    "interface_work",
+    "damping_work",
+    "load_work",
+    "kick_work",
+    "impact_loss",
+    "kick_energy",
+    "energy_residual",
+    "energy_exchanged",
+)
+
+
+class Verdicts(NamedTuple):
+    """What is known of each trajectory at its end; arrays over trajectories."""
+
+    verdict: np.ndarray
+    amplitude: np.ndarray  # m/s
+    decided_at: np.ndarray  # s
+    events: np.ndarray
+    last_event: np.ndarray  # s
+    energy: dict[str, np.ndarray]  # terms of the ledger by name, J; empty where not asked for
+
+    @property
+    def pending(self) -> np.ndarray:
+        """Which trajectories have not been followed to their end."""
+        return self.verdict == Verdict.NOT_RUN
+
+
+def not_run(total: int, energy: bool) -> Verdicts:
+    """So many trajectories of which nothing is known yet."""
+    return Verdicts(
+        verdict=np.full(total, Verdict.NOT_RUN, np.int8),
+        amplitude=np.full(total, np.nan),
+        decided_at=np.full(total, np.nan),
+        events=np.zeros(total, np.int32),
+        last_event=np.full(total, np.nan),
+        energy={name: np.full(total, np.nan) for name in ENERGIES} if energy else {},
+    )
+
+
+def record(verdicts: Verdicts, index: np.ndarray, ended: Progress) -> None:
+    """Write what is known of trajectories at their ends to their places."""
+    verdict = np.asarray(ended.verdict)
+    amplitude = np.where(verdict == Verdict.LIMIT_CYCLE, ended.recurrence.amplitude, np.nan)
+    verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, amplitude)
+    verdicts.decided_at[index] = np.where(verdict >= 0, ended.t, np.nan)
+    verdicts.events[index] = ended.events
+    verdicts.last_event[index] = ended.last_event
+    if ended.energy is not None:
+        ledger = ended.energy.ledger
+        terms = {**ledger.work.lines("work"), "impact_loss": ledger.impact, "energy_residual": ledger.worst}
+        terms["energy_exchanged"] = exchanged(ledger)
+        terms["kick_energy"] = ended.energy.vibration
+        for name, values in verdicts.energy.items():
+            values[index] = terms[name]
+    # Last, and in one go: a trajectory with a verdict is complete, whenever an interrupt comes.
+    verdicts.verdict[index] = verdict
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun: "1 trajectory", "2 trajectories"."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count:,} {noun if count == 1 else plural}"

@@ -1,0 +1,121 @@
+"""What trajectories of one structure share, worked out once for all of them.
+
+Trajectories that differ in the history of their load only make a *group*: they have the same mechanics, the same
+matrices of their stepper, the same proofs and the same attractor.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..contact import Mechanics
+from ..foundation.compiling import compiled
+from ..linear.linearisation import linear_sliding
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+from ..steppers.event_exact import EventExact
+from ..steppers.section import Resolution
+from ..steppers.windowed import MATRIX_ROWS, Windowed
+from ..verdicts import ensemble as attractors
+from ..verdicts.ensemble import Attractor
+from ..verdicts.sliding_proof import SlidingModes, sliding_modes
+from ..verdicts.sticking_proof import StickingDrift, sticking_drift
+from .flattened import Flattened, flatten
+from .progress import measured_from_rest
+
+# Parameters that trajectories of one group may differ in: the load's history, which leaves the mechanics alone.
+HISTORY = ("p", "duration", "start")
+# Groups that are worked out at a time, so that one size is compiled.
+GROUPS_AT_A_TIME = 64
+
+
+class Shared(eqx.Module):
+    """What the trajectories of a group have in common."""
+
+    values: Float[Array, " k"]  # the parameters that are not history
+    mechanics: Mechanics
+    prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
+    modes: SlidingModes
+    drift: StickingDrift
+    attractor: Attractor
+
+
+class Batch(NamedTuple):
+    """What all trajectories of a run have in common, and how they are computed."""
+
+    scene: Scene
+    method: AbstractStepper | Windowed
+    resolution: Resolution
+    names: tuple[str, ...]  # parameters that make groups
+    history: tuple[str, ...]  # those of the load's history
+    energy: bool
+    width: int  # trajectories of a group side by side
+    many: bool  # so many that code which runs faster repays what it takes to compile
+    pool: ThreadPoolExecutor
+
+
+def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
+    """The stepper that does the same for many trajectories in less time, where there is one."""
+    return Windowed() if method == EventExact() and scene.friction.constant else method
+
+
+def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
+    """Memory for one trajectory where `sharing` make a group, its part of a step's intermediate results included."""
+    n = scene.structure.size
+    m = 2 * (n - 1)
+    own = 8 * ((3 + attractors.SEEN) * 2 * n + 60)
+    modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
+    prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
+    attractor = 8 * attractors.KEPT * 2 * n
+    return int(own + 3 * (modes + prepared + attractor) / sharing)
+
+
+def grouped(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of parameters that are not history, and the row that each trajectory belongs to."""
+    own = [column for name, column in values.items() if name not in HISTORY]
+    if not own:
+        count = len(next(iter(values.values())))
+        return np.zeros((1, 0)), np.zeros(count, int)
+    distinct, group = np.unique(np.stack(own, axis=-1), axis=0, return_inverse=True)
+    return distinct, group.ravel()
+
+
+def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
+    """`Shared` of each row of `distinct`, as one array."""
+    size, parts = GROUPS_AT_A_TIME, []
+    for start in range(0, len(distinct), size):
+        # Filled up with copies, so that one size is compiled.
+        rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
+        part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
+        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, _ in parts)))
+    numbers = form = None
+    for start in range(0, len(distinct), size):
+        # One by one into place, because they are large: they are never there twice.
+        mechanics, prepared, _, drifts = parts.pop(0)
+        rows = slice(start, min(start + size, len(distinct)))
+        unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)
+        own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
+        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown))
+        numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
+        numbers[rows], form = part.numbers, part.form
+    return Flattened(numbers, form)
+
+
+@compiled
+def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
+    def one(row):
+        own = with_values(scene, names, row)
+        mechanics = measured_from_rest(own)
+        return mechanics, method.prepare(mechanics), linear_sliding(own), sticking_drift(own)
+
+    return jax.vmap(one)(values)
+
+
+def with_values(scene: Scene, names: tuple[str, ...], row) -> Scene:
+    """The scene with a row of values for these parameters."""
+    return scene.replace(**{name: row[i] for i, name in enumerate(names)})

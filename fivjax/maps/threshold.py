@@ -1,0 +1,222 @@
+"""Critical kicks: the smallest that lead to the limit cycle, scanned for and narrowed down in batches."""
+
+import functools
+import json
+import math
+
+import numpy as np
+import xarray as xr
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..io.datasets import labelled
+from ..model.load import Pulse
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+from ..steppers.description import describe_method
+from ..steppers.event_exact import EventExact
+from ..steppers.where_switched import WhereSwitched
+from ..verdicts.verdict import Verdict
+from .axes import add_linear_limit, check_run, checked_axes
+from .crossing import NO_KICK, Crossing, first_crossings
+from .engine import run_to_verdict
+
+# Points inside a bracket that are tried at once: more of them means fewer rounds, and the rounds are what takes time.
+POINTS_PER_ROUND = 15
+
+
+@in_double_precision
+def critical_perturbation(
+    scene: Scene,
+    *,
+    p_range: tuple[float, float] = (1.0, 5.0),
+    p_step: float = 0.01,
+    tolerance: float = 1e-5,
+    method: AbstractStepper | None = None,
+    t_max: float = 30.0,
+    memory: float = 2e9,
+    progress: bool | None = None,
+    energy: bool = False,
+    **axis,
+) -> xr.Dataset:
+    """The smallest kick that leads to the limit cycle, along one or several axes; all of them bracketed in batch.
+
+        fj.critical_perturbation(scene, mu=np.linspace(0.05, 0.228, 40))          # Fig. 10
+        fj.critical_perturbation(scene, belt_speed=[0.5, 1, 1.5, 3, 5, 10, 100])  # Table 2
+
+    The range of p is scanned at a distance of `p_step`, then the first change from sliding to limit cycle is narrowed
+    down. The boundary has islands (sliding above a limit cycle); a change narrower than the scan is not seen.
+
+    **Arguments:**
+
+    - `scene`: a scene whose load is a `Pulse`.
+    - `**axis`: values of any numeric parameters but p, by name.
+    - `p_range`, `p_step`: where to look, and how finely.
+    - `tolerance`: the width of the bracket at which to stop.
+    - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
+    - `energy`: whether to add the energies of the critical kick.
+
+    **Returns:** a dataset over the axes with
+
+    - `p_crit_low`, `p_crit_high`: the largest kick proved to slide below the first change and the smallest proved to end on
+      a limit cycle above it, each by a trajectory of its own when the change was narrowed down;
+    - `p_crit`: their middle. It is NaN where no change lies in the range, where undecided trajectories keep the two further
+      apart than the tolerance, and where a trajectory run again contradicts the scan. Where the limit cycle is reached
+      from the lower end of the range on, it is that end, and `p_crit_low` is NaN;
+    - `p_crit_error`: half the distance of the two, plus the change of `p_crit` from a step twice as long to the method's;
+    - `crossings`: the changes that the scan saw, and `only_crossing`: whether there was at most one, and no undecided
+      trajectory that might hide another.
+
+    With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J: what the sliding
+    state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
+
+    **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
+    """
+    method = EventExact() if method is None else method
+    check_run(scene, method, t_max, memory)
+    arguments.truth("energy", energy)
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
+    if "p" in axis:
+        raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
+    if not axis:
+        axis = {"belt_speed": np.asarray(scene.belt_speed)[None]}
+    if not isinstance(p_range, tuple | list) or len(p_range) != 2:
+        kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
+        raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")
+    low, high = p_range
+    arguments.real_number("p_range[0]", low, minimum=0)
+    arguments.real_number("p_range[1]", high, above=low)
+    arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
+    arguments.real_number("tolerance", tolerance, above=0)
+    axes = checked_axes(scene, axis)
+    shape = tuple(len(values) for values in axes.values())
+    columns = {
+        name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
+    }
+
+    run = functools.partial(run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress)
+    scan = np.linspace(low, high, round((high - low) / p_step) + 1)
+    verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
+    seen = first_crossings(scan, verdicts)
+    fine, contradicted = _narrowed(run, method, columns, *_to_narrow(scan, verdicts, seen), tolerance)
+    stepping = np.zeros(math.prod(shape))
+    if isinstance(method, WhereSwitched):
+        # Event errors are first order in the step: the last halving changes the result by as much as is still missing.
+        coarse_method = WhereSwitched(method.solver, 2 * method.dt)
+        around = np.maximum(fine.brackets + p_step * np.array([-1.0, 1.0]), 0.0)
+        unknown = np.full(around.shape, Verdict.UNDECIDED)
+        coarse, _ = _narrowed(run, coarse_method, columns, around, unknown, tolerance)
+        stepping = np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
+    # From the lower end on there is nothing to slide below.
+    width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
+    dataset = xr.Dataset(
+        {
+            name: (tuple(axes), values.reshape(shape))
+            for name, values in {
+                "p_crit": fine.middle,
+                "p_crit_low": fine.low,
+                "p_crit_high": fine.high,
+                "p_crit_error": np.where(np.isnan(fine.middle), np.nan, 0.5 * width + stepping),
+                "crossings": seen.changes,
+                "only_crossing": (seen.changes <= 1) & ~contradicted & ~_hidden(scan, verdicts, seen),
+            }.items()
+        },
+        coords=axes,
+    )
+    if energy:
+        for name, values in _energies_of_the_kick(run, method, scene, {**columns, "p": fine.middle}).items():
+            dataset[name] = (tuple(axes), values.reshape(shape))
+    add_linear_limit(dataset, scene)
+    dataset.attrs["range"] = json.dumps([float(low), float(high)])
+    return labelled(dataset, scene, method=describe_method(method), t_max=t_max, tolerance=tolerance, p_step=p_step)
+
+
+def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The vibration's energy at the end of each kick, and the work that the kick did on the way."""
+    known = np.flatnonzero(np.isfinite(columns["p"]))
+    start, duration = (np.asarray(columns.get(name, scene.parameters[name])) for name in ("start", "duration"))
+    energies = {name: np.full(len(columns["p"]), np.nan) for name in ("critical_energy", "kick_work")}
+    if len(known):
+        outcome = run(
+            values={name: column[known] for name, column in columns.items()},
+            method=method,
+            t_max=float(np.max(start + duration)),
+            label="energy",
+            energy=True,
+        )
+        energies["critical_energy"][known] = outcome.energy["kick_energy"]
+        energies["kick_work"][known] = outcome.energy["kick_work"]
+    return energies
+
+
+def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> np.ndarray:
+    """Verdicts for every row of the columns at its own values of p (rows, kicks)."""
+    values = {name: np.repeat(column, p.shape[1]) for name, column in columns.items()}
+    found = run(values={**values, "p": p.ravel()}, method=method, label=label, lingering=label != "scan")
+    return found.verdict.reshape(p.shape)
+
+
+def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> tuple[np.ndarray, np.ndarray]:
+    """The brackets (rows, 2) to be narrowed, and the verdicts of the scan at their ends; where the limit cycle is reached
+    from the first kick on, the first step.
+    """
+    from_the_start = np.isnan(seen.low) & np.isfinite(seen.middle)
+    brackets = np.where(from_the_start[:, None], scan[:2], seen.brackets)
+    ends = np.array([Verdict.SLIDING, Verdict.LIMIT_CYCLE])
+    return brackets, np.where(from_the_start[:, None], verdicts[:, :2], ends)
+
+
+def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> np.ndarray:
+    """Whether undecided kicks outside the bracket might hide another change."""
+    inside = (scan > seen.low[:, None]) & (scan < seen.high[:, None])
+    return np.any((verdicts < 0) & ~inside & (scan != NO_KICK), axis=1)
+
+
+def _narrowed(
+    run, method, columns: dict[str, np.ndarray], brackets: np.ndarray, at_ends: np.ndarray, tolerance: float
+) -> tuple[Crossing, np.ndarray]:
+    """The crossings inside brackets, narrowed to the tolerance or to where undecided trajectories stop the narrowing.
+
+    The ends that a bracket begins with are run again, so that both ends of what is returned are verdicts of trajectories
+    of the narrowing. Second, where one of those contradicts the verdicts `at_ends` (rows, 2): of two verdicts of the same
+    kick one is false, so no crossing is stated there.
+    """
+    nothing = np.full(len(brackets), np.nan)
+    found = Crossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))
+    contradicted = np.zeros(len(brackets), bool)
+    brackets = brackets.copy()
+    open_ = np.flatnonzero(np.isfinite(brackets).all(axis=1))
+    round_ = 0
+    while len(open_):
+        round_ += 1
+        shares = np.linspace(0, 1, POINTS_PER_ROUND + 2)
+        p = brackets[open_, :1] + shares * np.diff(brackets[open_])
+        chosen = {name: column[open_] for name, column in columns.items()}
+        label = f"narrowing {round_}"
+        if round_ == 1:
+            verdicts = _verdicts(run, method, chosen, p, label)
+            before, again = at_ends[open_], verdicts[:, [0, -1]]
+            contradicted[open_] = np.any((before >= 0) & (again >= 0) & (before != again), axis=1)
+        else:
+            inner = _verdicts(run, method, chosen, p[:, 1:-1], label)
+            ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(open_), 2))
+            verdicts = np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
+        now = first_crossings(p, verdicts)
+        still = []
+        for row, place in enumerate(open_):
+            width = now.high[row] - now.low[row]
+            narrower = round_ == 1 or width < 0.9 * (brackets[place, 1] - brackets[place, 0])
+            for whole, part in zip(found, now, strict=True):
+                whole[place] = part[row]
+            if np.isfinite(width):
+                brackets[place] = now.low[row], now.high[row]
+            if narrower and width > tolerance and not contradicted[place]:
+                still.append(place)
+        open_ = np.array(still, int)
+    close = found.high - found.low <= tolerance
+    middle = np.where(close, 0.5 * (found.low + found.high), found.middle)
+    middle = np.where(~close & np.isfinite(found.low), np.nan, middle)
+    found = found._replace(
+        middle=np.where(contradicted, np.nan, middle), high=np.where(contradicted, np.nan, found.high)
+    )
+    return found, contradicted
