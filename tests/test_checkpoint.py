@@ -96,7 +96,7 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
     ],
 )
 def test_a_checkpoint_of_another_run_is_refused(paper_scene, whole, tmp_path, change, fragment):
-    """Were it taken, results of two different runs would stand in one map."""
+    """A checkpoint with another axis, limit, method or scene would mix two runs in one map."""
     path = tmp_path / "map.part"
     fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     before = path.read_bytes()
@@ -108,7 +108,7 @@ def test_a_checkpoint_of_another_run_is_refused(paper_scene, whole, tmp_path, ch
 
 
 def test_a_full_disk_costs_nothing_that_was_finished(paper_scene, whole, tmp_path, monkeypatch, at_once):
-    """Were the run stopped or the older checkpoint broken by a failing write, a night would be lost."""
+    """A failing write neither stops the run nor breaks the older checkpoint."""
     path, real, calls = tmp_path / "map.part", os.fsync, []
 
     def full(handle):
@@ -127,7 +127,7 @@ def test_a_full_disk_costs_nothing_that_was_finished(paper_scene, whole, tmp_pat
 
 
 def test_a_disk_that_is_really_full_brings_nothing_down(tmp_path):
-    """Were HDF5 let near it, the process would end in a segmentation fault; here it ends in a sentence."""
+    """The process ends in a sentence; HDF5 on a full disk would end it in a segmentation fault."""
     program = (
         "import resource, sys, numpy as np, xarray as xr, fivjax as fj\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
@@ -141,7 +141,7 @@ def test_a_disk_that_is_really_full_brings_nothing_down(tmp_path):
 
 
 def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
-    """Were it overwritten, a mistyped path would cost a file."""
+    """A mistyped path does not cost a file."""
     text, result = tmp_path / "notes.txt", tmp_path / "result.nc"
     text.write_text("notes")
     fj.save(xr.Dataset({"a": ("x", np.arange(3.0))}), result)
@@ -153,7 +153,7 @@ def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
 
 
 def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, monkeypatch):
-    """Were it begun anew without a word, what the interrupted one had finished would be gone."""
+    """A map begun anew without a word would throw away what the interrupted one had finished."""
     monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)
     (tmp_path / "map.unfinished").write_bytes(b"hours of work")
     assert cli.main(["map", "--out", str(tmp_path / "map")]) == 2
@@ -161,6 +161,7 @@ def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, mon
     assert (tmp_path / "map.unfinished").read_bytes() == b"hours of work"
 
 
+@pytest.mark.slow
 def test_a_killed_command_is_resumed_bit_for_bit(tmp_path):
     """kill -9 at an instant of its own choosing, then SIGTERM, then to the end: the same map as without."""
     cache = tmp_path / "cache"
