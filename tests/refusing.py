@@ -7,6 +7,33 @@ import pytest
 
 from fivjax import cli
 
+# What compiles: the functions that the public ones call once their arguments are checked.
+ENGINES = (
+    "fivjax.maps.bistability.run_to_verdict",
+    "fivjax.maps.threshold.run_to_verdict",
+    "fivjax.simulation.trajectory._simulate",
+    "fivjax.calibration.fit.misfit",
+    "fivjax.maps.tradeoff_study._end_state",
+    "fivjax.simulation.differentiation._differentiated",
+)
+
+
+class EngineReached(BaseException):
+    """Bad input got as far as compiled code. Not an `Exception`, so that no handler takes it for a refusal."""
+
+
+def without_engines(monkeypatch) -> None:
+    """Have every function that compiles raise `EngineReached`: a check that is made after compiling comes minutes too late."""
+
+    def reached(*_, **__):
+        raise EngineReached
+
+    for name in ENGINES:
+        monkeypatch.setattr(name, reached)
+    # It configures JAX for the whole process.
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
+
+
 SEEN: set[str] = set()  # kinds of refusals met in this process: sentences without their values
 
 

@@ -379,7 +379,7 @@ def test_result_is_written_and_drawn(decay_fit, tmp_path):
 
 def test_command_line(tmp_path, decay, capsys, monkeypatch):
     """Reads, fits, writes both files; a file that cannot be used ends in one sentence and code 2."""
-    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
     scene, data = decay
     path = tmp_path / "run.npz"
     np.savez(path, t=data.t, a0=data.values[:, 0], a1=data.values[:, 1])

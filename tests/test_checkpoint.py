@@ -154,7 +154,7 @@ def test_what_is_no_checkpoint_is_refused_and_left_alone(paper_scene, tmp_path):
 
 def test_the_command_does_not_overwrite_an_interrupted_map(tmp_path, capsys, monkeypatch):
     """A map begun anew without a word would throw away what the interrupted one had finished."""
-    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
     (tmp_path / "map.unfinished").write_bytes(b"hours of work")
     assert cli.main(["map", "--out", str(tmp_path / "map")]) == 2
     assert "--resume" in capsys.readouterr().err

@@ -30,8 +30,6 @@ STILL_TOO_LONG = {
     "fivjax.calibration.fit",
     "fivjax.calibration.stages",
     "fivjax.io.recordings",
-    "fivjax.cli",
-    "fivjax.maps.engine",
     "fivjax.paper.figures",
     "fivjax.steppers.windowed",
 }
@@ -39,7 +37,6 @@ STILL_TOO_LONG = {
 STILL_NAMED_ALIKE = {
     "fivjax.calibration.cycle_misfit",
     "fivjax.calibration.misfit",
-    "fivjax.maps.packed",
     "fivjax.paper.report",
     "fivjax.plot.calibration",
 }

@@ -13,27 +13,17 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
-from refusing import refused, refused_on_the_command_line, untouched
+from refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.io import datasets as results
-
-
-class EngineReached(BaseException):
-    """Bad input got as far as compiled code. Not an `Exception`, so that no handler takes it for a refusal."""
+from fivjax.io import files
 
 
 @pytest.fixture(autouse=True)
 def no_engine(monkeypatch):
-    """Were a check made after compiling, a typing error would cost a minute. Compiling begins where these are called."""
-
-    def reached(*_, **__):
-        raise EngineReached
-
-    monkeypatch.setattr(sys.modules["fivjax.maps"], "run_to_verdict", reached)
-    monkeypatch.setattr(sys.modules["fivjax.simulate"], "_simulate", reached)
-    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)  # it configures JAX for the whole process
+    """A check that is made after compiling lets a typing error cost a minute: it is rejected."""
+    without_engines(monkeypatch)
 
 
 @pytest.fixture
@@ -41,14 +31,14 @@ def constant_scene():
     return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad())
 
 
-def test_the_engine_is_reached_by_good_input(paper_scene):
+def test_the_engine_is_reached_by_good_input(paper_scene, tmp_path):
     """Were the stand-ins in the wrong place, every other test here would pass whatever is checked and when."""
     for call in (
         lambda: fj.simulate(paper_scene, 0.1, 1e-3),
         lambda: fj.bistability_map(paper_scene, mu=[0.1, 0.2]),
         lambda: fj.critical_perturbation(paper_scene),
-        lambda: cli.main(["map", "--out", "/tmp/never-written"]),
-        lambda: cli.main(["simulate", "--out", "/tmp/never-written"]),
+        lambda: cli.main(["map", "--out", str(tmp_path / "never-written")]),
+        lambda: cli.main(["simulate", "--out", str(tmp_path / "never-written")]),
     ):
         with pytest.raises(EngineReached):
             call()
@@ -356,7 +346,7 @@ def breaks_midway(monkeypatch):
         def sync(_):
             raise error
 
-        monkeypatch.setattr(results.os, "fsync", sync)
+        monkeypatch.setattr(files.os, "fsync", sync)
         return {fj.save: DATASET, fj.save_figure: Figure()}
 
     return make
@@ -414,7 +404,7 @@ def test_results_can_be_read_by_others_like_any_new_file(tmp_path):
     assert fj.save(DATASET, tmp_path / "result.nc").stat().st_mode == plain.stat().st_mode
 
 
-@pytest.mark.parametrize("check", [results.check_writable, lambda p: fj.save(DATASET, p), lambda p: fj.save_figure(Figure(), p)],
+@pytest.mark.parametrize("check", [files.check_writable, lambda p: fj.save(DATASET, p), lambda p: fj.save_figure(Figure(), p)],
                          ids=["check_writable", "save", "save_figure"])  # fmt: skip
 def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
     """Were a path found bad only after the work, the work would be lost."""
@@ -429,7 +419,7 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
             raise PermissionError(13, "Permission denied")
 
         # A folder that even an administrator cannot write cannot be made on every machine.
-        monkeypatch.setattr(results.tempfile, "NamedTemporaryFile", denied)
+        monkeypatch.setattr(files.tempfile, "NamedTemporaryFile", denied)
         with refused(ValueError, str(tmp_path), "cannot be written", "Permission denied"):
             check(tmp_path / "result.nc")
 
@@ -438,25 +428,25 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
 def test_a_real_folder_that_nobody_can_write():
     """Were the probe not a real write, this folder, whose permission bits look fine to an administrator, would pass."""
     with refused(ValueError, "`/proc`", "cannot be written"):
-        results.check_writable("/proc/result.nc")
+        files.check_writable("/proc/result.nc")
 
 
 def test_a_file_in_place_of_the_folder_is_called_a_file(tmp_path):
     """Were it said not to exist, the user would look for a spelling mistake."""
     (tmp_path / "taken").write_bytes(b"")
     with refused(ValueError, "`", "not a folder"):
-        results.check_writable(tmp_path / "taken" / "result.nc")
+        files.check_writable(tmp_path / "taken" / "result.nc")
 
 
 def test_long_names_that_the_file_system_allows(tmp_path):
     """Were they refused, the sentence would blame the folder."""
-    assert results.check_writable(tmp_path / ("x" * 252 + ".nc")).parent == tmp_path
+    assert files.check_writable(tmp_path / ("x" * 252 + ".nc")).parent == tmp_path
 
 
 @pytest.mark.parametrize("thing", [{"a": 1}, np.zeros(3), None], ids=["dict", "array", "None"])
 def test_what_is_no_dataset(tmp_path, thing):
     """Were the mistake not named, the message would be about an attribute."""
-    with refused(TypeError, "`dataset`"):
+    with refused(TypeError, "`result`"):
         fj.save(thing, tmp_path / "result.nc")
 
 
@@ -469,7 +459,7 @@ def test_what_is_no_dataset(tmp_path, thing):
         (["map", "--x", "mu=0.1:0.2"], ["NAME=FROM:TO:COUNT", "'mu=0.1:0.2'"]),
         (["map", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
         (["map", "--y", "p=a:b:3"], ["NAME=FROM:TO:COUNT", "'p=a:b:3'"]),
-        (["map", "--y", "p=1:2:0"], ["COUNT", "'p=1:2:0'"]),
+        (["map", "--y", "p=1:2:0"], ["at least 1 value", "COUNT is 0"]),
         (["map", "--y", "p=1:2:2.5"], ["COUNT", "'p=1:2:2.5'"]),
         (["map", "--x", "mu=0.2:0.1:3"], ["`mu`", "0.2", "0.1"]),
         (["map", "--x", "mu=0.1:0.1:3"], ["`mu`", "0.1"]),

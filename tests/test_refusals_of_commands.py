@@ -1,11 +1,9 @@
 """Bad input at every other command, and at the functions behind them: a sentence, exit code 2, and nothing written."""
 
-import sys
-
 import numpy as np
 import pytest
 import xarray as xr
-from refusing import refused, refused_on_the_command_line, untouched
+from refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 import fivjax as fj
 from fivjax import cli
@@ -15,26 +13,10 @@ T = np.arange(64) * 1e-3
 A = np.sin(400.0 * T)
 
 
-class EngineReached(BaseException):
-    """Bad input got as far as compiled code."""
-
-
 @pytest.fixture(autouse=True)
 def no_engine(monkeypatch):
-    """Were a check made after compiling, a typing error would cost a minute."""
-
-    def reached(*_, **__):
-        raise EngineReached
-
-    for module, name in (
-        ("maps", "run_to_verdict"),
-        ("simulate", "_simulate"),
-        ("calibrate", "misfit"),
-        ("tradeoff", "_end_state"),
-        ("gradients", "_differentiated"),
-    ):
-        monkeypatch.setattr(sys.modules[f"fivjax.{module}"], name, reached)
-    monkeypatch.setattr(cli, "keep_compiled_code", lambda: None)  # it configures JAX for the whole process
+    """A check that is made after compiling lets a typing error cost a minute: it is rejected."""
+    without_engines(monkeypatch)
 
 
 def text(rows=64, header="t,acceleration 0", change=lambda rows: rows) -> str:
@@ -90,7 +72,8 @@ MU = ["--free", "mu"]
         (["empty.csv", *MU], ["line of names"]),
         (["short.csv", *MU], ["at least 16", "8"]),
         (["names.csv", *MU], ["no channel", "x"]),
-        (["timeless.csv", *MU], ["`t`", "`rate`"]),
+        (["names.csv", *MU], ["which is which with `--column`"]),
+        (["timeless.csv", *MU], ["`t`", "name it with `--time`, or give `--rate` in Hz"]),
         (["twice.csv", *MU], ["twice"]),
         (["nan.csv", *MU], ["line 11", "nan"]),
         (["word.csv", *MU], ["line 11", "'loud'"]),
@@ -115,8 +98,8 @@ MU = ["--free", "mu"]
         (["good.csv", *MU, "--column", "t=loudness"], ["acceleration i", "'loudness'"]),
         (["good.csv", *MU, "--unit", "t"], ["--unit", "'t'"]),
         (["good.csv", *MU, "--unit", "t=fortnight"], ["fortnight"]),
-        (["good.csv", *MU, "--rate", "0"], ["`rate`", "positive"]),
-        (["good.csv", *MU, "--full-scale", "-1"], ["`full_scale`", "positive"]),
+        (["good.csv", *MU, "--rate", "0"], ["`--rate`", "positive"]),
+        (["good.csv", *MU, "--full-scale", "-1"], ["`--full-scale`", "positive"]),
         (["good.csv", *MU, "--offset", "0.5", "0.1"], ["`offset`", "go up"]),
         (["good.csv", *MU, "--offset", "0", "0.1", "--regime", "limit cycle"], ["`offset`", '"kick"']),
         (["good.csv", *MU, "--starts", "0"], ["`starts`", "at least 1"]),
@@ -145,6 +128,14 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["cea", "--x", "mu"], ["NAME=FROM:TO:COUNT", "'mu'"]),
         (["cea", "--x", "speed=1:2:3"], ["`speed`"]),
         (["cea", "--x", "mu=-1:2:3"], ["`mu`", "-1"]),
+        (["cea", "--x", "mu=0.1:0.2:1"], ["at least 2 values", "COUNT is 1"]),
+        (["map", "--x", "mu=0.1:0.2:0"], ["at least 1 value", "COUNT is 0"]),
+        (["map", "--x", "theta=0:30:4"], ["`theta`", "rad", "30 degrees are 0.5236 rad"]),
+        (["map", "--belt-speed", "0"], ["`--belt-speed`", "zero", "sliding"]),
+        (["simulate", "--theta", "90"], ["`--theta`", "rad", "90 degrees are 1.571 rad"]),
+        (["simulate", "--decay", "0.3"], ["`--decay`", "`--mu-static` and `--mu-dynamic` are missing"]),
+        (["simulate", "--mu-dynamic", "0.3"], ["`--mu-static` is missing"]),
+        (["simulate", "--mu-static", "0.3", "--mu-dynamic", "0.2", "--mu", "0.1"], ["`--mu`", "`--mu-static`", "one of them"]),
         (["cea", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
         (["cea", "--k1", "-1"], ["`k1`", "non-negative"]),
         (["cea", "--theta", "nan"], ["`theta`", "finite"]),
@@ -179,6 +170,34 @@ def test_where_to_write_is_asked_first(folder, capsys, command):
     ):
         with untouched(folder):
             assert fragment in refused_on_the_command_line(capsys, [*command, "--out", out])
+
+
+@pytest.mark.parametrize(
+    ("command", "there"),
+    [
+        (["map"], ["out.nc"]),
+        (["simulate"], ["out.png"]),
+        (["simulate", "--energy"], ["out_energy.png"]),
+        (["cea"], ["out.nc", "out.png"]),
+        (["calibrate", "good.csv", *MU], ["out.png"]),
+        (["tradeoff"], ["out.nc"]),
+        (["reproduce", "--figure", "3"], ["out/reproduce.md"]),
+    ],
+    ids=lambda x: " ".join(x),
+)
+def test_results_are_not_overwritten_unasked(folder, capsys, command, there):
+    """A file of that name may be a night's work: it is refused before any work, and replaced only with `--overwrite`."""
+    for name in there:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("earlier")
+    with untouched(folder):
+        message = refused_on_the_command_line(capsys, [*command, "--out", "out"])
+    assert f"`{there[0]}` is there already" in message and "--overwrite" in message
+    if command[0] not in ("cea", "reproduce"):
+        with pytest.raises(EngineReached):
+            cli.main([*command, "--out", "out", "--overwrite"])
+    # Where nothing is there, nothing is asked.
+    assert (folder / there[0]).read_text() == "earlier"
 
 
 def test_reproducing_into_a_file(folder, capsys):

@@ -1,0 +1,7 @@
+"""`python -m fivjax.cli` is `fivjax`."""
+
+import sys
+
+from .command_line import main
+
+sys.exit(main())

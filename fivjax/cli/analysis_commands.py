@@ -1,0 +1,114 @@
+"""`fivjax cea` and `fivjax calibrate`: what linear theory says of a scene, and which scene a recording is of."""
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+import fivjax as fj
+
+from .options import SceneOptions
+from .outputs import Overwrite, output_paths, say
+from .parsing import axis, bound, pair
+
+
+@dataclasses.dataclass(frozen=True)
+class Cea:
+    """Complex eigenvalue analysis: frequencies and growth rates over one parameter (Fig. 3). Writes OUT.nc and OUT.png."""
+
+    x: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "mu=0:0.5:501"
+    """parameter to follow the modes along: any of the scene's"""
+    out: Path = Path("cea")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+
+    def run(self) -> None:
+        data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
+        scene = self.scene.scene()
+        # Lines through one point are an empty picture.
+        dataset = fj.cea.modes(scene, **dict([axis(self.x, least=2)]))
+        fj.save(dataset, data)
+        fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
+        say(data, picture)
+        direction = 1 if self.scene.belt_speed >= 0 else -1
+        limit = fj.cea.stability_limit(scene.structure, direction=direction)
+        if limit.outcome is fj.cea.StabilityOutcome.FOUND:
+            print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
+            print(fj.cea.sensitivity(scene.structure, direction=direction))
+        else:
+            print(f"  constant friction: {limit.outcome.value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibrate:
+    """Parameters from a recording, with uncertainties. Writes OUT.nc and OUT.png."""
+
+    recording: tyro.conf.Positional[Path]
+    """what was measured: .csv, .npy, .npz, .wav or .mat"""
+    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
+    """parameters to find, such as `mu c1 k1` or `mu,c1,k1`; all others are taken from the scene"""
+    regime: Literal["sliding", "kick", "limit cycle"] = "kick"
+    """what was recorded: a small motion about sliding, the response to the scene's kick, or a steady vibration"""
+    column: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=CHANNEL …")] = ()
+    """which column is which channel, such as `Acc_X=acceleration0`; by their names unless given"""
+    unit: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=UNIT …")] = ()
+    """units of columns, such as `t=ms Acc_X=g`; the file's own or SI unless given"""
+    time: str | None = None
+    """column of the time base; `t` or `time` unless given"""
+    rate: float | None = None
+    """sampling rate, where the file has no time base (Hz)"""
+    full_scale: float = 1.0
+    """what the largest sample of a .wav means, in the channel's unit"""
+    offset: tuple[float, float] | None = None
+    """kick: where the first sample may lie on the simulation's time (s), 0 to 0.5 unless given"""
+    bound: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW:HIGH …")] = ()
+    """bounds of free parameters, such as `mu=0.05:0.5`"""
+    starts: int = 8
+    """how many starts, the scene's own and others around it"""
+    out: Path = Path("calibration")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+
+    def run(self) -> None:
+        data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
+        free = [name for text in self.free for name in text.split(",") if name]
+        columns = dict(pair(text, "--column") for text in self.column)
+        units = dict(pair(text, "--unit") for text in self.unit)
+        try:
+            recording = fj.read_recording(
+                self.recording,
+                self.regime,
+                columns=columns or None,
+                time=self.time,
+                rate=self.rate,
+                units=units,
+                full_scale=self.full_scale,
+                offset=self.offset,
+            )
+        except ValueError as error:
+            raise ValueError(with_options(str(error))) from None
+        bounds = dict(map(bound, self.bound))
+        fit = fj.calibrate(self.scene.scene(), recording, free, bounds, starts=self.starts)
+        fj.save(fit, data)
+        fj.save_figure(fj.show(fit), picture)
+        say(data, picture)
+        print(fit)
+
+
+def with_options(sentence: str) -> str:
+    """A sentence of `read_recording` with its arguments called by the options that set them: "with `columns`" is `--column`."""
+    options = {
+        "columns": "--column",
+        "units": "--unit",
+        "time": "--time",
+        "rate": "--rate",
+        "full_scale": "--full-scale",
+    }
+    sentence = re.sub(
+        rf"\b(with|give|Argument) `({'|'.join(options)})`", lambda found: f"{found[1]} `{options[found[2]]}`", sentence
+    )
+    return sentence.replace("Argument `--", "Option `--")

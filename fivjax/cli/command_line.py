@@ -1,0 +1,91 @@
+"""The program: which commands there are, what exit code each end has, where compiled code is kept."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import tyro
+
+import fivjax as fj
+
+from .analysis_commands import Calibrate, Cea
+from .map_command import Map
+from .outputs import Failure, Interrupted
+from .simulate_command import Simulate
+from .study_commands import Reproduce, Tradeoff
+
+COMMANDS = {
+    "map": Map,
+    "simulate": Simulate,
+    "cea": Cea,
+    "calibrate": Calibrate,
+    "tradeoff": Tradeoff,
+    "reproduce": Reproduce,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; sentences on standard error and an exit code that is not zero for what does not end well.
+
+    2: refused before any work; 1: no result, or the disk did not take it; 130: interrupted.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"fivjax {fj.__version__}")
+        return 0
+    command = tyro.extras.subcommand_cli_from_dict(
+        COMMANDS,
+        prog="fivjax",
+        description="Friction-induced vibration: what a scene does after a kick. `fivjax --version` says which fivjax this is.",
+        args=arguments,
+    )
+    keep_compiled_code()
+    try:
+        with _terminated_like_interrupted():
+            command.run()
+    except (ValueError, TypeError) as error:
+        print(f"fivjax: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
+        return 1
+    except Failure as failure:
+        print(f"fivjax: {failure}", file=sys.stderr)
+        return 1
+    except Interrupted as interruption:
+        print(f"fivjax: {interruption}", file=sys.stderr)
+        return 130
+    except KeyboardInterrupt:
+        print("fivjax: Interrupted; nothing was written.", file=sys.stderr)
+        return 130
+    return 0
+
+
+@contextlib.contextmanager
+def _terminated_like_interrupted():
+    """SIGTERM, which a batch system sends before it kills, ends a run as Ctrl-C does: in order."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    # Only a program's main thread may say what a signal does.
+    mine = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, interrupt) if mine else None
+    try:
+        yield
+    finally:
+        if mine:
+            signal.signal(signal.SIGTERM, before)
+
+
+def keep_compiled_code() -> None:
+    """Keep compiled code in the user's cache folder, unless JAX was told where to keep it."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "fivjax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

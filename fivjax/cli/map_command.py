@@ -1,0 +1,87 @@
+"""`fivjax map`: which kick leads to a limit cycle, over two parameters."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import fivjax as fj
+
+from .options import MethodOptions, SceneOptions
+from .outputs import Failure, Interrupted, Overwrite, output_paths, say
+from .parsing import axis, number
+
+
+@dataclasses.dataclass(frozen=True)
+class Map:
+    """Bi-stability map: one trajectory for each pair of values, all in one batch. Writes OUT.nc and OUT.png."""
+
+    x: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "mu=0.05:0.228:64"
+    """parameter to the right: any of the scene's"""
+    y: Annotated[str, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = "p=1:4:64"
+    """parameter upwards"""
+    out: Path = Path("bistability")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    t_max: float = 20.0
+    """time after which a trajectory without a verdict is called undecided (s)"""
+    memory: float = 2e9
+    """memory for trajectories under way (bytes)"""
+    resume: bool = False
+    """go on with the map of the same name that was interrupted"""
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
+
+    def run(self) -> None:
+        import numpy as np
+
+        # Whoever began the map that is gone on with was asked whether its files may be overwritten.
+        (unfinished,) = output_paths(self.out, True, ".unfinished")
+        going_on = self.resume and unfinished.exists()
+        data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
+        scene, method = self.scene.scene(), self.method.stepper()
+        axes = dict(map(axis, (self.x, self.y)))
+        if len(axes) != 2:
+            raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
+        if self.scene.belt_speed == 0 and "belt_speed" not in axes:
+            raise ValueError(
+                "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."
+            )
+        if unfinished.exists() and not self.resume:
+            raise ValueError(
+                f"An interrupted map is kept in `{unfinished}`. Go on with it by `--resume`, or delete the file to begin anew."
+            )
+        try:
+            with warnings.catch_warnings():
+                # What is said of an interrupted map here is more.
+                warnings.filterwarnings("ignore", message="Interrupted:")
+                dataset = fj.bistability_map(
+                    scene, method=method, t_max=self.t_max, memory=self.memory, resume=unfinished, **axes
+                )
+            if np.any(dataset["verdict"] == fj.Verdict.NOT_RUN):
+                raise KeyboardInterrupt
+            fj.save(dataset, data)
+            fj.save_figure(fj.plot.bistability(dataset), picture)
+        except KeyboardInterrupt:
+            raise Interrupted(_how_to_resume(unfinished)) from None
+        unfinished.unlink(missing_ok=True)
+        say(data, picture)
+        counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
+        for verdict, count in counts.items():
+            if count:
+                print(f"  {number(count, 'trajectory', 'trajectories'):>20s}: {_in_words(verdict)}")
+        if not any(counts[verdict] for verdict in fj.Verdict if verdict >= fj.Verdict.UNDECIDED):
+            reasons = ", ".join(_in_words(verdict) for verdict, count in counts.items() if count)
+            raise Failure(f"No trajectory of the map could be followed: {dataset.attrs.get('failure', reasons)}.")
+
+
+def _in_words(verdict) -> str:
+    return verdict.name.lower().replace("_", " ")
+
+
+def _how_to_resume(unfinished: Path) -> str:
+    if not unfinished.exists():
+        return "Interrupted before any trajectory was finished; nothing was written."
+    return f"Interrupted; what is finished is kept in `{unfinished}`. Go on with the same command and `--resume`."

@@ -1,0 +1,77 @@
+"""Where results go: asked before any work, never overwritten unasked, and said at the end."""
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..io.files import check_writable
+
+# An option of every command that writes. It is not called --force, because that is the load.
+Overwrite = Annotated[bool, tyro.conf.arg(help="replace files that are there already", help_behavior_hint="")]
+
+
+class Interrupted(Exception):
+    """A run that was stopped from outside and can be resumed."""
+
+
+class Failure(Exception):
+    """A run that came to its end without a result."""
+
+
+def output_paths(stem: Path, overwrite: bool, *endings: str) -> tuple[Path, ...]:
+    """The files of a result, by endings such as `.nc`; found writable, and not there yet, before any work is done.
+
+    **Raises:** `ValueError` where the option names no file, a folder does not exist or cannot be written, and for files
+    that are there already unless they may be overwritten.
+    """
+    if not stem.name:
+        raise ValueError(f"Option `--out` must name the files to write, such as `--out result`, but is `{stem}`.")
+    stem = stem.with_suffix("") if stem.suffix in (".nc", ".png") else stem
+    paths = tuple(check_writable(stem.with_name(stem.name + ending)) for ending in endings)
+    if not overwrite:
+        refuse_existing(*paths)
+    return paths
+
+
+def refuse_existing(*paths: Path) -> None:
+    """Refuse files that are there already."""
+    there = [path for path in paths if path.exists()]
+    if there:
+        raise ValueError(
+            f"File `{there[0]}` is there already. Add `--overwrite` to replace it, or name another by `--out`."
+        )
+
+
+def say(*paths: Path) -> None:
+    """Say which files were written."""
+    print("\n".join(f"wrote {path}" for path in paths))
+
+
+@contextlib.contextmanager
+def waiting(what: str, after: float = 0.5) -> Iterator[None]:
+    """Within, say every second on a terminal what is waited for, and for how long; nothing where there is no terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    done, begin = threading.Event(), time.perf_counter()
+
+    def tick() -> None:
+        wait = after
+        while not done.wait(wait):
+            print(f"\r{what} … {time.perf_counter() - begin:.0f} s", end="", file=sys.stderr, flush=True)
+            wait = 1.0
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+    ticker = threading.Thread(target=tick, daemon=True)
+    ticker.start()
+    try:
+        yield
+    finally:
+        done.set()
+        ticker.join()

@@ -1,0 +1,62 @@
+"""What is typed on the command line as `NAME=…`, read; each refusal shows how it must read."""
+
+import math
+
+import numpy as np
+
+
+def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
+    """The name and values of an axis from `NAME=FROM:TO:COUNT`.
+
+    **Raises:** `ValueError` for anything else, ends that are not finite or do not go up, fewer than `least` values.
+    """
+    try:
+        name, values = text.split("=")
+        start, stop, count = values.split(":")
+        low, high, points = float(start), float(stop), int(count)
+    except ValueError:
+        raise ValueError(
+            f"An axis must read NAME=FROM:TO:COUNT, such as mu=0.05:0.228:64, but reads {text!r}."
+        ) from None
+    if points < least:
+        raise ValueError(f"Axis `{name}` must have at least {number(least, 'value')}, but its COUNT is {points}.")
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"Axis `{name}` must be finite, but goes from {low:g} to {high:g}.")
+    if points > 1 and not high > low:
+        raise ValueError(f"Axis `{name}` must go up, but goes from {low:g} to {high:g}.")
+    if name == "theta":
+        for end in (low, high):
+            check_angle(f"Axis `{name}`", end)
+    return name, np.linspace(low, high, points)
+
+
+def pair(text: str, option: str) -> tuple[str, str]:
+    """What stands on the two sides of `COLUMN=…`."""
+    name, equals, meaning = text.partition("=")
+    if not (name and equals and meaning):
+        raise ValueError(f"Option `{option}` must read COLUMN=…, such as `t=ms`, but reads {text!r}.")
+    return name, meaning
+
+
+def bound(text: str) -> tuple[str, tuple[float, float]]:
+    """The name and the two ends of `NAME=LOW:HIGH`."""
+    try:
+        name, values = text.split("=")
+        low, high = map(float, values.split(":"))
+    except ValueError:
+        raise ValueError(f"A bound must read NAME=LOW:HIGH, such as mu=0.05:0.5, but reads {text!r}.") from None
+    return name, (low, high)
+
+
+def check_angle(what: str, angle: float) -> None:
+    """Refuse an inclination of a right angle or more: it was meant in degrees, or the belt is no belt."""
+    if math.isfinite(angle) and abs(angle) >= 0.5 * math.pi:
+        raise ValueError(
+            f"{what} is in rad and must be less than a right angle, {0.5 * math.pi:.4f}, but is {angle:g}; "
+            f"{angle:g} degrees are {math.radians(angle):.4g} rad."
+        )
+
+
+def number(count: int, one: str, several: str | None = None) -> str:
+    """A count with its noun: "1 trajectory", "2 trajectories"."""
+    return f"{count} {one if count == 1 else several or one + 's'}"

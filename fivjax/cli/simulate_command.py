@@ -1,0 +1,44 @@
+"""`fivjax simulate`: one trajectory through the kick."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+import fivjax as fj
+
+from .options import MethodOptions, SceneOptions
+from .outputs import Overwrite, output_paths, say, waiting
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """One trajectory from sliding equilibrium through the kick. Writes OUT.nc and OUT.png, with --energy OUT_energy.png."""
+
+    t1: float = 2.0
+    """end (s)"""
+    dt_save: float = 1e-4
+    """distance of saved instants (s)"""
+    quantity: Literal["displacement", "velocity", "acceleration"] = "acceleration"
+    """what to draw, along the belt"""
+    energy: bool = False
+    """keep the energy ledger: its lines go into the data, and into a picture of their own"""
+    out: Path = Path("response")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
+
+    def run(self) -> None:
+        endings = (".nc", ".png", "_energy.png") if self.energy else (".nc", ".png")
+        data, picture, *balance = output_paths(self.out, self.overwrite, *endings)
+        with waiting("simulate: compiling and stepping"):
+            run = fj.simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
+        fj.save(run, data)
+        fj.save_figure(fj.plot.response(run, self.quantity), picture)
+        for path in balance:
+            fj.save_figure(fj.plot.energy.balance(run), path)
+        say(data, picture, *balance)
+        if run.outcome != fj.Ending.FINISHED:
+            print(f"  {run.meaning}")

@@ -1,0 +1,62 @@
+"""`fivjax tradeoff` and `fivjax reproduce`: what accuracy costs, and the paper's figures."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import fivjax as fj
+
+from .options import SceneOptions
+from .outputs import Overwrite, output_paths, refuse_existing, say
+
+
+@dataclasses.dataclass(frozen=True)
+class Tradeoff:
+    """What accuracy costs on a scene: methods, steps and precisions compared. Writes OUT.nc and OUT.png."""
+
+    t1: float = 0.5
+    """time after which states are compared (s)"""
+    trajectories: int = 256
+    """trajectories side by side when cost is measured"""
+    boundary: bool = True
+    """compare p_crit and verdicts too, which takes minutes"""
+    out: Path = Path("tradeoff")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=lambda: SceneOptions(p=1.3))
+
+    def run(self) -> None:
+        from ..maps.tradeoff_study import table
+
+        data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
+        dataset = fj.tradeoff(self.scene.scene(), t1=self.t1, trajectories=self.trajectories, boundary=self.boundary)
+        fj.save(dataset, data)
+        fj.save_figure(fj.plot.tradeoff(dataset), picture)
+        say(data, picture)
+        print(table(dataset))
+
+
+@dataclasses.dataclass(frozen=True)
+class Reproduce:
+    """The paper's Figures 2 to 18 and its tables, and reproduce.md: what it prints beside what is computed."""
+
+    figure: Annotated[str | None, tyro.conf.arg(metavar="2…18|table1|table2")] = None
+    """make only this one; all unless given"""
+    out: Path = Path("reproduction")
+    """folder to write into, made where there is none"""
+    overwrite: Overwrite = False
+
+    def run(self) -> None:
+        report = self.out / "reproduce.md"
+        if not self.overwrite:
+            refuse_existing(report)
+        begin = time.perf_counter()
+        made = fj.reproduce(self.figure, self.out)
+        findings = [finding for one in made.values() for finding in one.findings]
+        agree = sum(finding.agrees for finding in findings)
+        say(report)
+        print(f"  {len(made)} figures and tables, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")
+        print(f"  {agree} of {len(findings)} numbers and statements as printed; the others are explained in the report")

@@ -1,0 +1,97 @@
+"""The command line beside its refusals: start, version, what it says while it works and at its end."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import fivjax as fj
+from fivjax.cli import main, outputs
+from fivjax.cli.analysis_commands import with_options
+from fivjax.cli.options import SceneOptions
+from fivjax.io.datasets import labelled
+
+
+@pytest.fixture(autouse=True)
+def settings_stay(monkeypatch):
+    """Where compiled code is kept is configured for a whole process."""
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
+
+
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_what_a_question_loads(option):
+    """`--version` and `--help` are answered without JAX, and so within a second."""
+    code = f"import sys; sys.argv = ['fivjax', {option!r}]\nfrom fivjax.cli import main\ntry: main()\nexcept SystemExit: pass\n"
+    code += "print('loaded', *sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    said, _, loaded = ran.stdout.rpartition("loaded ")
+    assert (fj.__version__ if option == "--version" else "simulate") in said
+    assert not {"jax", "matplotlib", "xarray", "scipy", "h5py", "diffrax"} & set(loaded.split())
+
+
+def test_the_module_is_the_program():
+    ran = subprocess.run([sys.executable, "-m", "fivjax.cli", "--version"], capture_output=True, text=True, check=True)
+    assert ran.stdout == f"fivjax {fj.__version__}\n"
+
+
+def made_up_map(verdicts):
+    """A stand-in for `bistability_map` that finds these verdicts."""
+
+    def make(scene, *, method, t_max, memory, resume, **axes):
+        dims = tuple(axes)
+        fields = {"verdict": (dims, np.array(verdicts, np.int8)), "amplitude": (dims, np.ones(np.shape(verdicts)))}
+        return labelled(xr.Dataset(fields, axes), scene)
+
+    return make
+
+
+def test_a_map_counts_trajectories(monkeypatch, tmp_path, capsys):
+    """One trajectory is not called several, and none is called a lane."""
+    monkeypatch.setattr(fj, "bistability_map", made_up_map([[0, 0], [0, 1]]))
+    axes = ["--x", "mu=0.1:0.2:2", "--y", "p=1:2:2"]
+    assert main(["map", *axes, "--out", str(tmp_path / "map")]) == 0
+    said = capsys.readouterr().out
+    assert "3 trajectories: sliding" in said and "1 trajectory: limit cycle" in said and "lane" not in said
+
+
+def test_a_map_without_any_verdict_is_a_failure(monkeypatch, tmp_path, capsys):
+    """A script must not go on with a map in which no trajectory could be started: the exit code is not zero."""
+    monkeypatch.setattr(fj, "bistability_map", made_up_map([[-3, -3], [-3, -3]]))
+    assert main(["map", "--x", "mu=0.1:0.2:2", "--y", "p=1:2:2", "--out", str(tmp_path / "map")]) == 1
+    assert "No trajectory of the map could be followed: no equilibrium." in capsys.readouterr().err
+
+
+def test_friction_options():
+    """What is said of friction is used; where nothing is said it is the paper's."""
+    assert float(SceneOptions().scene().friction.mu) == 0.227
+    falling = SceneOptions(mu_static=0.3, mu_dynamic=0.2).scene().friction
+    assert isinstance(falling, fj.ExponentialDecay) and float(falling.decay) == 0.5
+    assert float(SceneOptions(mu_static=0.3, mu_dynamic=0.2, decay=0.7).scene().friction.decay) == 0.7
+
+
+def test_a_wait_is_said_on_a_terminal_only(monkeypatch, capsys):
+    """A long compilation must not look like a hang; a log file must not fill with carriage returns."""
+    with outputs.waiting("compiling", after=0.0):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with outputs.waiting("compiling", after=0.0):
+        time.sleep(0.05)
+    assert "compiling … 0 s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("sentence", "expected"),
+    [
+        ("Say which is which with `columns`.", "Say which is which with `--column`."),
+        ("It has no column `t` or `time`; name it with `time`, or give `rate` in Hz.",
+         "It has no column `t` or `time`; name it with `--time`, or give `--rate` in Hz."),
+        ("Argument `rate` must be positive, but is 0.", "Option `--rate` must be positive, but is 0."),
+    ],
+)  # fmt: skip
+def test_a_remedy_names_the_option(sentence, expected):
+    """`columns` is Python's; a user of the command line looks for `--column`."""
+    assert with_options(sentence) == expected
