@@ -4,6 +4,11 @@ from . import plot as plot
 from .calibration.fit import Calibration as Calibration
 from .calibration.fit import calibrate as calibrate
 from .contact import Status as Status
+from .cycles.cycle import LimitCycle as LimitCycle
+from .cycles.saddle import saddle_cycle as saddle_cycle
+from .cycles.search import NoLimitCycle as NoLimitCycle
+from .cycles.search import limit_cycle as limit_cycle
+from .cycles.search import limit_cycles as limit_cycles
 from .io.datasets import open as open
 from .io.datasets import save as save
 from .io.files import save_figure as save_figure

@@ -144,6 +144,14 @@ class EventExact(AbstractStepper):
         end, _ = _value_and_slope(states, h / unit)
         return Within(inside, 0.5 * h * weights, times, end)
 
+    def series(
+        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
+    ) -> tuple[Float[Array, "order+1 2n"], Float[Array, ""]]:
+        """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
+        unit = _time_unit(mechanics)
+        states, _ = _series(mechanics, contact, load, y, self.order_, unit)
+        return jnp.stack(states), unit
+
 
 def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
@@ -303,14 +311,19 @@ def _running_and(conditions):
 
 
 def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
-    """The root with the derivative of an implicit function: one Newton step from it, whose slope is taken as given."""
-    values, slopes = _value_and_slope(scaled, x)
+    """The root with the derivatives of an implicit function.
+
+    A Newton step from a converged root, with the slope taken as given, changes nothing but the derivative, and makes it
+    one order more exact: after the first step derivatives are right, after the second one derivatives of derivatives, too.
+    """
     chosen = jnp.arange(fires.shape[0]) == jnp.argmax(fires)
-    value = jnp.sum(jnp.where(chosen, values, 0.0))
-    slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
-    correction = value / jnp.where(slope == 0, 1.0, slope)
-    # The root is converged; the value of the correction is rounding, its derivative is what is wanted.
-    return x - (correction - jax.lax.stop_gradient(correction))
+    for _ in range(2):
+        values, slopes = _value_and_slope(scaled, x)
+        value = jnp.sum(jnp.where(chosen, values, 0.0))
+        slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
+        correction = value / jnp.where(slope == 0, 1.0, slope)
+        x = x - (correction - jax.lax.stop_gradient(correction))
+    return x
 
 
 def _value_and_slope(c: list, x):

@@ -1,0 +1,210 @@
+"""Once around a closed cycle: its segments, its word of contact modes, its peak, its harmonics, its monodromy matrix."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from ..contact import Contact, Mechanics, Status
+from ..foundation.compiling import compiled, power_of_4
+from ..foundation.precision import known_to_numpy
+from ..model.scene import Scene
+from ..steppers.core import Segment, follow
+from ..steppers.event_exact import EventExact
+from .section_map import Point, mechanics_about_sliding
+
+# Places in a segment where the tangential speed is looked at; about its largest, Newton's method finds the peak.
+SAMPLES = 24
+PEAK_STEPS = 6
+HARMONICS = 16
+
+
+class Phase(NamedTuple):
+    """One letter of a cycle's word: a contact mode and how long it lasts."""
+
+    status: Status
+    duration: float  # s
+
+
+class Round(NamedTuple):
+    """The segments of one period; rows beyond `count` are empty."""
+
+    t: Float[Array, " s"]  # when each begins, s
+    h: Float[Array, " s"]  # how long it lasts, s; zero where empty
+    y: Float[Array, "s 2n"]  # where it begins
+    contact: Contact
+    ended: Bool[Array, "s 2"]  # which guard ended it
+    count: Int[Array, ""]
+
+
+def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period: Float[Array, ""], most: int) -> Round:
+    """The segments of a motion that starts at a point, over a time `period` (s); at most `most` of them are kept."""
+    n2 = point.y.shape[0]
+    none = jnp.zeros(most, point.y.dtype)
+    empty = Round(
+        none,
+        none,
+        jnp.zeros((most, n2), point.y.dtype),
+        Contact(jnp.zeros(most, jnp.int32), jnp.ones(most, point.y.dtype)),
+        jnp.zeros((most, 2), bool),
+        jnp.zeros((), jnp.int32),
+    )
+
+    def record(total: Round, segment: Segment) -> Round:
+        row = Round(segment.t, segment.after.h, segment.y, segment.contact, segment.after.ended, total.count + 1)
+        kept = jax.tree.map(lambda all_, one: all_.at[total.count].set(one), total[:-1], row[:-1])
+        return Round(*kept, row.count)
+
+    zero = jnp.zeros((), point.y.dtype)
+    return follow(
+        stepper, mechanics, point.contact, zero, point.y, period, total=empty, observe=record, most=most, kind="lax"
+    ).total
+
+
+def peak_speed(stepper: EventExact, mechanics: Mechanics, segments: Round) -> Float[Array, ""]:
+    """The largest tangential speed in any of the segments, in m/s, to rounding."""
+    velocity = segments.y.shape[1] // 2 + mechanics.tangential
+    zero = jnp.zeros((), segments.y.dtype)
+
+    def of_segment(y, contact, h):
+        coefficients, unit = stepper.series(mechanics, contact, zero, y)
+        speeds = coefficients[:, velocity]
+        end = h / unit
+
+        def derivatives(x):
+            value = slope = bend = jnp.zeros_like(x)
+            for c in speeds[::-1]:
+                bend = bend * x + slope
+                slope = slope * x + value
+                value = value * x + c
+            return value, slope, 2 * bend
+
+        samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
+        values, _, _ = jax.vmap(derivatives)(samples)
+        x = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
+        for _ in range(PEAK_STEPS):
+            _, slope, bend = derivatives(x)
+            x = jax.lax.stop_gradient(jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), 0.0, end))
+        refined, _, _ = derivatives(x)
+        ends = jnp.stack([jnp.max(jnp.abs(values)), jnp.abs(refined)])
+        return jnp.where(h > 0, jnp.max(ends), 0.0)
+
+    return jnp.max(jax.vmap(of_segment)(segments.y, segments.contact, segments.h))
+
+
+def harmonics(
+    stepper: EventExact, mechanics: Mechanics, segments: Round, period: Float[Array, ""]
+) -> Complex[Array, "count n"]:
+    r"""Lines of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, by integrals over exactly one period; m/s."""
+    n = segments.y.shape[1] // 2
+    zero = jnp.zeros((), segments.y.dtype)
+
+    def of_segment(t, h, y, contact):
+        within = stepper.within(mechanics, contact, zero, y, h)
+        turns = 2 * math.pi * jnp.arange(1, HARMONICS + 1)[:, None] * ((t + within.times) / period)
+        weights = jnp.where(h > 0, within.weights, 0.0)
+        states = jnp.where(h > 0, within.states[:, n:], 0.0)
+        return (jnp.cos(turns) * weights) @ states, (jnp.sin(turns) * weights) @ states
+
+    real, imaginary = jax.vmap(of_segment)(segments.t, segments.h, segments.y, segments.contact)
+    return (2 / period) * (jnp.sum(real, axis=0) - 1j * jnp.sum(imaginary, axis=0))
+
+
+class Seen(NamedTuple):
+    """What is read off one period."""
+
+    segments: Round
+    amplitude: Float[Array, ""]  # m/s
+    lines: Complex[Array, "count n"]  # m/s
+
+
+@compiled
+def read_period(scene: Scene, stepper: EventExact, point: Point, period: Float[Array, ""], most: int) -> Seen:
+    """Segments, peak tangential speed and harmonics of one period from a point on it."""
+    mechanics = mechanics_about_sliding(scene)
+    segments = once_around(stepper, mechanics, point, period, most)
+    return Seen(
+        segments,
+        peak_speed(stepper, mechanics, segments),
+        harmonics(stepper, mechanics, segments, period),
+    )
+
+
+def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, segments: int) -> Seen:
+    """`read_period` as NumPy arrays; compiled for few numbers of segments."""
+    most = power_of_4(max(segments + 4, 64))
+    seen = read_period(scene, stepper, point, jnp.asarray(period), most)
+    return jax.tree.map(known_to_numpy, seen)
+
+
+def word(segments: Round) -> tuple[Phase, ...]:
+    """The contact modes of a cycle in order, with their durations; a mode that the section cuts in two counts once.
+
+    Sliding that reverses its direction is two phases.
+    """
+    count = int(segments.count)
+    letters: list[tuple[tuple[int, float], float]] = []
+    for k in range(count):
+        status = int(segments.contact.status[k])
+        sliding = status == Status.SLIDE
+        key = status, float(segments.contact.direction[k]) if sliding else 0.0
+        broken = k > 0 and bool(np.any(segments.ended[k - 1]))
+        duration = float(segments.h[k])
+        if letters and letters[-1][0] == key and not broken:
+            letters[-1] = key, letters[-1][1] + duration
+        elif duration > 0:
+            letters.append((key, duration))
+    if len(letters) > 1 and letters[0][0] == letters[-1][0] and not bool(np.any(segments.ended[count - 1])):
+        letters = [(letters[0][0], letters[0][1] + letters[-1][1]), *letters[1:-1]]
+    return tuple(Phase(Status(status), duration) for (status, _), duration in letters)
+
+
+@compiled
+def monodromy(
+    scene: Scene, stepper: EventExact, start: Point, after: Float[Array, ""], period: Float[Array, ""]
+) -> Float[Array, "2n 2n"]:
+    """The derivative of the motion over one period, from the state a time `after` (s) past a start, inside a segment.
+
+    Every event's saltation matrix is in it, because event times are differentiated implicitly.
+    """
+    mechanics = mechanics_about_sliding(scene)
+    zero = jnp.zeros((), start.y.dtype)
+    base = follow(stepper, mechanics, start.contact, zero, start.y, after, kind="lax")
+
+    def over_a_period(y):
+        return follow(stepper, mechanics, base.contact, zero, y, period, kind="lax").y
+
+    def along(direction):
+        return jax.jvp(over_a_period, (base.y,), (direction,))[1]
+
+    return jax.vmap(along, out_axes=1)(jnp.eye(base.y.shape[0], dtype=base.y.dtype))
+
+
+def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
+    """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
+
+    It is taken in the middle of the longest segment that does not stick, on what that segment's contact mode leaves free:
+    sticking holds more, and would hide multipliers that are 0.
+    """
+    moving = np.where(segments.contact.status != Status.STICK, 1.0, 1e-9)
+    longest = int(np.argmax(moving * segments.h))
+    contact = jax.tree.map(lambda leaf: jnp.asarray(leaf[longest]), segments.contact)
+    start = Point(jnp.asarray(segments.y[longest]), contact)
+    matrix = np.asarray(monodromy(scene, stepper, start, jnp.asarray(0.5 * segments.h[longest]), jnp.asarray(period)))
+    free = free_coordinates(scene, Status(int(segments.contact.status[longest])))
+    values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
+    return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+def free_coordinates(scene: Scene, status: Status) -> Int[np.ndarray, " m"]:
+    """Places in the state that a contact mode leaves free."""
+    structure = scene.structure
+    n, held = structure.size, []
+    if status != Status.DETACH:
+        held += [structure.normal, n + structure.normal]
+    if status == Status.STICK:
+        held.append(n + structure.tangential)
+    return np.delete(np.arange(2 * n), held)

@@ -1,0 +1,92 @@
+"""Closing a cycle: Newton's method on the Poincaré section, with the exact derivative of the return map."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .section_map import Point, Return, return_with_jacobian
+
+MOST_ITERATIONS = 30
+# A cycle is closed when it misses itself by less than this share of its size.
+CLOSED = 1e-10
+# Newton's method is done when it no longer gets closer, or is this close.
+EXACT = 2e-15
+HALVINGS = 5
+
+
+class Closed(NamedTuple):
+    """A state of the section that the return map leads back to itself."""
+
+    point: Point
+    crossings: int  # of the section, in one period
+    period: float  # s
+    jacobian: Float[np.ndarray, "2n 2n"]  # of the return map there
+    residual: float  # how far it is from closing, relative to its size
+    segments: int  # of motion, in one period
+    events: int  # contact events in one period
+
+
+def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Closed | None:
+    """The periodic motion near a guess that crosses the section `crossings` times a period; none if there is none near.
+
+    The unknown is the whole state on the section. What the contact mode or the section holds at zero comes back as zero
+    whatever it was, so those equations solve themselves, and one program serves all modes.
+    """
+    weights = np.asarray(scene.structure.weights)
+    best: tuple[float, Point, Return, np.ndarray] | None = None
+    point, step, since = guess, None, 0
+    for _ in range(MOST_ITERATIONS):
+        found, jacobian = _returned(scene, stepper, point, crossings)
+        y, size = np.asarray(point.y), np.linalg.norm(weights * np.asarray(point.y))
+        gap = np.asarray(found.point.y) - y
+        closure = np.linalg.norm(weights * gap) / size if size > 0 else np.inf
+        usable = np.isfinite(closure) and np.all(np.isfinite(jacobian))
+        if usable and not _same_mode(found.point, point):
+            # The guess lies on the other side of an event; where it leads is on this side.
+            point, step = found.point, None
+            since += 1
+            if since > HALVINGS:
+                break
+            continue
+        if best is not None and not (usable and closure < best[0]):
+            if best[0] <= CLOSED or step is None or since >= HALVINGS:
+                break
+            # Too far: half the way.
+            step, since = 0.5 * step, since + 1
+            point = Point(jnp.asarray(np.asarray(best[1].y) + step), best[1].contact)
+            continue
+        if not usable:
+            return None
+        best, since = (closure, point, found, jacobian), 0
+        if closure <= EXACT:
+            break
+        step = _newton_step(jacobian, gap)
+        if step is None:
+            break
+        point = Point(jnp.asarray(y + step), point.contact)
+    if best is None or not best[0] <= CLOSED:
+        return None
+    closure, point, found, jacobian = best
+    return Closed(point, crossings, float(found.time), jacobian, float(closure), int(found.segments), int(found.events))
+
+
+def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> tuple[Return, np.ndarray]:
+    found, jacobian = return_with_jacobian(scene, stepper, point, jnp.asarray(crossings, jnp.int32))
+    return jax.tree.map(jnp.asarray, found), np.asarray(jacobian)
+
+
+def _same_mode(a: Point, b: Point) -> bool:
+    same = int(a.contact.status) == int(b.contact.status)
+    return same and (int(a.contact.status) != 1 or float(a.contact.direction) == float(b.contact.direction))
+
+
+def _newton_step(jacobian: np.ndarray, gap: np.ndarray) -> np.ndarray | None:
+    try:
+        return np.linalg.solve(np.eye(len(gap)) - jacobian, gap)
+    except np.linalg.LinAlgError:
+        return None

@@ -1,0 +1,149 @@
+"""A limit cycle: what was computed of it, and what can be read off it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..contact import Contact
+from ..foundation.precision import in_double_precision
+from ..model.load import ConstantLoad
+from ..model.scene import Scene
+from ..simulation.trajectory import Trajectory, simulate
+from ..steppers.event_exact import EventExact
+from .around import Phase, floquet_multipliers, seen_around, word
+from .closing import Closed
+from .section_map import Point, return_with_jacobian, sliding_state
+
+# A multiplier this much inside the unit circle is taken to be inside.
+MARGIN = 1e-9
+
+
+class LimitCycle(eqx.Module):
+    """A periodic motion, stable or not, or a torus, computed on the Poincaré section.
+
+    The section is where the tangential velocity rises through zero. Multipliers belong to small deviations, per period; one of
+    a periodic motion's is 1, for a deviation along the cycle.
+    """
+
+    scene: Scene  # under its final load
+    kind: str = eqx.field(static=True)  # "periodic" or "torus"
+    period: float  # s; of a torus, the mean time between points of the section
+    state: Float[np.ndarray, " 2n"]  # displacements (m) and velocities (m/s) on the section
+    contact: Contact  # the contact mode there
+    word: tuple[Phase, ...]  # contact modes in order, with their durations (s)
+    multipliers: Complex[np.ndarray, " m"]  # by size, largest first
+    stable: bool
+    amplitude: float  # peak tangential speed, m/s
+    residual: float  # how far it is from closing, relative to its size
+    crossings: int  # points of the section in one period
+    harmonics: Complex[np.ndarray, "count n"]  # lines of the velocities, m/s
+    points: Float[
+        np.ndarray, "k 2n"
+    ]  # of the section, on one period or the torus, as deviations from sliding
+    return_jacobian: Float[np.ndarray, "2n 2n"]  # of the section's return map over one period
+    rotation_number: float | None = None  # of a torus: turns per return
+
+    @property
+    def frequency(self) -> float:
+        """Periods per second, in Hz."""
+        return 1.0 / self.period
+
+    @property
+    def deviation(self) -> Float[np.ndarray, " 2n"]:
+        """`state` as a deviation from the sliding equilibrium."""
+        return self.state - _equilibrium(self.scene)
+
+    @property
+    def unstable_directions(self) -> int:
+        """How many independent small deviations grow."""
+        values = section_multipliers(self.return_jacobian)
+        return int(np.sum(np.abs(values) > 1.0))
+
+    def trajectory(self, points: int = 1000, energy: bool = False) -> Trajectory:
+        """One period as a trajectory of `points` + 1 rows, the first and the last on the section.
+
+        **Raises:** `ValueError` for a number of points that is not positive.
+        """
+        return simulate(self.scene, t1=self.period, dt_save=self.period / points, y0=self.state, energy=energy)
+
+    @property
+    def energy(self) -> dict[str, float]:
+        """Energy per period by line of the ledger, in J: works of the contact, dampers and load, and the impact loss."""
+        ledger = self.trajectory(64, energy=True).energy
+        assert ledger is not None
+        lines = {name: float(np.asarray(line)[-1]) for name, line in ledger.work.lines("work").items()}
+        return {**lines, "impact_loss": float(np.asarray(ledger.impact)[-1])}
+
+    def __str__(self) -> str:
+        stability = "stable" if self.stable else f"unstable in {self.unstable_directions} direction(s)"
+        modes = " ".join(f"{phase.status.name.lower()} {1e3 * phase.duration:.4g} ms" for phase in self.word)
+        largest = ", ".join(f"{abs(value):.6g}" for value in self.multipliers[:4])
+        return (
+            f"limit cycle ({self.kind}, {stability}): {self.frequency:.6g} Hz, peak tangential speed "
+            f"{self.amplitude:.6g} m/s\n  word: {modes}\n  sizes of the multipliers: {largest}\n"
+            f"  closes to {self.residual:.1e} of its size"
+        )
+
+
+def section_multipliers(jacobian: Float[np.ndarray, "2n 2n"]) -> Complex[np.ndarray, " 2n"]:
+    """Eigenvalues of the return map's derivative, largest first: the multipliers without that of the cycle's own direction."""
+    values = np.linalg.eigvals(jacobian).astype(complex)
+    return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+@in_double_precision
+def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCycle:
+    """Everything about a closed cycle."""
+    seen = seen_around(scene, stepper, closed.point, closed.period, closed.segments)
+    largest = np.abs(section_multipliers(closed.jacobian))[0]
+    return LimitCycle(
+        scene=under_final_load(scene),
+        kind="periodic",
+        period=closed.period,
+        state=np.asarray(closed.point.y) + _equilibrium(scene),
+        contact=Contact(np.asarray(closed.point.contact.status), np.asarray(closed.point.contact.direction)),
+        word=word(seen.segments),
+        multipliers=floquet_multipliers(scene, stepper, seen.segments, closed.period),
+        stable=bool(largest < 1 - MARGIN),
+        amplitude=float(seen.amplitude),
+        residual=closed.residual,
+        crossings=closed.crossings,
+        harmonics=seen.lines,
+        points=section_points(scene, stepper, closed.point, closed.crossings),
+        return_jacobian=closed.jacobian,
+    )
+
+
+def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> Float[np.ndarray, "k 2n"]:
+    """The points of the section on one period from the given one on."""
+    points = [np.asarray(point.y)]
+    for _ in range(crossings - 1):
+        found, _ = return_with_jacobian(scene, stepper, point, jnp.asarray(1, jnp.int32))
+        point = found.point
+        points.append(np.asarray(point.y))
+    return np.stack(points)
+
+
+@in_double_precision
+def under_final_load(scene: Scene) -> Scene:
+    """The scene with its load after the last jump."""
+    return Scene(
+        scene.structure,
+        scene.friction,
+        scene.belt_speed,
+        ConstantLoad(scene.load.final),
+        scene.restitution,
+        scene.impact_law,
+    )
+
+
+def point_of(cycle: LimitCycle) -> Point:
+    """The cycle's point on the section, as the return map wants it."""
+    contact = Contact(jnp.asarray(cycle.contact.status, jnp.int32), jnp.asarray(cycle.contact.direction, jnp.float64))
+    return Point(jnp.asarray(cycle.deviation, jnp.float64), contact)
+
+
+@in_double_precision
+def _equilibrium(scene: Scene) -> np.ndarray:
+    return np.asarray(sliding_state(scene, scene.load.final))

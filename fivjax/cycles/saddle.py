@@ -1,0 +1,147 @@
+"""The unstable cycle on the boundary between sliding and squeal: edge tracking, then Newton's method.
+
+Between a state that slides in the end and one on a limit cycle there is one on the boundary of the two basins. A trajectory
+that starts next to it stays with the boundary for long before it leaves to either side, and on the boundary it comes to
+what attracts there: a saddle cycle, with one multiplier outside the unit circle. What two neighbours on either side pass
+while they are together tells where it is.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
+from ..steppers.event_exact import EventExact
+from .closing import close
+from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
+from .search import MOST_CROSSINGS, POINTS, SIDE_BY_SIDE, NoLimitCycle, limit_cycle, states_in_contact
+from .section_map import points_along
+
+# Looks (of `POINTS` points of the section each) at a trajectory before it is taken for one that stays on the boundary.
+MOST_LOOKS = 60
+# Neighbours on the boundary are apart once they differ by this share of their size; then the search begins anew between them.
+APART = 1e-4
+ROUNDS = 24
+# A trajectory has come to a cycle, or is back at sliding, when it is this close, relative to the cycle.
+CAPTURED = 1e-2
+FADED = 1e-2
+
+
+@in_double_precision
+def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
+    """The unstable cycle on the boundary between steady sliding and a limit cycle, under the final load.
+
+    **Arguments:** `scene`, whose steady sliding is stable; `cycle`, the limit cycle on the other side, `limit_cycle(scene)`
+    unless given.
+
+    **Returns:** a `LimitCycle` with exactly one multiplier outside the unit circle.
+
+    **Raises:** `NoLimitCycle` (a `ValueError`) where there is no limit cycle, or where what attracts on the boundary is not
+    periodic; `ValueError` for a scene without sliding equilibrium or beyond Painlevé's limit.
+    """
+    arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_painleve(scene)
+    sliding_equilibrium(under_final_load(scene))
+    cycle = limit_cycle(scene) if cycle is None else cycle
+    stepper = EventExact()
+    fates = _Fates(scene, stepper, cycle)
+    low, high = np.zeros_like(cycle.deviation), cycle.deviation
+    for _ in range(ROUNDS):
+        low, high = fates.narrowed(low, high)
+        paths = fates.together(low, high)
+        found = fates.saddle_near(paths)
+        if found is not None:
+            return found
+        low, high = paths[0][-1], paths[1][-1]
+    raise NoLimitCycle(
+        "No saddle cycle was met: what attracts on the boundary does not repeat within "
+        f"{MOST_CROSSINGS} crossings of the section. It may be a torus."
+    )
+
+
+class _Fates:
+    """Which side of the boundary states lie on."""
+
+    def __init__(self, scene: Scene, stepper: EventExact, cycle: LimitCycle):
+        self.scene, self.stepper, self.cycle = scene, stepper, cycle
+        self.weights = np.asarray(scene.structure.weights)
+        self.target = self.weights * cycle.points
+        self.size = np.max(np.linalg.norm(self.target, axis=-1))
+
+    def of(self, states: np.ndarray) -> np.ndarray:
+        """0 for states that return to sliding, 1 for those that come to the cycle or stay away from sliding."""
+        now = states_in_contact(self.scene, jnp.asarray(states))
+        fate = np.full(len(states), -1)
+        for _ in range(MOST_LOOKS):
+            returns = points_along(self.scene, self.stepper, now, POINTS)
+            y = self.weights * np.asarray(returns.point.y)
+            sizes = np.linalg.norm(y, axis=-1)
+            apart = np.min(np.linalg.norm(y[:, -4:, None] - self.target, axis=-1), axis=(1, 2))
+            quiet = ~np.asarray(returns.events)[:, POINTS // 2 :].any(axis=1)
+            shrinking = sizes[:, -1] < 0.7 * sizes[:, POINTS // 2]
+            slid = (quiet & shrinking) | (sizes[:, -1] < FADED * self.size)
+            fate = np.where(fate >= 0, fate, np.where(slid, 0, np.where(apart < CAPTURED * self.size, 1, -1)))
+            # Sections that are no longer met: rest, which is no vibration, or a failure; neither is sliding.
+            fate = np.where((fate < 0) & ~np.isfinite(sizes[:, -1]), 1, fate)
+            if np.all(fate >= 0):
+                break
+            now = jax.tree.map(lambda leaf: leaf[:, -1], returns.point)
+        return np.where(fate < 0, 1, fate)
+
+    def narrowed(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Two neighbours, one rounding apart, on the line between a state that slides and one that does not."""
+        a, b = 0.0, 1.0
+        while True:
+            shares = a + (b - a) * np.arange(1, SIDE_BY_SIDE + 1) / (SIDE_BY_SIDE + 1)
+            fates = self.of(low + shares[:, None] * (high - low))
+            first = int(np.argmax(fates)) if np.any(fates == 1) else SIDE_BY_SIDE
+            a, b = (a if first == 0 else shares[first - 1]), (b if first == SIDE_BY_SIDE else shares[first])
+            if np.linalg.norm(self.weights * (high - low)) * (b - a) < 1e-14 * self.size or b - a < 4e-16 * b:
+                return low + a * (high - low), low + b * (high - low)
+
+    def together(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The points of the section that two neighbours pass until they are apart."""
+        pair = np.stack([low, high])[np.arange(SIDE_BY_SIDE) % 2]
+        now = states_in_contact(self.scene, jnp.asarray(pair))
+        paths = np.zeros((2, 0, pair.shape[1]))
+        for _ in range(MOST_LOOKS):
+            returns = points_along(self.scene, self.stepper, now, POINTS)
+            y = np.asarray(returns.point.y)[:2]
+            paths = np.concatenate([paths, y], axis=1)
+            apart = np.linalg.norm(self.weights * (paths[0] - paths[1]), axis=-1)
+            size = np.linalg.norm(self.weights * paths[0], axis=-1)
+            gone = ~(apart < APART * size)
+            if gone.any():
+                last = max(int(np.argmax(gone)), 1)
+                return paths[0, :last], paths[1, :last]
+            now = jax.tree.map(lambda leaf: leaf[:, -1], returns.point)
+        return paths[0], paths[1]
+
+    def saddle_near(self, paths: tuple[np.ndarray, np.ndarray]) -> LimitCycle | None:
+        """The saddle cycle near the place where the neighbours' path repeats best."""
+        path = self.weights * paths[0]
+        sizes = np.linalg.norm(path, axis=-1)
+        tried = []
+        for crossings in range(1, MOST_CROSSINGS + 1):
+            if len(path) > crossings:
+                back = np.linalg.norm(path[crossings:] - path[:-crossings], axis=-1) / sizes[:-crossings]
+                place = int(np.argmin(back))
+                tried.append((back[place], crossings, place))
+        if not tried:
+            return None
+        best = min(back for back, _, _ in tried)
+        for back, crossings, place in tried:
+            if back > max(2 * best, 1e-9) or back > 0.1:
+                continue
+            guess = states_in_contact(self.scene, jnp.asarray(paths[0][place][None]))
+            guess = jax.tree.map(lambda leaf: leaf[0], guess)
+            closed = close(self.scene, self.stepper, guess, crossings)
+            if closed is None:
+                continue
+            outside = int(np.sum(np.abs(section_multipliers(closed.jacobian)) > 1))
+            away = np.linalg.norm(self.weights * np.asarray(closed.point.y) - path[place]) / sizes[place]
+            if outside == 1 and away < 0.5:
+                return limit_cycle_of(self.scene, self.stepper, closed)
+        return None

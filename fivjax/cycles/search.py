@@ -1,0 +1,279 @@
+"""Searching for limit cycles: trajectories are released, and where one seems to repeat, Newton's method closes the cycle."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..contact import Contact, State, Status, status_from_forces
+from ..foundation import arguments
+from ..foundation.compiling import compiled
+from ..foundation.precision import in_double_precision
+from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
+from ..simulation.trajectory import Trajectory
+from ..steppers.event_exact import EventExact
+from .closing import close
+from .cycle import LimitCycle, limit_cycle_of, point_of, under_final_load
+from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
+from .torus import torus_of
+
+# Loads that trajectories are released from, in final loads.
+RELEASES = (1.2, 1.5, 2.0, 3.0, 4.5, 6.0)
+# Trajectories that are followed side by side: one number, so that one program is compiled.
+SIDE_BY_SIDE = 8
+# Points of the section between two looks at the trajectories, and how many looks they get.
+POINTS = 96
+LOOKS = 40
+# Points of the section in one period, at most, for it to be tried as a periodic motion.
+MOST_CROSSINGS = 12
+# A motion that comes back to within this share of its size may be near a cycle.
+NEARLY = 0.1
+# The same cycle: their points are this close, relative to their size.
+SAME = 1e-6
+# A motion has died out when it has no events any more and is this much smaller than the belt's motion, or has shrunk so much.
+FADED = 1e-6
+# Looks after which a motion that is neither periodic nor fading is tried as a torus.
+TORUS_AFTER = 8
+
+
+class NoLimitCycle(ValueError):
+    """No limit cycle was met."""
+
+
+@in_double_precision
+def limit_cycle(scene: Scene, start=None) -> LimitCycle:
+    r"""A limit cycle of the scene under its final load.
+
+    A state on the Poincaré section (where the tangential velocity rises through zero) is sought that the return map $P$
+    leads back to itself, $P(y) = y$, by Newton's method with the exact derivative of $P$ through every contact event.
+
+    **Arguments:** `scene`; `start`: nothing (trajectories are released from several loads, and the first stable cycle of the
+    largest amplitude that they meet is returned), or where to begin: a `Trajectory` (its last row), a `LimitCycle` (of another
+    scene close by), or a pair of a state `(2n,)` in m and m/s and a status. From a start, an unstable cycle may be found.
+
+    **Returns:** a `LimitCycle`.
+
+    **Raises:** `NoLimitCycle` (a `ValueError`) where none is met; `ValueError` for a scene without sliding equilibrium, or
+    beyond Painlevé's limit.
+    """
+    _check(scene)
+    stepper = EventExact()
+    if start is None:
+        found = limit_cycles(scene)
+        if not found:
+            raise NoLimitCycle(
+                f"No limit cycle was met: none of the {len(RELEASES)} trajectories released ended on one. "
+                f"If you know a motion near one, give it as `start`."
+            )
+        return found[0]
+    guess, crossings = _guess(scene, stepper, start)
+    for count in crossings:
+        closed = close(scene, stepper, guess, count)
+        if closed is not None and _moves(scene, closed.point):
+            return limit_cycle_of(scene, stepper, closed)
+    raise NoLimitCycle(
+        "No limit cycle was met from `start`: Newton's method did not close a cycle near it. Give a motion closer to one."
+    )
+
+
+@in_double_precision
+def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
+    """All stable limit cycles that a search meets, the one with the largest amplitude first.
+
+    Trajectories are released at rest from several multiples of the final load, and from each of `starts` (states `(2n,)`
+    in m and m/s, or trajectories). More than one cycle may coexist; there may be others that no trajectory of the search came to.
+
+    **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
+    """
+    _check(scene)
+    stepper = EventExact()
+    return [met.cycle for met in attractors_met(scene, stepper, _released(scene, starts)) if met.cycle is not None]
+
+
+class Met(NamedTuple):
+    """An attractor that released trajectories came to, or a motion that was given up."""
+
+    cycle: LimitCycle | None
+    why: str
+
+
+def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met]:
+    """What each of several starts (leading axis) comes to: each attractor once, largest amplitude first."""
+    many = starts.y.shape[0]
+    if many > SIDE_BY_SIDE:
+        parts = [
+            attractors_met(scene, stepper, jax.tree.map(lambda leaf, k=k: leaf[k : k + SIDE_BY_SIDE], starts))
+            for k in range(0, many, SIDE_BY_SIDE)
+        ]
+        return _merged(parts)
+    starts = jax.tree.map(lambda leaf: leaf[np.arange(SIDE_BY_SIDE) % many], starts)
+    weights = np.asarray(scene.structure.weights)
+    found: list[LimitCycle] = []
+    open_ = np.arange(many)
+    now, begun = starts, None
+    given_up = 0
+    for look in range(LOOKS):
+        if not len(open_):
+            break
+        returns = points_along(scene, stepper, now, POINTS)
+        y = np.asarray(returns.point.y)
+        sizes = np.linalg.norm(weights * y, axis=-1)
+        begun = sizes[:, 0] if begun is None else begun
+        keep = np.zeros(len(y), bool)
+        for k in range(len(y)):
+            if k not in open_ or not np.all(np.isfinite(y[k])):
+                continue
+            events = np.asarray(returns.events)[k]
+            if not events[-POINTS // 2 :].any() and _has_faded(scene, sizes[k], begun[k], look):
+                continue
+            here = jax.tree.map(lambda leaf, k=k: leaf[k, -1], returns.point)
+            if _known(found, weights, y[k]):
+                continue
+            cycle = _closed_near(scene, stepper, here, weights * y[k])
+            if cycle is None and look >= TORUS_AFTER and _keeps_its_size(sizes[k]):
+                cycle = torus_of(scene, stepper, here)
+            if cycle is not None and cycle.stable and not _among(found, cycle):
+                found.append(cycle)
+                continue
+            keep[k] = cycle is None or not cycle.stable
+        open_ = np.flatnonzero(keep)
+        now = jax.tree.map(lambda leaf: leaf[:, -1], returns.point)
+        # Those that are done repeat one that is not, so that one number of trajectories is compiled.
+        if len(open_):
+            filler = np.where(keep, np.arange(len(keep)), open_[0])
+            now = jax.tree.map(lambda leaf, filler=filler: leaf[filler], now)
+            open_ = np.flatnonzero(keep)
+    given_up = len(open_)
+    met = [Met(cycle, "computed") for cycle in sorted(found, key=lambda cycle: -cycle.amplitude)]
+    return met + [Met(None, "sustained, neither periodic nor a torus")] * given_up
+
+
+def _merged(parts: list[list[Met]]) -> list[Met]:
+    cycles: list[LimitCycle] = []
+    for met in itertools.chain.from_iterable(parts):
+        if met.cycle is not None and not _among(cycles, met.cycle):
+            cycles.append(met.cycle)
+    rest = [met for met in itertools.chain.from_iterable(parts) if met.cycle is None]
+    return [Met(cycle, "computed") for cycle in sorted(cycles, key=lambda cycle: -cycle.amplitude)] + rest
+
+
+def _check(scene: Scene) -> None:
+    arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_painleve(scene)
+    sliding_equilibrium(under_final_load(scene))
+
+
+def _moves(scene: Scene, point: Point) -> bool:
+    structure = scene.structure
+    weights = np.asarray(structure.weights)
+    yardstick = weights[structure.size + structure.tangential] * abs(float(scene.belt_speed))
+    return bool(np.linalg.norm(weights * np.asarray(point.y)) > FADED * yardstick)
+
+
+def _has_faded(scene: Scene, sizes: np.ndarray, begun: float, look: int) -> bool:
+    structure = scene.structure
+    yardstick = np.asarray(structure.weights)[structure.size + structure.tangential] * abs(float(scene.belt_speed))
+    small = sizes[-1] < FADED * min(yardstick, begun)
+    # Without events the motion is the linear one, or close to it: shrinking for this long, it will not grow again.
+    return bool(small or (look > 1 and sizes[-1] < 0.5 * sizes[len(sizes) // 2] < 0.25 * sizes[0]))
+
+
+def _keeps_its_size(sizes: np.ndarray) -> bool:
+    half = len(sizes) // 2
+    return bool(abs(np.log(np.mean(sizes[half:]) / np.mean(sizes[:half]))) < 0.05)
+
+
+def _known(found: list[LimitCycle], weights: np.ndarray, points: np.ndarray) -> bool:
+    """Whether the last points lie on a cycle that is known already."""
+    for cycle in found:
+        if cycle.kind != "periodic":
+            continue
+        target = weights * cycle.points[0]
+        apart = np.linalg.norm(weights * points[-2 * cycle.crossings :] - target, axis=-1) / np.linalg.norm(target)
+        if np.min(apart) < 1e-3 and cycle.stable:
+            return True
+    return False
+
+
+def _among(found: list[LimitCycle], cycle: LimitCycle) -> bool:
+    same = [c for c in found if c.kind == cycle.kind and abs(c.amplitude - cycle.amplitude) < SAME * c.amplitude]
+    if cycle.kind == "torus":
+        return any(c.kind == "torus" and abs(c.amplitude - cycle.amplitude) < 1e-2 * c.amplitude for c in found)
+    return any(abs(c.period - cycle.period) < SAME * c.period for c in same)
+
+
+def _closed_near(scene: Scene, stepper: EventExact, point: Point, path: Float[np.ndarray, "k 2n"]) -> LimitCycle | None:
+    """The cycle that a trajectory with these last (weighted) points of the section may be coming to."""
+    size = np.linalg.norm(path[-1])
+    back = np.array([np.linalg.norm(path[-1] - path[-1 - k]) / size for k in range(1, MOST_CROSSINGS + 1)])
+    if np.min(back) > NEARLY:
+        return None
+    crossings = int(np.argmax(back <= max(1.5 * np.min(back), 1e-9))) + 1
+    closed = close(scene, stepper, point, crossings)
+    if closed is None or not _moves(scene, closed.point):
+        return None
+    if np.linalg.norm(np.asarray(scene.structure.weights) * np.asarray(closed.point.y) - path[-1]) > 0.5 * size:
+        return None  # Newton's method went elsewhere
+    return limit_cycle_of(scene, stepper, closed)
+
+
+@compiled
+def _released_states(scene: Scene, loads: Float[jax.Array, " e"]) -> State:
+    rest = sliding_state(scene, scene.load.final)
+    return jax.vmap(lambda load: sliding_state(scene, load * scene.load.final) - rest)(loads)
+
+
+@compiled
+def _in_contact_mode(scene: Scene, y: State) -> Contact:
+    mechanics = mechanics_about_sliding(scene)
+    return jax.vmap(lambda y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(y)
+
+
+def _released(scene: Scene, starts: Sequence) -> Point:
+    states = np.asarray(_released_states(scene, jnp.asarray(RELEASES)))
+    rest = np.asarray(sliding_state(scene, scene.load.final))
+    given = [_state_of(scene, start) - rest for start in starts]
+    return states_in_contact(scene, jnp.asarray(np.concatenate([states, np.stack(given)]) if given else states))
+
+
+def states_in_contact(scene: Scene, y: Float[jax.Array, "e 2n"]) -> Point:
+    """States (deviations from sliding; leading axis) with the contact modes that their forces demand."""
+    return Point(y, _in_contact_mode(scene, y))
+
+
+def _state_of(scene: Scene, start) -> np.ndarray:
+    if isinstance(start, Trajectory):
+        return np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
+    state = arguments.numeric_array("start", start).astype(float)
+    if state.shape != (2 * scene.structure.size,):
+        raise ValueError(
+            f"Argument `start` must hold {scene.structure.size} displacements and as many velocities, but has shape "
+            f"{state.shape}."
+        )
+    return state
+
+
+def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
+    """A point of the section to begin at, and the numbers of crossings a period to try."""
+    if isinstance(start, LimitCycle):
+        return point_of(start), [start.crossings]
+    status = None
+    if isinstance(start, tuple | list) and len(start) == 2:
+        start, status = start
+    rest = np.asarray(sliding_state(scene, scene.load.final))
+    y = jnp.asarray(_state_of(scene, start) - rest)
+    contact = jax.tree.map(lambda leaf: leaf[0], _in_contact_mode(scene, y[None]))
+    if status is not None:
+        contact = Contact(jnp.asarray(int(Status(int(status))), jnp.int32), contact.direction)
+    returns = points_along(scene, stepper, Point(y[None], Contact(contact.status[None], contact.direction[None])), 24)
+    path = np.asarray(returns.point.y)[0] * np.asarray(scene.structure.weights)
+    if not np.all(np.isfinite(path)):
+        raise NoLimitCycle("No limit cycle was met from `start`: the motion stops crossing the section.")
+    first = jax.tree.map(lambda leaf: leaf[0, 0], returns.point)
+    size = np.linalg.norm(path[0])
+    back = np.array([np.linalg.norm(path[k] - path[0]) / size for k in range(1, MOST_CROSSINGS + 1)])
+    return first, [int(k) + 1 for k in np.argsort(back, kind="stable")[:4]]

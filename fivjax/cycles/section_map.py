@@ -1,0 +1,142 @@
+r"""The Poincaré section's return map, exact through every contact event, with its derivative.
+
+The section is where the tangential velocity rises through zero. Over a period of any motion its mean is zero, so every
+limit cycle crosses the section, one that sticks, slips back or takes off as much as one that only slides. Where an impact
+throws the velocity over zero, the state just after the impact is the point.
+
+States are deviations from the sliding equilibrium under the final load: a small cycle under a high load is then as exact
+as a large one.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..contact import Contact, Mechanics, Rest, State
+from ..foundation.compiling import compiled
+from ..model.scene import Scene, steady_sliding
+from ..steppers.core import Segment, follow
+from ..steppers.event_exact import EventExact
+
+# Segments on the way from one point of the section to the next, at most: hundreds of events in one swing.
+MOST_SEGMENTS = 4096
+
+
+class Point(eqx.Module):
+    """A state on the section, as a deviation from the sliding equilibrium, and the contact mode there."""
+
+    y: State
+    contact: Contact
+
+
+class Return(NamedTuple):
+    """Where the return map leads."""
+
+    point: Point
+    time: Float[Array, ""]  # how long it took, s
+    events: Int[Array, ""]  # contact events on the way
+    segments: Int[Array, ""]  # segments on the way
+    peak: Float[Array, ""]  # largest tangential speed at the ends of segments, m/s
+    arrived: Bool[Array, ""]  # whether the section was met
+
+
+def mechanics_about_sliding(scene: Scene) -> Mechanics:
+    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
+
+    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals.
+    """
+    load = scene.load.final
+    _, normal_force = steady_sliding(scene, load)
+    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
+
+
+def sliding_state(scene: Scene, load: Float[Array, ""]) -> State:
+    """The state of steady sliding under a load (N)."""
+    q, _ = steady_sliding(scene, load)
+    return jnp.concatenate([q, jnp.zeros_like(q)])
+
+
+def longest_return(scene: Scene) -> Float[Array, ""]:
+    """A time (s) in which a motion that goes on has long met the section: a hundred of its slowest natural periods."""
+    structure = scene.structure
+    rates = jnp.diag(structure.stiffness) / jnp.diag(structure.mass)
+    return 100 * 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
+
+
+def section_return(
+    stepper: EventExact, scene: Scene, mechanics: Mechanics, point: Point, crossings: Int[Array, ""] | int
+) -> Return:
+    """From a point of the section, or any other start, to its `crossings`-th crossing; differentiable forward.
+
+    Not a number where the section is not met within `longest_return` for each crossing.
+    """
+    none = jnp.zeros((), jnp.int32)
+    budget = longest_return(scene) * crossings
+
+    def observe(total, segment: Segment):
+        crossed, events, segments, peak = total
+        after = segment.after
+        return (
+            crossed + after.rise.happened,
+            events + jnp.any(after.ended),
+            segments + 1,
+            jnp.maximum(peak, after.peak),
+        )
+
+    after = follow(
+        stepper,
+        mechanics,
+        point.contact,
+        jnp.zeros((), point.y.dtype),
+        point.y,
+        budget,
+        total=(none, none, none, jnp.zeros((), point.y.dtype)),
+        observe=observe,
+        until=lambda total: total[0] >= crossings,
+        at_section=True,
+        most=64 * MOST_SEGMENTS,
+        kind="lax",
+    )
+    crossed, events, segments, peak = after.total
+    arrived = (crossed >= crossings) & jnp.all(jnp.isfinite(after.y))
+    y = jnp.where(arrived, after.y, jnp.nan)
+    return Return(Point(y, after.contact), budget - after.left, events, segments, peak, arrived)
+
+
+@compiled
+def return_with_jacobian(
+    scene: Scene, stepper: EventExact, point: Point, crossings: Int[Array, ""]
+) -> tuple[Return, Float[Array, "2n 2n"]]:
+    """The return map at a point, and its derivative: saltation at each event and at the section included."""
+    mechanics = mechanics_about_sliding(scene)
+
+    def along(direction):
+        def state(y):
+            found = section_return(stepper, scene, mechanics, Point(y, point.contact), crossings)
+            return found.point.y, found
+
+        _, tangent, found = jax.jvp(state, (point.y,), (direction,), has_aux=True)
+        return found, tangent
+
+    size = point.y.shape[0]
+    found, jacobian = jax.vmap(along, out_axes=(None, 1))(jnp.eye(size, dtype=point.y.dtype))
+    return found, jacobian
+
+
+@compiled
+def points_along(scene: Scene, stepper: EventExact, starts: Point, count: int) -> Return:
+    """The next `count` points of the section from each of several starts (leading axis); after a failure, not a number."""
+    mechanics = mechanics_about_sliding(scene)
+
+    def to_next(point, _):
+        following = section_return(stepper, scene, mechanics, point, 1)
+        return following.point, following
+
+    def of_one(start):
+        return jax.lax.scan(to_next, start, None, length=count)[1]
+
+    return jax.vmap(of_one)(starts)

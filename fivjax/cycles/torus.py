@@ -1,0 +1,5 @@
+"""Tori."""
+
+
+def torus_of(scene, stepper, point):
+    return None
