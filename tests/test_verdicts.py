@@ -192,3 +192,11 @@ def test_stick_slip_that_fades_slowly_is_no_limit_cycle():
     assert found.kind == "sliding"
     assert float(m["last_event"][0]) == pytest.approx(found.last_event, rel=1e-6)
     assert int(m["contact_events"][0]) == found.events
+
+
+def test_what_comes_back_under_a_long_kick_is_no_limit_cycle():
+    """Stick-slip under a load of a fiftieth for five seconds is periodic; the load returns, and 0.3 s later it slides."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.1), 1.0, fj.Pulse(100.0, 0.02, duration=5.0))
+    m = fj.bistability_map(scene, p=[0.02], progress=False)
+    assert int(m["verdict"][0]) == fj.Verdict.SLIDING
+    assert float(m["decided_at"][0]) == pytest.approx(5.28, abs=0.1)

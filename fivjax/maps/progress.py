@@ -132,6 +132,8 @@ def step(setting: Setting, now: Progress) -> Progress:
     y, contact, h, peak, rise, *_ = after
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
+    # What comes back under the kick's load says nothing of the motion after it.
+    rise = rise._replace(happened=rise.happened & jnp.all(scene.load.jumps <= now.t))
     memory = recurrence.observe(
         now.recurrence,
         structure.weights,

@@ -89,13 +89,13 @@ def _find_attractors(batch: Batch, shared: Flattened, groups: np.ndarray, column
     trajectories = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
     most = max(attractors.TESTS)
     deviations = np.full((most, len(own), 2 * structure.size), np.nan)
-    peaks, times = np.full((most, len(own)), np.nan), np.full((most, len(own)), np.nan)
+    peaks, times, events = (np.full((most, len(own)), np.nan) for _ in range(3))
     looks = 0
 
     def cycle_of(k: int):
         mine = slice(k * members, (k + 1) * members)
-        ensemble = attractors.Ensemble(deviations[:looks, mine], peaks[:looks, mine], times[:looks, mine], moving[mine])
-        return attractors.met(ensemble, slowest_decay[groups[k]])
+        seen = (array[:looks, mine] for array in (deviations, peaks, times, events))
+        return attractors.met(attractors.Ensemble(*seen, moving[mine]), slowest_decay[groups[k]])
 
     while len(running) and looks < most:
         report(0)
@@ -105,6 +105,8 @@ def _find_attractors(batch: Batch, shared: Flattened, groups: np.ndarray, column
         recent = slice(looks, looks + attractors.SEEN)
         deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
         peaks[recent, running], times[recent, running] = now.recurrence.peak, now.t
+        # As of the last of these looks: enough to tell whether there were any since the looks before.
+        events[recent, running] = now.events
         looks += attractors.SEEN
         moving[running] = (now.verdict == Verdict.UNDECIDED) | (now.verdict == Verdict.LIMIT_CYCLE)
         over = ~moving[running]

@@ -66,6 +66,7 @@ class Ensemble(NamedTuple):
     deviations: Float[np.ndarray, "k e 2n"]  # weighted
     peaks: Float[np.ndarray, "k e"]  # largest tangential speed since the look before, m/s
     times: Float[np.ndarray, "k e"]  # s
+    events: Int[np.ndarray, "k e"]  # contact events so far
     moving: Bool[np.ndarray, " e"]  # members that are still followed: without another verdict
 
 
@@ -94,7 +95,9 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     for member in np.flatnonzero(ensemble.moving):
         others = ensemble.moving & (np.arange(len(ensemble.moving)) != member)
         known = ensemble.deviations[earlier, others].reshape(-1, ensemble.deviations.shape[-1])
-        if len(known) and np.all(_distance(known, ensemble.deviations[later, member]) <= REACHED):
+        # A vibration that grows from nothing meets on its growing mode long before its first event.
+        eventful = ensemble.events[later, member][-1] > ensemble.events[later, member][0]
+        if len(known) and eventful and np.all(_distance(known, ensemble.deviations[later, member]) <= REACHED):
             members.append(member)
     if len(members) < LEAST_MEMBERS:
         return None
