@@ -1,25 +1,84 @@
-"""Pictures: drawn from real results, without touching pyplot, and showing what they should."""
+"""Pictures: drawn without touching pyplot, showing what they should, and refusing in sentences whose remedy works."""
 
+import re
+import subprocess
 import sys
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.figure import Figure
 
 import fivjax as fj
-from fivjax.plot import results as plot
+from fivjax import plot
+from fivjax.plot._style import coordinate_label
+from fivjax.plot.contact_status import KICK_HEIGHT
+
+SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.3, start=0.02))
 
 
 @pytest.fixture(scope="module")
 def runs():
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.3, start=0.02))
-    return {f"{v:g} m/s": fj.simulate(scene.replace(belt_speed=v), 0.6, 1e-3) for v in (1.0, 3.0)}
+    """Two trajectories with the layout of `simulate`: swings at 68 Hz, the first of them sticks and detaches."""
+    t = np.arange(0.0, 0.6, 1e-3)
+    wave = np.sin(2 * np.pi * 68 * t)[:, None] * [1e-3, 2e-3, 0.0]
+    load = np.where((t >= 0.02) & (t < 0.12), 130.0, 100.0)
+    made = {}
+    for speed in (1.0, 3.0):
+        status = (
+            np.where(wave[:, 0] > 9e-4, 0, np.where(wave[:, 0] < -9e-4, 2, 1)) if speed == 1 else np.ones(len(t), int)
+        )
+        scene = SCENE.replace(belt_speed=speed)
+        made[f"{speed:g} m/s"] = fj.Trajectory(t, wave, 400 * wave, 1e5 * wave, status, load, load, load, scene)
+    return made
 
 
-@pytest.fixture(scope="module")
-def a_map():
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
-    return fj.bistability_map(scene, mu=[0.1, 0.15, 0.2], p=[1.5, 2.0, 2.5, 3.0], t_max=4.0, progress=False)
+def still(**load) -> fj.Trajectory:
+    """A trajectory of six rows that does not move, whose status changes."""
+    t, zero = np.arange(6.0), np.zeros((6, 3))
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.1), 3.0, fj.Pulse(**load) if load else None)
+    return fj.Trajectory(t, zero, zero, zero, np.array([1, 0, 1, 2, 2, 1]), t, t, np.full(6, 100.0), scene)
+
+
+def a_map(**axes) -> xr.Dataset:
+    """A dataset with the layout of `bistability_map`: sliding below p = 2.2, limit cycles of growing amplitude above."""
+    axes = axes or {"mu": [0.1, 0.15, 0.2], "p": [1.5, 2.0, 2.5, 3.0]}
+    shape = [len(values) for values in axes.values()]
+    p = np.meshgrid(*axes.values(), indexing="ij")[list(axes).index("p")] if "p" in axes else np.ones(shape)
+    cycle = p > 2.2
+    others = tuple(name for name in axes if name != "p")
+    over = [len(axes[name]) for name in others]
+    return xr.Dataset(
+        {
+            "verdict": (tuple(axes), cycle.astype(np.int8)),
+            "amplitude": (tuple(axes), np.where(cycle, p, 0.0)),
+            "decided_at": (tuple(axes), p),
+            "p_crit": (others, np.full(over, 2.25)),
+            "p_crit_low": (others, np.full(over, 2.0)),
+            "p_crit_high": (others, np.full(over, 2.5)),
+        },
+        coords=axes,
+        attrs={"mu_crit": 0.228} if "mu" in axes else {},
+    )
+
+
+def a_threshold(p_crit=(3.0, 2.0, 1.5, 1.2), low=None, high=None) -> xr.Dataset:
+    """A dataset with the layout of `critical_perturbation` over friction."""
+    p_crit = np.asarray(p_crit, float)
+    return xr.Dataset(
+        {
+            "p_crit": ("mu", p_crit),
+            "p_crit_low": ("mu", p_crit - 1e-5 if low is None else np.asarray(low, float)),
+            "p_crit_high": ("mu", p_crit + 1e-5 if high is None else np.asarray(high, float)),
+            "only_crossing": ("mu", np.ones(len(p_crit), bool)),
+            "crossings": ("mu", np.ones(len(p_crit), int)),
+        },
+        coords={"mu": np.linspace(0.1, 0.22, len(p_crit))},
+        attrs={"range": "[1.0, 5.0]"},
+    )
+
+
+UNDECIDED = {"p_crit": [3.0, np.nan, 1.5, 1.2], "low": [2.9, 1.7, 1.4, 1.1], "high": [3.1, 2.6, 1.6, 1.3]}
 
 
 def drawn(figure: Figure, tmp_path) -> bytes:
@@ -27,90 +86,227 @@ def drawn(figure: Figure, tmp_path) -> bytes:
     return fj.save_figure(figure, tmp_path / "picture.png").read_bytes()
 
 
-def test_every_picture_draws(runs, a_map, tmp_path):
-    """Each public picture function on real results, written as PNG."""
+def texts(legend) -> list[str]:
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_every_picture_draws(runs, tmp_path):
+    """Each public picture function, written as PNG."""
     one = next(iter(runs.values()))
     for figure in (
-        plot.response(one),
         plot.response(one, "velocity", coordinate=1),
-        plot.phase_plane(one, last=0.2),
         plot.phase_plane(runs, last=0.2),
         plot.perturbation(one),
+        plot.perturbation(one, zoom=0.2),
         plot.comparison(runs),
-        plot.bistability(a_map),
-        plot.bistability(a_map, value="decided_at"),
+        plot.bistability(a_map(), value="decided_at"),
+        plot.critical(a_threshold()),
     ):
         assert drawn(figure, tmp_path).startswith(b"\x89PNG")
 
 
-def test_the_map_picture_shows_boundary_and_undecided_lanes(a_map, tmp_path):
-    """The legend must name what is drawn: sliding, the boundary, and how many lanes have no verdict."""
-    undecided = a_map.copy(deep=True)
+@pytest.mark.slow
+def test_pictures_of_computed_results(tmp_path):
+    """The layouts that the other tests draw are those that maps and thresholds really have."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
+    computed = fj.bistability_map(scene, mu=[0.1, 0.15, 0.2], p=[1.5, 2.0, 2.5, 3.0], t_max=4.0, progress=False)
+    assert set(a_map().data_vars) <= set(computed.data_vars)
+    figure = plot.bistability(computed)
+    (mesh,) = [c for c in figure.axes[0].collections if np.ma.count(c.get_array()) and c.get_cmap().name == "viridis"]
+    expected = computed["amplitude"].values[computed["verdict"].values == 1]
+    np.testing.assert_allclose(np.sort(np.ma.compressed(mesh.get_array())), np.sort(expected))
+    drawn(figure, tmp_path)
+    drawn(plot.response(fj.simulate(scene, 0.1, 1e-3)), tmp_path)
+    found = fj.critical_perturbation(
+        scene, mu=[0.15, 0.2], p_range=(1.0, 3.0), p_step=0.25, tolerance=1e-2, progress=False
+    )
+    assert set(a_threshold().data_vars) <= set(found.data_vars)
+    drawn(plot.critical(found), tmp_path)
+
+
+def test_amplitudes_reach_the_colour_scale():
+    """The colour of a cell is its amplitude: the mesh holds the dataset's values."""
+    computed = a_map()
+    meshes = [c for c in plot.bistability(computed).axes[0].collections if c.get_array() is not None]
+    expected = computed["amplitude"].values[computed["verdict"].values == 1]
+    np.testing.assert_allclose(np.sort(np.ma.compressed(meshes[1].get_array())), np.sort(expected))
+
+
+def test_the_map_picture_shows_boundary_and_undecided_trajectories():
+    """The legend must name what is drawn: sliding, the boundary, and how many have no verdict."""
+    undecided = a_map()
     undecided["verdict"][0, 0] = -1
-    legend = plot.bistability(undecided).axes[0].get_legend()
-    texts = [text.get_text() for text in legend.get_texts()]
-    count = int((undecided["verdict"] < 0).sum())
-    assert any("sliding" in text for text in texts)
-    assert any("p_" in text for text in texts)
-    assert any(f"({count} of 12)" in text for text in texts)
+    said = texts(plot.bistability(undecided).axes[0].get_legend())
+    assert any("sliding" in text for text in said)
+    assert any("p_" in text for text in said)
+    assert any("(1 of 12)" in text for text in said)
+
+
+def test_an_undecided_range_of_p_crit_is_a_bar_and_no_line():
+    """Across undecided trajectories no line may be drawn: the bar ends at the kicks that are proved, as in the dataset."""
+    found = a_threshold(**UNDECIDED)
+    by_map = a_map(mu=found["mu"].values, p=[1.0, 2.0, 3.0, 4.0]).assign(
+        {name: found[name] for name in ("p_crit", "p_crit_low", "p_crit_high")}
+    )
+    for figure in (
+        plot.critical(found),
+        plot.bistability(by_map),
+        plot.bistability(by_map.drop_vars("p_crit"), critical=found),
+    ):
+        axes = figure.axes[0]
+        bars = [c.get_segments() for c in axes.collections if type(c).__name__ == "LineCollection"]
+        assert [np.asarray(segments).tolist() for segments in bars] == [[[[0.14, 1.7], [0.14, 2.6]]]]
+        for line in axes.lines:
+            at = np.isclose(np.asarray(line.get_xdata(), float), 0.14)
+            assert not np.isfinite(np.asarray(line.get_ydata(), float)[at]).any() or line.get_linestyle() == "--"
+        assert any("range" in text for text in texts(axes.get_legend()))
+    certain = plot.critical(a_threshold()).axes[0]
+    assert not [c for c in certain.collections if type(c).__name__ == "LineCollection"]
+
+
+def test_the_critical_curve_marks_where_islands_were_seen():
+    """Fig. 10: filled where the crossing is the only one, hollow elsewhere."""
+    found = a_threshold()
+    found["only_crossing"][0] = False
+    assert texts(plot.critical(found).axes[0].get_legend()) == ["only crossing seen", "islands seen above"]
+
+
+def test_the_limit_of_linear_theory_is_marked_whatever_the_other_axis():
+    """A map over friction and belt speed has no p, yet μ_crit is where it was: a line on the axis of friction."""
+    over_speed = a_map(mu=[0.1, 0.2, 0.3], belt_speed=[1.0, 2.0])
+    for dataset, place in ((over_speed, 0), (over_speed.transpose("belt_speed", "mu"), 1)):
+        (line,) = plot.bistability(dataset).axes[0].lines
+        assert (line.get_xdata(), line.get_ydata())[place] == [0.228, 0.228]
+
+
+def test_a_map_of_one_row_has_cells():
+    """Where an axis has one value its cells have a width all the same: nothing is drawn with none."""
+    figure = plot.bistability(a_map(mu=[0.2], p=[1.5, 2.0, 2.5, 3.0]))
+    low, high = figure.axes[0].get_xlim()
+    assert low < 0.2 < high
+    (corners,) = {
+        tuple(m.get_coordinates()[0, :, 0]) for m in figure.axes[0].collections if hasattr(m, "get_coordinates")
+    }
+    assert corners[0] < 0.2 < corners[1]
 
 
 def test_statuses_are_shaded_where_they_occur(runs):
-    """The legend of a response names the statuses that occur in it, and only those."""
-    sticking = plot.response(runs["1 m/s"]).axes[0].get_legend()
-    assert "sticking" in [text.get_text() for text in sticking.get_texts()]
-    scene = runs["1 m/s"].scene.replace(p=1.0)
-    quiet = fj.simulate(scene, 0.6, 1e-3)
+    """The legend of a response names what occurs in it, and only that."""
+    assert texts(plot.response(runs["1 m/s"]).axes[0].get_legend()) == ["sticking", "detached", "kick, p = 1.3"]
+    quiet = fj.Trajectory(**{**vars(still()), "status": np.ones(6, int)})
     assert plot.response(quiet).axes[0].get_legend() is None
 
 
 def test_a_status_of_one_row_is_shaded_for_as_long_as_a_row_lasts():
     """A stick shorter than the distance of rows is seen, and shading ends where the next status begins."""
-    t, still = np.arange(6.0), np.zeros((6, 3))
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.1), 3.0)
-    run = fj.Trajectory(t, still, still, still, np.array([1, 0, 1, 2, 2, 1]), t, t, t, scene)
     axes = Figure().add_subplot()
-    handles = plot.shade_status(axes, run)
+    handles = plot.shade_status(axes, still())
     assert [handle.get_label() for handle in handles] == ["sticking", "detached"]
-    spans = [path.get_extents() for bars in axes.collections for path in bars.get_paths()]
-    assert [(span.x0, span.x1) for span in spans] == [(1, 2), (3, 5)]
+    parts = [path.get_extents() for bars in axes.collections for path in bars.get_paths()]
+    assert [(part.x0, part.x1) for part in parts] == [(1, 2), (3, 5)]
 
 
-def test_the_critical_curve_marks_where_islands_were_seen(tmp_path):
-    """Fig. 10: filled where the crossing is the only one, hollow elsewhere."""
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.05), 3.0, fj.Pulse(100.0, 1.2))
-    found = fj.critical_perturbation(
-        scene, mu=[0.15, 0.2], p_range=(1.0, 3.0), p_step=0.25, tolerance=1e-2, progress=False
+def test_the_kick_is_marked_when_it_acts():
+    """A response without a mark does not say when it was kicked; a kick of p = 1 is none."""
+    kicked = still(force=100.0, p=1.2, duration=0.5, start=2.0)
+    for figure in (plot.response(kicked), plot.comparison({"one": kicked})):
+        axes = figure.axes[0]
+        (mark,) = [c.get_paths()[0].get_extents() for c in axes.collections if len(c.get_paths()) == 1][-1:]
+        assert (mark.x0, mark.x1, mark.y0, mark.y1) == (2.0, 2.5, 1 - KICK_HEIGHT, 1.0)
+        assert "kick, p = 1.2" in texts(axes.get_legend())
+    none = plot.response(still(force=100.0, p=1.0)).axes[0]
+    assert "kick" not in " ".join(texts(none.get_legend()))
+
+
+def test_a_short_kick_of_a_long_run_is_seen(runs):
+    """Fig. 8: beside the whole run, a panel of which the kick takes a visible part; the load's axis does not begin at zero."""
+    figure = plot.perturbation(runs["3 m/s"], zoom=0.2)
+    around = figure.axes[0]
+    low, high = around.get_xlim()
+    assert low < 0.02 < 0.12 < high
+    assert 0.1 / (high - low) > 0.4
+    low, high = around.get_ylim()
+    assert 30 / (high - low) > 0.5
+    with pytest.raises(ValueError, match="`zoom` must be positive"):
+        plot.perturbation(runs["3 m/s"], zoom=0)
+
+
+def test_labels_name_coordinates():
+    """An axis says which coordinate it shows, by name where the structure has names."""
+    structure = fj.belt_oscillator()
+    labels = [coordinate_label(structure, k) for k in range(3)]
+    if getattr(structure, "coordinates", None):
+        assert labels == ["tangential x2", "y1", "normal y2"]
+    else:
+        assert labels == ["tangential", "coordinate 1", "normal"]
+    plain = fj.Structure(structure.mass, structure.damping, structure.stiffness, structure.load_direction)
+    assert plot.response(still()).axes[0].get_ylabel() == f"{labels[0]}, acceleration (m/s²)"
+    assert "1" in coordinate_label(plain, 1)
+
+
+def test_names_of_methods_do_not_collide():
+    """Work and precision: methods are told apart by markers and named in a legend, not in labels one upon the other."""
+    names = [f"method {k}" for k in range(7)]
+    table = xr.Dataset(
+        {
+            "cost": (("stepper", "precision"), np.full((7, 2), 1e-6)),
+            "state_error": (("stepper", "precision"), np.full((7, 2), 1e-9)),
+        },
+        coords={"stepper": names, "precision": ["float64", "float32"]},
     )
-    found["only_crossing"][0] = False
-    figure = plot.critical(found)
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
-        "only crossing seen",
-        "islands seen above",
-    ]
-    drawn(figure, tmp_path)
+    figure = plot.tradeoff(table)
+    assert not figure.axes[0].texts
+    assert texts(figure.legends[0]) == [*names, "hollow: float32"]
+    assert len({line.get_marker() for line in figure.axes[0].lines}) == 7
+    figure.draw_without_rendering()
 
 
-def test_wrong_shapes_are_refused(a_map):
-    """A map with one axis has no picture; the sentence says what to do."""
-    with pytest.raises(ValueError, match="two axes"):
-        plot.bistability(a_map.isel(mu=0, drop=True))
-    with pytest.raises(ValueError, match="quantity"):
-        plot.response(next(iter([fj.simulate(fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.1)), 0.01, 1e-3)])), "speed")
+# --- refusals
+
+
+def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
+    """Three axes: the call in the sentence is carried out, and draws."""
+    m = a_map(mu=[0.1, 0.2], p=[1.5, 2.5], belt_speed=[1.5, 2.5])
+    with pytest.raises(ValueError, match="needs two axes, but this map has 3: mu, p, belt_speed") as refused:
+        plot.bistability(m)
+    (call,) = re.findall(r"`(fj\.plot\.bistability\(.*?\))`;", str(refused.value))
+    assert isinstance(eval(call, {"fj": fj, "m": m}), Figure)
+    with pytest.raises(ValueError, match="this map has 1: p"):
+        plot.bistability(a_map(p=[1.5, 2.5]))
+    found = a_threshold().expand_dims(belt_speed=[1.0, 2.0]).transpose("mu", "belt_speed")
+    with pytest.raises(ValueError, match="over 2: mu, belt_speed") as refused:
+        plot.critical(found)
+    (call,) = re.findall(r"`(fj\.plot\.critical\(.*?\))`\.", str(refused.value))
+    assert isinstance(eval(call, {"fj": fj, "found": found}), Figure)
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: plot.bistability(None), r"what `fj.bistability_map\(scene, .*\)` returns, but is None"),
+        (lambda: plot.bistability(a_map(), critical=3), r"what `fj.critical_perturbation\(.*\)` returns, but is 3"),
+        (lambda: plot.bistability(a_threshold()), "a dataset without `verdict`"),
+        (lambda: plot.bistability(a_map(), value="size"), "a dataset without `size`"),
+        (lambda: plot.critical(a_map()), "a dataset without `only_crossing`"),
+        (lambda: plot.response(a_map()), r"as `fj.simulate` returns it, but is a dataset.*`fj.show\(dataset\)`"),
+        (lambda: plot.response(None), "such as `fj.simulate.*` returns, but is None"),
+        (lambda: plot.phase_plane([1.0]), "must be a trajectory"),
+        (lambda: plot.perturbation(a_map()), "is a dataset"),
+        (lambda: plot.comparison(still()), "trajectories by label"),
+        (lambda: plot.comparison({}), "is empty"),
+        (lambda: plot.tradeoff(a_map()), r"what `fj.tradeoff\(scene\)` returns"),
+        (lambda: plot.energy.balance(None), "must be a trajectory"),
+        (lambda: plot.energy.balance(still()), r"`simulate\(..., energy=True\)`"),
+        (lambda: plot.energy.per_cycle(a_map()), r"what `fj.energy_per_cycle\(run\)` returns"),
+        (lambda: plot.response(still(), "speed"), "`quantity` must be one of"),
+    ],
+)
+def test_wrong_objects_are_refused_with_the_call_that_makes_right_ones(call, sentence):
+    with pytest.raises((TypeError, ValueError), match=sentence):
+        call()
 
 
 def test_pictures_leave_pyplot_alone():
     """Importing fivjax must not import pyplot, whose state is global."""
-    import subprocess
-
     code = "import sys, fivjax, fivjax.plot; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
-
-
-def test_amplitudes_reach_the_colour_scale(a_map):
-    """The colour of a cell is its amplitude: the mesh holds the dataset's values."""
-    figure = plot.bistability(a_map)
-    meshes = [c for c in figure.axes[0].collections if c.get_array() is not None]
-    values = np.ma.compressed(meshes[1].get_array())
-    expected = a_map["amplitude"].values[a_map["verdict"].values == 1]
-    np.testing.assert_allclose(np.sort(values), np.sort(expected))

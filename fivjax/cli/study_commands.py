@@ -55,8 +55,6 @@ class Reproduce:
             refuse_existing(report)
         begin = time.perf_counter()
         made = fj.reproduce(self.figure, self.out)
-        findings = [finding for one in made.values() for finding in one.findings]
-        agree = sum(finding.agrees for finding in findings)
         say(report)
         print(f"  {len(made)} figures and tables, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")
-        print(f"  {agree} of {len(findings)} numbers and statements as printed; the others are explained in the report")
+        print(f"  {made.summary} What differs is explained in the report.")

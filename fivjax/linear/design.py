@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation import arguments
+from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import labelled
 from ..model.structure import Structure
@@ -37,7 +38,11 @@ class DesignOutcome(enum.StrEnum):
 
 
 class Design(eqx.Module):
-    """The best design that was met: its structure, what changed, and the quantity before and after."""
+    """The best design that was met: its structure, what changed, and the quantity before and after.
+
+    `history` holds the quantity and the parameters over the steps of the search, up to the one that first reached the
+    target; its attribute `chosen_step` says which of them is the design.
+    """
 
     structure: Structure
     parameters: dict[str, float]
@@ -153,7 +158,7 @@ def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_b
 
     optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01))
 
-    @jax.jit
+    @compiled
     def search(shares):
         def step(carry, _):
             shares, memory = carry
@@ -177,11 +182,17 @@ def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_b
         reached = after >= target if larger_is_better else after <= target
         outcome = DesignOutcome.TARGET_REACHED if reached else DesignOutcome.TARGET_NOT_REACHED
     columns = jax.vmap(values)(real(shares))
+    # Content with a target, the search is over where it is first reached; what follows is no part of the design.
+    taken = best + 1 if outcome is DesignOutcome.TARGET_REACHED else steps + 1
     history = xr.Dataset(
         {name.replace(" ", "_"): ("step", quantities), **{k: ("step", np.asarray(v)) for k, v in columns.items()}},
         coords={"step": np.arange(steps + 1)},
-    )
+    ).isel(step=slice(taken))
+    history[name.replace(" ", "_")].attrs.update(long_name=name, units="1" if larger_is_better else "1/s")
     history = labelled(history, as_scene(structure, 0.0, 1), analysis="design by gradient", quantity=name)
+    history.attrs["chosen_step"] = best
+    if target is not None:
+        history.attrs["target"] = float(target)
     return Design(structure.replace(**parameters), parameters, before, after, target, outcome, name, history)
 
 

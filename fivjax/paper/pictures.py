@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
-from ..plot.results import BLACK, BLUE, GREEN, ORANGE, VERMILION, shade_status
+from ..plot._style import BLACK, BLUE, GREEN, ORANGE, VERMILION, legend_above, new_figure
+from ..plot.contact_status import shade_status
 from ..simulation.trajectory import Trajectory
 
 Window = tuple[float, float]
@@ -25,7 +26,7 @@ DEPTH = 40.0
 
 def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Friction coefficient over slip speed, one line for each `law` (Fig. 2)."""
-    figure = figure or Figure(figsize=(5.6, 3.8), layout="constrained")
+    figure = new_figure(figure, 5.6, 3.8)
     axes = figure.add_subplot()
     styles = [(VERMILION, "-"), (BLUE, "--"), (BLACK, "-.")]
     for law, (colour, line) in zip(dataset["law"].values, styles, strict=False):
@@ -41,11 +42,11 @@ def onset(run: Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figu
 
     `spectrum` is from `spectra.spectrogram`; across the belt is the paper's y1, coordinate 1.
     """
-    figure = figure or Figure(figsize=(8.4, 6.0), layout="constrained")
+    figure = new_figure(figure, 8.4, 6.0)
     panels = figure.subplot_mosaic("aa;bc")
     accelerations(panels["a"], run, (float(run.t[0]), float(run.t[-1])))
     panels["a"].axvspan(*window, color="0.8", zorder=0)
-    _thick(panels["a"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False))
+    _thick(legend_above(panels["a"], columns=2))
     accelerations(panels["b"], run, window)
     level = spectrum["level"]
     shown = level.sel(frequency=slice(0, 500))
@@ -64,7 +65,7 @@ def coexistence(
 
     `marks` are windows to point at by name, those of Fig. 7.
     """
-    figure = figure or Figure(figsize=(8.4, 6.4), layout="constrained")
+    figure = new_figure(figure, 8.4, 6.4)
     panels = figure.subplot_mosaic("a;b", height_ratios=(3, 2))
     overlaid(runs, axes=panels["a"])
     for name, (start, end) in marks.items():
@@ -76,7 +77,7 @@ def coexistence(
     low, high = panels["a"].get_ylim()
     panels["a"].set_ylim(low, high + 0.12 * (high - low))
     accelerations(panels["b"], zoomed, zoom)
-    panels["b"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+    legend_above(panels["b"], columns=2)
     return lettered(figure, list(panels.values()))
 
 
@@ -85,14 +86,14 @@ def overlaid(
 ) -> Figure | None:
     """The tangential accelerations of several runs on one pair of axes, in the order given (Figs. 6(a) and 9)."""
     if axes is None:
-        figure = figure or Figure(figsize=(8.4, 3.8), layout="constrained")
+        figure = new_figure(figure, 8.4, 3.8)
         axes = figure.add_subplot()
     # Of different lightness, so that they are told apart in grey too.
     shades = [(BLUE, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
     for (name, run), colour in zip(runs.items(), shades, strict=False):
         axes.plot(run.t, run.acceleration[:, run.scene.structure.tangential], color=colour, lw=0.5, label=name)
     axes.set(xlabel="time (s)", ylabel="tangential\nacceleration (m/s²)", xlim=(0, max(r.t[-1] for r in runs.values())))
-    _thick(axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=len(runs), frameon=False))
+    _thick(legend_above(axes, columns=len(runs)))
     return figure
 
 
@@ -115,7 +116,7 @@ def accelerations(axes: Axes, run: Trajectory, window: Window) -> None:
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, figure: Figure | None = None) -> Figure:
     """A table of text (Tables 1 and 2)."""
-    figure = figure or Figure(figsize=(1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1)), layout="constrained")
+    figure = new_figure(figure, 1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1))
     axes = figure.add_subplot()
     axes.set_axis_off()
     drawn = axes.table(

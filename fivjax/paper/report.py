@@ -7,8 +7,10 @@ from tqdm.auto import tqdm
 
 from ..foundation.precision import in_double_precision
 from ..io.datasets import check_writable, save, save_figure, save_text
-from . import pictures as plot_paper
-from .figures import FIGURES, Made, Runs
+from . import pictures
+from .figures import FIGURES
+from .findings import Kind, Made, summary
+from .runs import Runs
 
 REPORT = "reproduce.md"
 
@@ -48,17 +50,17 @@ def reproduce(
     for name in bar:
         bar.set_postfix_str(_file_name(name))
         one = FIGURES[name](runs)
-        plot_paper.captioned(one.picture, one.caption)
+        pictures.captioned(one.picture, one.caption)
         made[name] = one
         if out is not None:
             save_figure(one.picture, out / f"{_file_name(name)}.png")
             save(one.data, out / f"{_file_name(name)}.nc")
     if out is not None:
-        save_text(report(made), out / REPORT)
+        save_text(markdown(made), out / REPORT)
     return made
 
 
-def report(made: Mapping[str, Made]) -> str:
+def markdown(made: Mapping[str, Made]) -> str:
     """What the paper prints beside what was computed, as Markdown."""
     findings = [finding for one in made.values() for finding in one.findings]
     differing = [finding for finding in findings if not finding.agrees]
@@ -69,9 +71,10 @@ def report(made: Mapping[str, Made]) -> str:
         "friction-induced instabilities.*",
         "",
         "Computed from Table 1 with events located exactly (`fj.EventExact`); nothing is tuned. A number agrees where it "
-        "prints the same with as many digits as the paper gives; a statement agrees where the computed numbers bear it out.",
+        "prints the same with as many digits as the paper gives; a statement agrees where the computed numbers bear it out. "
+        "What the paper prescribes (Table 1, friction laws, the kick) is taken as printed, and is no result.",
         "",
-        f"{len(findings) - len(differing)} of {len(findings)} agree.",
+        summary(findings),
         "",
     ]
     if differing:
@@ -86,7 +89,8 @@ def report(made: Mapping[str, Made]) -> str:
         lines += [f"## {one.caption}", "", f"![{_title(name)}]({file}.png)", "", f"Data: `{file}.nc`.", ""]
         lines += ["| where | what | the paper | computed | |", "|---|---|---|---|---|"]
         for f in one.findings:
-            cells = (f.where, f.what, f.printed, f.computed, "agrees" if f.agrees else "**differs**")
+            judged = "input" if f.kind is Kind.INPUT else "agrees" if f.agrees else "**differs**"
+            cells = (f.where, f.what, f.printed, f.computed, judged)
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         notes = [f"{f.what}: {_sentence(f.why)}" for f in one.findings if f.why]
         lines += ["", *dict.fromkeys(f"- {note}" for note in notes), ""]

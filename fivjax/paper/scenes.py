@@ -91,28 +91,3 @@ def scene(friction: AbstractFriction | None = None, belt_speed=3.0, p=1.2, start
     values = {name: value for name, (_, value, _) in TABLE_1.items()}
     load = Pulse(values.pop("force"), p, duration=0.1, start=start)
     return Scene(belt_oscillator(**values), Coulomb(MU) if friction is None else friction, belt_speed, load)
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """What the paper says at one place, beside what was computed."""
-
-    where: str  # "Fig. 3", "Section 4.3"
-    what: str
-    printed: str
-    computed: str
-    agrees: bool
-    why: str = ""  # where it differs; or what else is worth knowing
-
-
-def number(where: str, what: str, printed: str, computed: float, unit: str = "", why: str = "") -> Finding:
-    """A number that the paper prints: it agrees where the computed one, rounded to as many digits, prints the same."""
-    decimals = len(printed.partition(".")[2])
-    agrees = f"{computed:.{decimals}f}" == printed
-    unit = f" {unit}" if unit else ""
-    return Finding(where, what, printed + unit, f"{computed:.{max(decimals + 3, 3)}f}{unit}", bool(agrees), why)
-
-
-def statement(where: str, what: str, said: str, computed: str, holds, why: str = "") -> Finding:
-    """A statement without a number: `holds` says whether the computed numbers bear it out."""
-    return Finding(where, what, said, computed, bool(holds), why)

@@ -9,26 +9,46 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Okabe and Ito, in an order of falling darkness; lines also change their dashes.
-COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-DASHES = ("-", "--", "-.", ":")
-FALLS, RISES = "#0072B2", "#E69F00"
+from ._style import (
+    BLACK,
+    BLUE,
+    COLOURS,
+    DASHES,
+    ORANGE,
+    VERMILION,
+    cell_edges,
+    check_dataset,
+    new_figure,
+    variable_label,
+)
+
+FALLS, RISES = BLUE, ORANGE
 
 
 def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Frequencies and growth rates of the modes over one parameter (Fig. 3), with the critical friction marked.
 
-    `dataset` is from `cea.modes`.
+    `dataset` is from `cea.modes`. A single point of the axis is drawn as such.
+
+    **Raises:** `TypeError` for anything but modes.
     """
-    figure = _figure(figure, (6.4, 5.6))
+    check_dataset(dataset, ("frequency", "growth_rate"), "fj.cea.modes(structure, mu=np.linspace(0, 0.5, 501))")
+    figure = new_figure(figure, 6.4, 5.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     name = str(dataset["frequency"].dims[0])
+    # A line through a single point cannot be seen.
+    marker = "o" if dataset.sizes[name] == 1 else None
     for k, mode in enumerate(dataset["mode"].values):
-        style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[k % len(DASHES)], "label": f"mode {mode + 1}"}
+        style = {
+            "color": COLOURS[k % len(COLOURS)],
+            "linestyle": DASHES[k % len(DASHES)],
+            "label": f"mode {mode + 1}",
+            "marker": marker,
+        }
         upper.plot(dataset[name], dataset["frequency"].sel(mode=mode), **style)
         lower.plot(dataset[name], dataset["growth_rate"].sel(mode=mode), **style)
     lower.axhline(0, color="0.4", linewidth=0.8)
-    if "mu_crit" in dataset and np.isfinite(dataset["mu_crit"]):
+    if name == "mu" and "mu_crit" in dataset and np.isfinite(dataset["mu_crit"]):
         mu_crit = float(dataset["mu_crit"])
         for axes in (upper, lower):
             axes.axvline(mu_crit, color="0.4", linestyle=(0, (1, 2)), linewidth=1.2)
@@ -40,9 +60,9 @@ def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
             ha="right",
             fontsize="small",
         )
-    upper.set_ylabel(_label(dataset["frequency"]))
-    lower.set_ylabel(_label(dataset["growth_rate"]))
-    lower.set_xlabel(_label(dataset[name]))
+    upper.set_ylabel(variable_label(dataset["frequency"]))
+    lower.set_ylabel(variable_label(dataset["growth_rate"]))
+    lower.set_xlabel(variable_label(dataset[name]))
     upper.legend(frameon=False)
     return figure
 
@@ -52,9 +72,12 @@ def sensitivity(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
 
     `dataset` is from `cea.sensitivity(structure).dataset`. The plain derivative is written beside each bar. Bars to the
     left (μ_crit falls) are hatched.
+
+    **Raises:** `TypeError` for anything but the dataset of a sensitivity.
     """
+    check_dataset(dataset, ("normalised", "sensitivity"), "fj.cea.sensitivity(structure).dataset")
     shown = dataset.isel(parameter=np.argsort(np.nan_to_num(np.abs(dataset["normalised"].values)), kind="stable"))
-    figure = _figure(figure, (6.4, 1.4 + 0.36 * shown.sizes["parameter"]))
+    figure = new_figure(figure, 6.4, 1.4 + 0.36 * shown.sizes["parameter"])
     axes = figure.subplots()
     names = [str(name) for name in shown["parameter"].values]
     for row, value in enumerate(shown["normalised"].values):
@@ -90,27 +113,53 @@ def chart(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Growth rate over two parameters, with the limit of stability drawn in.
 
     `dataset` is from `cea.chart`. Points without steady sliding are left white.
+
+    **Raises:** `TypeError` for anything but a chart.
     """
-    figure = _figure(figure, (6.4, 4.8))
+    check_dataset(dataset, ("growth_rate", "frequency"), "fj.cea.chart(structure, mu=..., k1=...)")
+    if dataset["growth_rate"].ndim != 2 or "mode" in dataset.dims:
+        raise TypeError(
+            "Argument `dataset` must be a chart over two parameters; modes are drawn by `fj.plot_linear.eigenvalues`."
+        )
+    figure = new_figure(figure, 6.4, 4.8)
     axes = figure.subplots()
     across, up = (str(name) for name in dataset["growth_rate"].dims)
     growth = dataset["growth_rate"].transpose(up, across)
-    picture = axes.pcolormesh(dataset[across], dataset[up], growth, cmap="cividis", shading="nearest", rasterized=True)
-    figure.colorbar(picture, ax=axes, label=_label(dataset["growth_rate"]))
+    edges = (cell_edges(dataset[name].values) for name in (across, up))
+    picture = axes.pcolormesh(*edges, growth, cmap="cividis", rasterized=True)
+    figure.colorbar(picture, ax=axes, label=variable_label(dataset["growth_rate"]))
     _limit(axes, dataset[across], dataset[up], growth)
-    axes.set_xlabel(_label(dataset[across]))
-    axes.set_ylabel(_label(dataset[up]))
+    axes.set_xlabel(variable_label(dataset[across]))
+    axes.set_ylabel(variable_label(dataset[up]))
     return figure
 
 
 def design(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """How a design went: the quantity it improves, and the parameters, over the steps (`Design.history`)."""
+    """How a design went: the quantity it improves, and the parameters, over the steps (`Design.history`).
+
+    The design that was returned is marked, with its value; the target is a dashed line.
+
+    **Raises:** `TypeError` for anything but the history of a design.
+    """
+    check_dataset(dataset, (), "fj.design.raise_critical_friction(structure, bounds).history")
+    if "step" not in dataset.dims or "chosen_step" not in dataset.attrs:
+        raise TypeError(
+            "Argument `dataset` must be the `history` of a design, such as `raise_critical_friction` returns."
+        )
     names = [str(name) for name in dataset.data_vars]
-    figure = _figure(figure, (6.4, 1.2 + 1.5 * len(names)))
-    for axes, name in zip(np.atleast_1d(figure.subplots(len(names), 1, sharex=True)), names, strict=True):
-        axes.plot(dataset["step"], dataset[name], color=COLOURS[0])
-        axes.set_ylabel(_label(dataset[name]))
-    axes.set_xlabel("step")
+    figure = new_figure(figure, 6.4, 1.2 + 1.5 * len(names))
+    step, target = int(dataset.attrs["chosen_step"]), dataset.attrs.get("target")
+    rows = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
+    for axes, name in zip(rows, names, strict=True):
+        axes.plot(dataset["step"], dataset[name], color=BLACK, marker="o" if dataset.sizes["step"] == 1 else None)
+        value = float(dataset[name].sel(step=step))
+        axes.plot(step, value, "o", color=VERMILION, label=f"returned: {value:.6g}")
+        axes.set_ylabel(variable_label(dataset[name]))
+        if name == names[0] and target is not None:
+            axes.axhline(target, color=BLUE, ls="--", lw=1.0, label=f"target: {target:g}")
+        axes.margins(x=0.03, y=0.12)
+        axes.legend(frameon=False, fontsize="small")
+    rows[-1].set_xlabel("step")
     return figure
 
 
@@ -122,17 +171,9 @@ def _limit(axes: Axes, x, y, growth) -> None:
             f"{side} everywhere shown" if values.size else "no steady sliding anywhere shown", fontsize="medium"
         )
         return
+    if min(growth.shape) < 2:
+        return
     # White under black: seen on any colour.
     axes.contour(x, y, growth, levels=[0.0], colors="white", linewidths=3.0)
     axes.contour(x, y, growth, levels=[0.0], colors="black", linewidths=1.4)
     axes.set_title("line: limit of stability", fontsize="medium")
-
-
-def _figure(figure: Figure | None, size: tuple[float, float]) -> Figure:
-    return Figure(figsize=size, layout="constrained") if figure is None else figure
-
-
-def _label(variable: xr.DataArray) -> str:
-    long_name = variable.attrs.get("long_name", str(variable.name).replace("_", " "))
-    unit = variable.attrs.get("units", "1")
-    return str(long_name) if unit == "1" else f"{long_name} ({unit})"

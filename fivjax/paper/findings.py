@@ -1,0 +1,89 @@
+"""What the paper says at one place beside what was computed, and what counts as agreeing.
+
+Three kinds are told apart. A *number* is printed by the paper and computed here. A *statement* is in words, and the computed
+numbers bear it out or do not. An *input* is what the paper prescribes: it is taken as printed, agrees with itself and is never
+counted.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Iterable
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+
+class Kind(enum.StrEnum):
+    """What a finding is about."""
+
+    NUMBER = "number"
+    STATEMENT = "statement"
+    INPUT = "input"
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What the paper says at one place, beside what was computed."""
+
+    kind: Kind
+    where: str  # "Fig. 3", "Section 4.3"
+    what: str
+    printed: str
+    computed: str
+    agrees: bool
+    why: str = ""  # where it differs; or what else is worth knowing
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """One figure or table: a matplotlib figure, a dataset, and the findings."""
+
+    caption: str
+    picture: Figure
+    data: xr.Dataset
+    findings: tuple[Finding, ...]
+
+
+def number(where: str, what: str, printed: str, computed: float, unit: str = "", why: str = "") -> Finding:
+    """A number that the paper prints: it agrees where the computed one, rounded to as many digits, prints the same."""
+    decimals = len(printed.partition(".")[2])
+    agrees = f"{computed:.{decimals}f}" == printed
+    unit = f" {unit}" if unit else ""
+    return Finding(
+        Kind.NUMBER, where, what, printed + unit, f"{computed:.{max(decimals + 3, 3)}f}{unit}", bool(agrees), why
+    )
+
+
+def statement(where: str, what: str, said: str, computed: str, holds, why: str = "") -> Finding:
+    """A statement without a number: `holds` says whether the computed numbers bear it out."""
+    return Finding(Kind.STATEMENT, where, what, said, computed, bool(holds), why)
+
+
+def given(where: str, what: str, printed: str, why: str = "") -> Finding:
+    """An input: a value that the paper prescribes and that the runs start from."""
+    return Finding(Kind.INPUT, where, what, printed, "taken as printed", True, why)
+
+
+def score(findings: Iterable[Finding]) -> dict[Kind, tuple[int, int]]:
+    """By kind, how many agree and how many there are; inputs are counted apart and agree with themselves."""
+    findings = list(findings)
+    counted = {}
+    for kind in Kind:
+        own = [finding for finding in findings if finding.kind is kind]
+        counted[kind] = (sum(finding.agrees for finding in own), len(own))
+    return counted
+
+
+def summary(findings: Iterable[Finding]) -> str:
+    """In a sentence how much of what was computed agrees with the paper."""
+    met, numbers = score(findings)[Kind.NUMBER]
+    borne, statements = score(findings)[Kind.STATEMENT]
+    inputs = score(findings)[Kind.INPUT][1]
+    parts = []
+    if numbers:
+        parts.append(f"{met} of {numbers} printed numbers come out as printed")
+    if statements:
+        parts.append(f"{borne} of {statements} statements are borne out")
+    if inputs:
+        parts.append(f"{inputs} inputs are taken as printed and not counted")
+    return "; ".join(parts) + "."

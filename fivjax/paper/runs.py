@@ -1,0 +1,71 @@
+"""The paper's transients, each run once however many figures show it, and what figures keep of them."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+
+from ..simulation.energy import Energy
+from ..simulation.energy_cycles import energy_per_cycle
+from ..simulation.trajectory import Trajectory
+from .scenes import CASES
+
+
+class Runs:
+    """The paper's transients, each run once however many figures show it."""
+
+    @functools.cache  # noqa: B019 (lives as long as one reproduction)
+    def __call__(self, name: str) -> Trajectory:
+        return CASES[name].run()
+
+    @functools.cache  # noqa: B019
+    def beginning(self, name: str, t1: float = 4.0) -> Trajectory:
+        """The first part of a run, in as many rows: for pictures whose windows show what lasts less than a row of the whole."""
+        return dataclasses.replace(CASES[name], t1=t1).run()
+
+    @functools.cache  # noqa: B019
+    def cycles(self, name: str) -> xr.Dataset:
+        return energy_per_cycle(self(name))
+
+    def first(self, name: str, status: int | None = None) -> float:
+        """When a run first sticks (0) or detaches (2), or else when its first contact event comes, in s; infinite if never.
+
+        Read off the ledger, which misses nothing between rows; late by less than a row.
+        """
+        run = self(name)
+        ledger = energy_of(run).ledger
+        spent = {None: 0.0 * ledger.events, 0: ledger.stick_time, 2: ledger.detach_time}[status]
+        begun = np.flatnonzero(ledger.events > 0 if status is None else spent > 0)
+        return float(run.t[begun[0]] - spent[begun[0]]) if len(begun) else np.inf
+
+    def data(self, *names: str, cycles: bool = True) -> xr.Dataset:
+        """What the pictures draw of some runs and, unless not wanted, of their cycles, over `case`."""
+        kept = ["displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load"]
+        kept += ["mechanical_energy", "stick_power", "slide_power", "damping_power", "load_power", "energy_residual"]
+        of_cycles = ["contact_work", "energy_gain", "stick_time", "detach_time", "turning_point"]
+        parts = []
+        for name in names:
+            rows = self(name).to_dataset()[kept]
+            if cycles:
+                rows = rows.merge(self.cycles(name)[of_cycles].reset_coords(["cycle_start", "cycle_end"]))
+            parts.append(rows)
+        return _cases(dict(zip(names, parts, strict=True)))
+
+
+def energy_of(run: Trajectory) -> Energy:
+    """The ledger, which every case has."""
+    assert run.energy is not None
+    return run.energy
+
+
+def _cases(parts: Mapping[str, xr.Dataset]) -> xr.Dataset:
+    scenes = {name: part.attrs["scene"] for name, part in parts.items()}
+    # Runs of unequal length have instants of their own: rows are numbered, and `t` says when they are.
+    rows = [part.reset_index("t").reset_coords("t").rename_dims(t="row") for part in parts.values()]
+    data = xr.concat(rows, xr.Variable("case", list(parts)), join="outer", combine_attrs="override")
+    data.attrs["scene"] = str(scenes)
+    for variable in data.data_vars.values():
+        variable.encoding = {"zlib": True, "complevel": 1, "shuffle": True}
+    return data

@@ -1,0 +1,117 @@
+"""What all pictures share: colours, labels with units, new figures, and sentences about what cannot be drawn.
+
+Figures are made without `pyplot`, so nothing global is touched. Colours are Okabe and Ito's and matplotlib's perceptually
+uniform maps; lines differ in style as well, so that they are told apart by everyone and in grey.
+"""
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+
+from ..foundation import arguments
+from ..io.datasets import QUANTITIES
+from ..model.structure import Structure
+from ..simulation.trajectory import Trajectory
+
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
+# In an order of falling darkness; with as many dashes as are needed to tell neighbours apart.
+COLOURS = (BLACK, BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+DASHES = ("-", "--", "-.", ":")
+SYMBOLS = {"mu": r" $\mu$", "p": " $p$"}
+
+
+def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
+    """The figure to draw into: the one given, or a new one of this size in inches."""
+    return Figure(figsize=(width, height), layout="constrained") if figure is None else figure
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A label with its unit, none for pure numbers."""
+    return text if unit == "1" else f"{text} ({unit.replace('2', '²')})"
+
+
+def axis_label(name) -> str:
+    """The label of a parameter or result, by the name that fivjax knows it by."""
+    long_name, unit = QUANTITIES.get(str(name), (str(name), "1"))
+    return with_unit(long_name + SYMBOLS.get(str(name), ""), unit)
+
+
+def variable_label(variable: xr.DataArray) -> str:
+    """The label of a variable, from its own attributes."""
+    long_name = variable.attrs.get("long_name", str(variable.name).replace("_", " "))
+    return with_unit(str(long_name), variable.attrs.get("units", "1"))
+
+
+def coordinate_name(structure: Structure, index: int) -> str:
+    """The name of a coordinate, such as x2, or its number where the structure has no names."""
+    names = getattr(structure, "coordinates", None)
+    return str(names[index]) if names else f"coordinate {index}"
+
+
+def coordinate_label(structure: Structure, index: int) -> str:
+    """The name of a coordinate with what it is to the contact: "tangential x2", "normal y2", "y1"."""
+    name = coordinate_name(structure, index)
+    role = {structure.tangential: "tangential", structure.normal: "normal"}.get(index)
+    if role is None:
+        return name
+    return f"{role} {name}" if getattr(structure, "coordinates", None) else role
+
+
+def cell_edges(values: np.ndarray) -> np.ndarray:
+    """The edges of cells around the values of an axis; a single value has a cell of its own, too."""
+    values = np.asarray(values, float)
+    if len(values) == 1:
+        half = 0.5 * abs(values[0]) or 0.5
+        return np.array([values[0] - half, values[0] + half])
+    middle = 0.5 * (values[:-1] + values[1:])
+    return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+
+
+def legend_above(axes: Axes, handles=None, columns: int = 3) -> Legend:
+    """A legend without frame above the right end of a panel, where it hides nothing."""
+    options = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": columns, "frameon": False}
+    return axes.legend(**({} if handles is None else {"handles": handles}), **options)
+
+
+def check_run(run) -> None:
+    """Refuse what is no trajectory, with the call that makes one."""
+    if isinstance(run, xr.Dataset):
+        raise TypeError(
+            "Argument `run` must be a trajectory, as `fj.simulate` returns it, but is a dataset. Pass the trajectory itself; "
+            "of a dataset, maps, modes and the like are drawn by `fj.show(dataset)`."
+        )
+    arguments.instance("run", run, Trajectory, "a trajectory, such as `fj.simulate(scene, 2.0)` returns")
+
+
+def check_runs(runs) -> None:
+    """Refuse what is no collection of trajectories by label."""
+    if not isinstance(runs, dict) or not runs:
+        raise TypeError(
+            'Argument `runs` must be trajectories by label, such as {"3 m/s": run}, but is '
+            f"{'empty' if isinstance(runs, dict) else arguments.describe(runs)}."
+        )
+    for run in runs.values():
+        check_run(run)
+
+
+def check_dataset(dataset, variables: tuple[str, ...], call: str, name: str = "dataset") -> None:
+    """Refuse what does not hold the variables that a picture draws, with the call whose result does."""
+    if isinstance(dataset, xr.Dataset):
+        missing = [variable for variable in variables if variable not in dataset]
+        if not missing:
+            return
+        held = ", ".join(map(str, dataset.data_vars)) or "nothing"
+        described = f"a dataset without `{missing[0]}` (it holds: {held})"
+    else:
+        described = arguments.describe(dataset)
+    raise TypeError(f"Argument `{name}` must be what `{call}` returns, but is {described}.")

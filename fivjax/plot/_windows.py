@@ -1,0 +1,77 @@
+"""Windows of runs with their ledgers, for the pictures of energy."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..simulation.energy import Energy
+from ..simulation.trajectory import Trajectory
+from ._style import BLUE, GREEN, ORANGE, PURPLE, check_run
+from .contact_status import shade_status
+
+Window = tuple[float, float]
+
+STYLES = [(BLUE, "-"), (ORANGE, "--"), (GREEN, "-."), (PURPLE, ":")]
+
+
+def shade(axes: Axes, run: Trajectory, part: slice) -> dict:
+    """`shade_status` over a part of a run; legend entries by name."""
+    shown = Trajectory(**{**vars(run), "t": run.t[part], "status": run.status[part], "energy": None})
+    return {handle.get_label(): handle for handle in shade_status(axes, shown)}
+
+
+def inside(run: Trajectory, window: Window) -> slice:
+    """The rows of a run in a window; refused if it holds no two of them."""
+    check_run(run)
+    start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
+    if end - start < 2:
+        raise ValueError(
+            f"A window must hold several instants of the run, but {window[0]:g} to {window[1]:g} s holds {end - start}; "
+            f"the run goes from {run.t[0]:g} to {run.t[-1]:g} s."
+        )
+    return slice(int(start), int(end))
+
+
+def ledger(run: Trajectory) -> Energy:
+    """The ledger of a run, or a sentence about how to get one."""
+    check_run(run)
+    if run.energy is None:
+        raise ValueError("This picture needs a run with its ledger; ask for it: `simulate(..., energy=True)`.")
+    return run.energy
+
+
+def styles(runs: Mapping) -> list:
+    """A colour and a line style for each run."""
+    return [STYLES[i % len(STYLES)] for i in range(len(runs))]
+
+
+def align_zeros(*pair: Axes) -> None:
+    """Put the zeros of two vertical axes at one height, so that signs can be read off both."""
+    limits = [axes.get_ylim() for axes in pair]
+    spans = [max(abs(low), abs(high)) for low, high in limits]
+    below = max(max(-low, 0.0) / span for (low, _), span in zip(limits, spans, strict=True))
+    above = max(max(high, 0.0) / span for (_, high), span in zip(limits, spans, strict=True))
+    for axes, span in zip(pair, spans, strict=True):
+        axes.set_ylim(-1.05 * below * span, 1.05 * above * span)
+
+
+def legend_between(axes: Axes, entries: list) -> None:
+    """One row of entries between a panel and the one above it."""
+    axes.legend(
+        handles=entries,
+        loc="lower right",
+        bbox_to_anchor=(1, 1),
+        ncols=len(entries),
+        frameon=False,
+        columnspacing=1.2,
+        handlelength=1.6,
+        fontsize="small",
+    )
+
+
+def legend_of_figure(figure: Figure, handles: Mapping) -> None:
+    """One legend above all panels, none where nothing is to be said."""
+    if handles:
+        figure.legend(handles=list(handles.values()), loc="outside upper right", ncols=4, frameon=False)

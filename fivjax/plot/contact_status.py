@@ -1,0 +1,58 @@
+"""The contact's status and the kick, marked in pictures over time."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+
+from ..contact import Status
+from ..model.load import Pulse
+from ..simulation.trajectory import Trajectory
+from ._style import ORANGE, SKY, VERMILION
+
+STATUS_COLOURS = {Status.STICK: ORANGE, Status.DETACH: SKY}
+STATUS_NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}
+# How much of a panel's height the mark of a kick takes, at its top.
+KICK_HEIGHT = 0.045
+
+
+def shade_status(axes: Axes, run: Trajectory) -> list[Patch]:
+    """Shade where the contact sticks or is detached; returns legend entries for what occurs."""
+    handles = []
+    t = np.append(run.t, run.t[-1])
+    for status, colour in STATUS_COLOURS.items():
+        is_on = np.asarray(run.status) == status
+        if not is_on.any():
+            continue
+        hatch = "///" if status == Status.STICK else None
+        # From the first row that has it to the row that has another, so that one row alone is seen too.
+        edges = np.diff(np.concatenate([[False], is_on, [False]]).astype(int))
+        begun, ended = t[np.flatnonzero(edges > 0)], t[np.flatnonzero(edges < 0)]
+        axes.broken_barh(
+            np.stack([begun, ended - begun], axis=1),
+            (0, 1),
+            transform=axes.get_xaxis_transform(),
+            facecolor=colour,
+            edgecolor="none",
+            alpha=0.35,
+            hatch=hatch,
+            lw=0,
+        )
+        handles.append(Patch(facecolor=colour, alpha=0.5, hatch=hatch, label=STATUS_NAMES[status]))
+    return handles
+
+
+def mark_kick(axes: Axes, run: Trajectory) -> list[Patch]:
+    """Mark at the top of a panel when the kick acts; returns its legend entry, none where there is no kick."""
+    load = run.scene.load
+    if not isinstance(load, Pulse) or float(load.p) == 1 or float(load.start) >= run.t[-1]:
+        return []
+    axes.broken_barh(
+        [(float(load.start), float(load.duration))],
+        (1 - KICK_HEIGHT, KICK_HEIGHT),
+        transform=axes.get_xaxis_transform(),
+        facecolor=VERMILION,
+        # In a long run a short kick is still a line wide.
+        edgecolor=VERMILION,
+        lw=1.2,
+    )
+    return [Patch(facecolor=VERMILION, label=f"kick, p = {float(load.p):g}")]

@@ -1,0 +1,86 @@
+"""Bi-stability maps: where sliding returns, and how large the limit cycle is elsewhere."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from ..io.datasets import QUANTITIES
+from ..verdicts.verdict import Verdict
+from ._style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, new_figure, with_unit
+from .thresholds import draw_threshold
+
+SLIDING_SHADE = "#f2f2f2"
+
+
+def bistability(
+    dataset: xr.Dataset, *, critical: xr.Dataset | None = None, value: str = "amplitude", figure: Figure | None = None
+) -> Figure:
+    """A bi-stability map: where sliding returns, and how large the limit cycle is elsewhere.
+
+    **Arguments:** `dataset` from `bistability_map` with two axes (the first is drawn to the right); `critical`, from
+    `critical_perturbation`, drawn over it instead of the map's own, coarser boundary; `value`, what colours the limit
+    cycles: "amplitude", "decided_at", "contact_events" or "last_event".
+
+    **Raises:** `TypeError` for anything but a map, `ValueError` for a map that does not have two axes.
+    """
+    check_dataset(dataset, ("verdict", value), "fj.bistability_map(scene, mu=..., p=...)")
+    names = tuple(map(str, dataset["verdict"].dims))
+    _check_axes(dataset, names)
+    if critical is not None:
+        check_dataset(critical, ("p_crit",), "fj.critical_perturbation(scene, mu=...)", "critical")
+    figure = new_figure(figure, 7.2, 4.8)
+    axes = figure.add_subplot()
+    x, y = (cell_edges(dataset[name].values) for name in names)
+    verdict = dataset["verdict"].values.T
+    sliding = np.ma.masked_where(verdict != Verdict.SLIDING, np.ones_like(verdict, float))
+    axes.pcolormesh(x, y, sliding, cmap=ListedColormap([SLIDING_SHADE]), rasterized=True)
+    cycle = np.ma.masked_where(verdict != Verdict.LIMIT_CYCLE, dataset[value].values.T)
+    mesh = axes.pcolormesh(x, y, cycle, cmap="viridis", rasterized=True)
+    if cycle.count():
+        long_name, unit = QUANTITIES.get(value, (value, "1"))
+        figure.colorbar(mesh, ax=axes, label=with_unit(long_name, unit))
+    open_ = verdict < 0
+    handles = [Patch(facecolor=SLIDING_SHADE, edgecolor="0.6", label="returns to sliding")]
+    if open_.any():
+        marked = np.ma.masked_where(~open_, np.ones_like(verdict, float))
+        axes.pcolormesh(x, y, marked, cmap=ListedColormap([VERMILION]), rasterized=True)
+        handles.append(Patch(facecolor=VERMILION, label=f"no verdict ({int(open_.sum())} of {open_.size})"))
+    boundary = dataset if critical is None else critical
+    if names[1] == "p" and "p_crit" in boundary and boundary["p_crit"].dims == (names[0],):
+        handles += draw_threshold(axes, boundary, names[0], BLACK)
+    limit = dataset.attrs.get("mu_crit")
+    for axis, name in ((axes.axvline, names[0]), (axes.axhline, names[1])):
+        if name == "mu" and limit is not None:
+            axis(limit, color=VERMILION, ls="--", lw=1.4)
+            label = rf"$\mu_\mathrm{{crit}}$ = {limit:.4f} (linear theory)"
+            handles.append(Line2D([], [], color=VERMILION, ls="--", label=label))
+    for set_limits, edges, name in ((axes.set_xlim, x, names[0]), (axes.set_ylim, y, names[1])):
+        _fit(set_limits, edges, limit if name == "mu" else None)
+    axes.set(xlabel=axis_label(names[0]), ylabel=axis_label(names[1]))
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
+    axes.set_title("Bi-stability: colour where a kick leads to a limit cycle")
+    return figure
+
+
+def _check_axes(dataset: xr.Dataset, names: tuple[str, ...]) -> None:
+    if len(names) < 2:
+        raise ValueError(
+            f"A map picture needs two axes, but this map has {len(names)}: {', '.join(names) or 'none'}. Give "
+            f"`fj.bistability_map` a second one, such as `p=np.linspace(1, 4, 64)`."
+        )
+    if len(names) > 2:
+        chosen = ", ".join(f"{name}=0" for name in names[2:])
+        raise ValueError(
+            f"A map picture needs two axes, but this map has {len(names)}: {', '.join(names)}. Select a slice, here the first: "
+            f'`fj.plot.bistability(m.isel({chosen}))`; `m.sel(..., method="nearest")` selects by value.'
+        )
+
+
+def _fit(set_limits, edges: np.ndarray, also: float | None) -> None:
+    low, high = edges[0], edges[-1]
+    if also is not None and high < also < high + 0.1 * (high - low):
+        high = also + 0.02 * (high - low)
+    set_limits(low, high)

@@ -1,0 +1,137 @@
+"""Trajectories over time and in the phase plane (Figs. 8, 9 and 17)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ..foundation import arguments
+from ..io.datasets import QUANTITIES
+from ..simulation.trajectory import Trajectory
+from ._style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    check_run,
+    check_runs,
+    coordinate_label,
+    legend_above,
+    new_figure,
+    with_unit,
+)
+from .contact_status import mark_kick, shade_status
+
+
+def response(
+    run: Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, figure: Figure | None = None
+) -> Figure:
+    """One coordinate over time, with the contact's status shaded and the kick marked at the top.
+
+    **Arguments:** `run`; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, by its number, the
+    tangential one unless given.
+
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity.
+    """
+    check_run(run)
+    figure = new_figure(figure, 8.0, 3.6)
+    axes = figure.add_subplot()
+    coordinate = run.scene.structure.tangential if coordinate is None else coordinate
+    axes.plot(run.t, _of(run, quantity)[:, coordinate], color=BLACK, lw=0.8)
+    handles = [*shade_status(axes, run), *mark_kick(axes, run)]
+    what = f"{coordinate_label(run.scene.structure, coordinate)}, {quantity}"
+    axes.set(xlabel="time (s)", ylabel=with_unit(what, QUANTITIES[quantity][1]), xlim=(run.t[0], run.t[-1]))
+    if handles:
+        legend_above(axes, handles)
+    return figure
+
+
+def phase_plane(
+    runs: Trajectory | Mapping[str, Trajectory], last: float = 0.5, *, figure: Figure | None = None
+) -> Figure:
+    """Tangential velocity over displacement for the `last` seconds of one run or of several by label (Fig. 17)."""
+    runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
+    check_runs(runs)
+    figure = new_figure(figure, 5.6, 4.6)
+    axes = figure.add_subplot()
+    styles = [(GREEN, "-"), (PURPLE, "--"), (BLUE, "-."), (ORANGE, ":"), (VERMILION, "-"), (BLACK, "--")]
+    for (name, run), (colour, line) in zip(runs.items(), styles * (1 + len(runs) // len(styles)), strict=False):
+        tangential = run.scene.structure.tangential
+        end = np.asarray(run.t) >= run.t[-1] - last
+        x, v = np.asarray(run.displacement)[end, tangential], np.asarray(run.velocity)[end, tangential]
+        axes.plot(1e3 * x, v, color=colour, ls=line, lw=0.9, label=name)
+    axes.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
+    if any(runs):
+        # Beside the orbits: they may be anywhere in the plane.
+        legend_above(axes)
+    return figure
+
+
+def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure | None = None) -> Figure:
+    """The load's pulse and the tangential acceleration that answers it (Fig. 8).
+
+    **Arguments:** `run`; `zoom`, a length in s: beside the whole run, so much of it around the kick, whose shape cannot be
+    seen in a long run.
+
+    **Raises:** `TypeError` for anything but a trajectory, `ValueError` for a `zoom` that is not positive.
+    """
+    check_run(run)
+    if zoom is not None:
+        arguments.real_number("zoom", zoom, above=0)
+    figure = new_figure(figure, 8.0 if zoom is None else 9.6, 4.8)
+    width = (1,) if zoom is None else (2, 3)
+    panels = figure.subplots(
+        2, len(width), sharex="col", sharey="row", height_ratios=(1, 2), width_ratios=width, squeeze=False
+    )
+    whole = (float(run.t[0]), float(run.t[-1]))
+    raised = np.flatnonzero(run.load != run.load[-1])
+    begin = float(run.t[raised[0]]) if len(raised) else whole[0]
+    windows = (
+        [whole] if zoom is None else [(max(whole[0], begin - 0.2 * zoom), min(whole[1], begin + 0.8 * zoom)), whole]
+    )
+    tangential = run.scene.structure.tangential
+    for (upper, lower), window in zip(panels.T, windows, strict=True):
+        upper.step(run.t, run.load, where="post", color=VERMILION, lw=1.6)
+        lower.plot(run.t, np.asarray(run.acceleration)[:, tangential], color=BLUE, lw=0.7)
+        mark_kick(lower, run)
+        lower.set(xlabel="time (s)", xlim=window)
+    # Around what the load does, not from zero: a kick of a tenth is to be seen.
+    low, high = float(np.min(run.load)), float(np.max(run.load))
+    room = 0.2 * (high - low) or 0.1 * high
+    panels[0, 0].set(ylabel="load (N)", ylim=(low - room, high + room))
+    panels[1, 0].set_ylabel(with_unit(f"{coordinate_label(run.scene.structure, tangential)},\nacceleration", "m/s2"))
+    if zoom is not None:
+        for upper, name in zip(panels[0], ("around the kick", "whole run"), strict=True):
+            upper.set_title(name, loc="right", fontsize="medium")
+    return figure
+
+
+def comparison(
+    runs: Mapping[str, Trajectory], quantity: str = "acceleration", *, figure: Figure | None = None
+) -> Figure:
+    """The tangential response of several runs by label, each in a row of its own, on one scale (Fig. 9)."""
+    runs = dict(runs) if isinstance(runs, Mapping) else runs
+    check_runs(runs)
+    figure = new_figure(figure, 8.0, 1.2 + 1.9 * len(runs))
+    rows = list(figure.subplots(len(runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0])
+    for axes, (name, run), colour in zip(rows, runs.items(), [BLUE, ORANGE, GREEN, PURPLE] * len(runs), strict=False):
+        tangential = run.scene.structure.tangential
+        axes.plot(run.t, _of(run, quantity)[:, tangential], color=colour, lw=0.7)
+        handles = [Line2D([], [], color=colour, label=name), *shade_status(axes, run), *mark_kick(axes, run)]
+        legend_above(axes, handles, columns=4)
+        label = f"{coordinate_label(run.scene.structure, tangential)},\n{quantity}"
+        axes.set_ylabel(with_unit(label, QUANTITIES[quantity][1]))
+        axes.set_xlim(run.t[0], run.t[-1])
+    rows[-1].set_xlabel("time (s)")
+    return figure
+
+
+def _of(run: Trajectory, quantity: str) -> np.ndarray:
+    if quantity not in ("displacement", "velocity", "acceleration"):
+        raise ValueError(
+            f'Argument `quantity` must be one of "displacement", "velocity", "acceleration", but is {quantity!r}.'
+        )
+    return np.asarray(getattr(run, quantity))
