@@ -8,6 +8,7 @@ import fivjax as fj
 from fivjax.linear import cea, design
 from fivjax.linear.design import DesignOutcome
 from fivjax.linear.outcomes import StabilityOutcome
+from fivjax.plot import linear as plot_linear
 
 ROUTES = ["eigenvalues", "routh-hurwitz"]
 STARTS = np.random.default_rng(2025).uniform(0.0, 1.0, 20)
@@ -76,7 +77,17 @@ def test_a_stiffness_split_moves_the_limit_out_of_the_operating_range():
     assert np.isclose(result.after, expected, rtol=1e-10)
     assert np.isclose(cea.critical_friction(result.structure), result.after, rtol=1e-14)
     assert result.before == pytest.approx(MU_CRIT, rel=1e-12)
-    assert result.history["critical_friction"].sizes == {"step": 61}
+    # The search is content with the target: its history, and the picture of it, end with the design that is returned.
+    limits = result.history["critical_friction"]
+    assert limits.values[-1] == result.after
+    assert np.all(limits.values[:-1] < 0.4)
+    assert limits.attrs["long_name"] == "critical friction"
+    axes = plot_linear.design(result.history).axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        f"returned: {result.after:.6g}",
+        "target: 0.4",
+    ]
+    assert axes.lines[0].get_ydata()[-1] == result.after
 
 
 def test_a_damping_split_cannot_and_says_so():
@@ -84,6 +95,8 @@ def test_a_damping_split_cannot_and_says_so():
         fj.belt_oscillator(), {"c1": (0.1, 1.9)}, tied={"c2": lambda p: 2.0 - p["c1"]}, target=0.4, steps=60
     )
     assert result.outcome is DesignOutcome.TARGET_NOT_REACHED
+    assert result.history.sizes["step"] == 61
+    assert result.history["critical_friction"].values[result.history.attrs["chosen_step"]] == result.after
     # The best split, by brute force: the top of a parabola that falls by 5e-10 within half a step.
     limits = [reference.critical_friction(0.2, 0.24, c1=c1, c2=2.0 - c1) for c1 in np.linspace(0.98, 1.01, 301)]
     assert result.after > MU_CRIT

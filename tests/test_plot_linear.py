@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.figure import Figure
 
 import fivjax as fj
+from fivjax import cli
 from fivjax.linear import cea
 from fivjax.plot import linear as plot_linear
 
@@ -25,6 +27,34 @@ def test_eigenvalues_are_drawn_with_the_limit():
 def test_never_unstable_has_no_mark():
     figure = plot_linear.eigenvalues(cea.modes(fj.belt_oscillator(theta=0.0), mu=np.linspace(0.0, 0.5, 3)))
     assert not figure.axes[1].texts
+
+
+def test_a_sweep_over_one_value_draws_points(tmp_path):
+    """A line through one point is empty axes: `fivjax cea --x mu=0.2:0.2:1` has to show both modes all the same."""
+    assert cli.main(["cea", "--x", "mu=0.2:0.2:1", "--out", str(tmp_path / "one")]) == 0
+    figure = plot_linear.eigenvalues(xr.open_dataset(tmp_path / "one.nc", engine="h5netcdf"))
+    for axes in figure.axes:
+        points = [line for line in axes.lines if len(line.get_xdata()) == 1]
+        assert [line.get_marker() for line in points] == ["o", "o"]
+
+
+def test_a_chart_over_one_value_has_cells():
+    """An axis with one value has a cell around it, and no limit is drawn where none can be."""
+    row = cea.chart(fj.belt_oscillator(), mu=np.linspace(0.0, 0.5, 5), k1=[100e3])
+    figure = plot_linear.chart(row)
+    low, high = figure.axes[0].get_ylim()
+    assert low < 100e3 < high
+    figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize(
+    "call", [plot_linear.eigenvalues, plot_linear.sensitivity, plot_linear.chart, plot_linear.design]
+)
+def test_wrong_objects_are_refused_with_the_call_that_makes_right_ones(call):
+    with pytest.raises(TypeError, match=r"must be (what `fj\.\w+\.\w+\(.*` returns|the `history` of a design)"):
+        call(None)
+    with pytest.raises(TypeError, match="must be"):
+        call(xr.Dataset())
 
 
 @pytest.mark.parametrize("damper", [1.0, 0.0])

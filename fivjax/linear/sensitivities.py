@@ -9,7 +9,8 @@ import numpy as np
 
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
-from ..io.datasets import QUANTITIES, labelled
+from ..foundation.quantities import QUANTITIES
+from ..io.datasets import labelled
 from ..model.structure import Structure
 from .critical import critical_friction, stability_limit
 from .outcomes import Mechanism, StabilityOutcome

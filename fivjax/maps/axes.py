@@ -13,10 +13,12 @@ from ..steppers.base import AbstractStepper
 
 def add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
     """Note the critical friction of linear theory where friction is an axis and nothing else changes it."""
-    changes_it = {*scene.structure.parameters, "belt_speed"} & set(dataset.dims)
-    if "mu" not in dataset.dims or changes_it or float(scene.belt_speed) == 0:
+    changes_it = set(scene.structure.parameters) & set(dataset.dims)
+    # Of the belt's speed only the sign counts.
+    directions = np.unique(np.sign(dataset["belt_speed"] if "belt_speed" in dataset.dims else scene.belt_speed))
+    if "mu" not in dataset.dims or changes_it or len(directions) != 1 or directions[0] == 0:
         return
-    limit = float(critical_friction(scene.structure, direction=1 if scene.belt_speed > 0 else -1))
+    limit = float(critical_friction(scene.structure, direction=int(directions[0])))
     if np.isfinite(limit):
         dataset.attrs["mu_crit"] = limit
 

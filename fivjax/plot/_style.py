@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
 from ..foundation import arguments
-from ..io.datasets import QUANTITIES
+from ..foundation.quantities import QUANTITIES
 from ..model.structure import Structure
 from ..simulation.trajectory import Trajectory
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from ..io.datasets import QUANTITIES
+from ..foundation.quantities import QUANTITIES
 from ..verdicts.verdict import Verdict
 from ._style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, new_figure, with_unit
 from .thresholds import draw_threshold

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..foundation import arguments
-from ..io.datasets import QUANTITIES
+from ..foundation.quantities import QUANTITIES
 from ..simulation.trajectory import Trajectory
 from ._style import (
     BLACK,
