@@ -71,6 +71,7 @@ def test_inputs_and_statements_are_no_numbers(kicks):
         assert {f.kind for f in kicks[0][made].findings} == {Kind.INPUT}
     text = (kicks[1] / "reproduce.md").read_text(encoding="utf-8")
     assert "2 of 3 printed numbers come out as printed;" in text
+    assert kicks[0].summary in text
     assert "15 inputs are taken as printed and not counted." in text
     assert "| Table 1 | spring between the bodies | 101000 N/m | taken as printed | input |" in text
 

@@ -38,9 +38,7 @@ class LimitCycle(eqx.Module):
     residual: float  # how far it is from closing, relative to its size
     crossings: int  # points of the section in one period
     harmonics: Complex[np.ndarray, "count n"]  # lines of the velocities, m/s
-    points: Float[
-        np.ndarray, "k 2n"
-    ]  # of the section, on one period or the torus, as deviations from sliding
+    points: Float[np.ndarray, "k 2n"]  # of the section, on one period or the torus, as deviations from sliding
     return_jacobian: Float[np.ndarray, "2n 2n"]  # of the section's return map over one period
     rotation_number: float | None = None  # of a torus: turns per return
 

@@ -76,9 +76,10 @@ def score(findings: Iterable[Finding]) -> dict[Kind, tuple[int, int]]:
 
 def summary(findings: Iterable[Finding]) -> str:
     """In a sentence how much of what was computed agrees with the paper."""
-    met, numbers = score(findings)[Kind.NUMBER]
-    borne, statements = score(findings)[Kind.STATEMENT]
-    inputs = score(findings)[Kind.INPUT][1]
+    counted = score(findings)
+    met, numbers = counted[Kind.NUMBER]
+    borne, statements = counted[Kind.STATEMENT]
+    inputs = counted[Kind.INPUT][1]
     parts = []
     if numbers:
         parts.append(f"{met} of {numbers} printed numbers come out as printed")

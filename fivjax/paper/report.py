@@ -15,13 +15,22 @@ from .runs import Runs
 REPORT = "reproduce.md"
 
 
+class Reproduction(dict[str, Made]):
+    """What was made, by name of figure or table."""
+
+    @property
+    def summary(self) -> str:
+        """In a sentence how much of what was computed agrees with the paper."""
+        return summary(finding for made in self.values() for finding in made.findings)
+
+
 @in_double_precision
 def reproduce(
     figure: str | int | Sequence[str | int] | None = None,
     out: str | Path | None = None,
     *,
     progress: bool | None = None,
-) -> dict[str, Made]:
+) -> Reproduction:
     """The paper's Figures 2 to 18 and Tables 1 and 2, from its own parameters.
 
         fj.reproduce(3)["3"].picture
@@ -35,7 +44,8 @@ def reproduce(
       `reproduce.md`, which puts each number that the paper prints beside the computed one. Nothing is written unless given.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
 
-    **Returns:** by name, a `Made` with `picture` (a matplotlib figure), `data` (an xarray dataset), `caption` and `findings`.
+    **Returns:** by name, a `Made` with `picture` (a matplotlib figure), `data` (an xarray dataset), `caption` and `findings`;
+    `summary` says in a sentence how much agrees.
 
     **Raises:** `ValueError` for a figure that the paper does not have, or a folder that cannot be written, before any work.
     """
@@ -45,7 +55,7 @@ def reproduce(
         if not out.exists() and out.parent.is_dir():
             out.mkdir()
         check_writable(out / REPORT)
-    runs, made = Runs(), {}
+    runs, made = Runs(), Reproduction()
     bar = tqdm(names, desc="reproduce", unit="figure", disable=None if progress is None else not progress)
     for name in bar:
         bar.set_postfix_str(_file_name(name))

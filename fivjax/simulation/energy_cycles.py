@@ -168,6 +168,8 @@ def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Calla
                 total=(now.ledger, now.contact.status),
                 observe=enter,
                 until=lambda total: count(total[0]) != count(start.ledger),
+                # Cycles end where the tangential velocity rises through zero: inside a segment unless asked for.
+                at_section=True,
                 kind="lax",
             )
             t = jnp.where(found.left <= 0, stop, stop - found.left)
