@@ -1,5 +1,6 @@
 """The explorer without a browser: what sliders do, that nothing is compiled again, what is refused."""
 
+import inspect
 import io
 import sys
 
@@ -11,6 +12,8 @@ from PIL import Image
 
 import fivjax as fj
 from fivjax.io.datasets import labelled
+from fivjax.notebook.map_picture import stale
+from fivjax.notebook.panels import limits
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +28,24 @@ def a_map(scene):
     verdict = (mu[:, None] * p > 0.25).astype(np.int8)
     fields = {"verdict": (("mu", "p"), verdict), "amplitude": (("mu", "p"), 3.0 * verdict)}
     return labelled(xr.Dataset(fields, {"mu": mu, "p": p}), scene)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_verdicts():
+    """A stand-in for what computes verdicts: undecided at once. Compiling the true one would take a quarter of a minute."""
+
+    def undecided(scene, *, t_max=20.0, progress=None, **axes):
+        shape = tuple(map(len, axes.values()))
+        fields = {
+            "verdict": np.full(shape, -1, np.int8),
+            "amplitude": np.zeros(shape),
+            "decided_at": np.full(shape, t_max),
+        }
+        return labelled(xr.Dataset({name: (tuple(axes), x) for name, x in fields.items()}, axes), scene, t_max=t_max)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fivjax.notebook.explore.bistability_map", undecided)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +92,20 @@ def test_what_is_said_is_of_the_scene_shown(explorer, scene):
     assert "μ_crit = 0.2282" in explorer.said.value
 
 
-def test_a_click_opens_the_nearest_lane_exactly(explorer):
-    """A place on the map's picture becomes the nearest lane, exactly, also where a slider's steps pass it by."""
-    axes = explorer._map_axes
+def clicked(explorer, mu: float, p: float) -> None:
+    """A click on the map's picture at this place."""
+    axes = explorer._map.axes
     width, height = axes.figure.canvas.get_width_height()
-    x, y = axes.transData.transform((0.155, 1.65))
-    unmarked = pixels(explorer.map)
-    # The map is of the scene it was made for, so a lane of it has that scene's springs.
-    explorer.sliders["k1"].value = 97e3
+    x, y = axes.transData.transform((mu, p))
     explorer.map.clicked = [x / width, 1 - y / height]
+
+
+def test_a_click_opens_the_nearest_trajectory_exactly(explorer):
+    """A place on the map's picture becomes the nearest trajectory, exactly, also where a slider's steps pass it by."""
+    unmarked = pixels(explorer.map)
+    # The map is of the scene it was made for, so a trajectory of it has that scene's springs.
+    explorer.sliders["k1"].value = 97e3
+    clicked(explorer, 0.155, 1.65)
     assert (explorer.sliders["mu"].value, explorer.sliders["p"].value) == (0.1511, 1.7)
     assert explorer.sliders["k1"].value == 100e3
     assert np.any(pixels(explorer.map) != unmarked)
@@ -89,6 +115,90 @@ def test_a_click_opens_the_nearest_lane_exactly(explorer):
     explorer.sliders["mu"].value = 0.152
     assert explorer._value("mu") == 0.152
     explorer.sliders["mu"].value, explorer.sliders["p"].value = 0.2, 1.3
+
+
+def test_a_click_beside_the_map_opens_nothing(explorer):
+    """A click on the margin, the legend or the colour bar once opened the trajectory of the nearest corner."""
+    before = {name: slider.value for name, slider in explorer.sliders.items()}
+    for place in ([0.01, 0.99], [0.99, 0.5], [0.5, 0.999]):
+        explorer.map.clicked = place
+        assert {name: slider.value for name, slider in explorer.sliders.items()} == before
+
+
+def test_the_verdict_of_what_is_shown_is_shown(explorer):
+    """On the map it is the map's own, at once; elsewhere it is computed, and never the nearest cell's."""
+    clicked(explorer, 0.22, 1.0)
+    assert "verdict: sliding" in explorer.said.value
+    clicked(explorer, 0.22, 2.0)
+    assert "verdict: limit cycle" in explorer.said.value
+    explorer.sliders["mu"].value = 0.2
+    explorer.wait()
+    assert "verdict: undecided" in explorer.said.value
+    explorer.sliders["p"].value = 1.3
+
+
+def test_a_map_of_another_structure_is_veiled_and_computed_anew(explorer, a_map):
+    """With k1 = 103 000 the map still showed the old structure's verdicts beside the new one's trajectory."""
+    whole = pixels(explorer.map)
+    assert explorer.anew.layout.display == "none"
+    explorer.sliders["k1"].value = 103e3
+    assert stale(explorer._map.differences(explorer._shown)) == ("This map is of k1 = 100000;\nshown is k1 = 103000.")
+    assert explorer.anew.layout.display == ""
+    assert pixels(explorer.map).mean() > whole.mean() + 1
+    explorer.wait()
+    assert "verdict: undecided" in explorer.said.value
+    explorer.anew.click()
+    assert explorer.anew.layout.display == "none" and not explorer.anew.disabled
+    assert float(explorer._map.scene.parameters["k1"]) == 103e3
+    # Back at the old structure it is the new map that is of another one.
+    explorer.sliders["k1"].value = 100e3
+    assert explorer.anew.layout.display == ""
+    explorer.anew.click()
+    assert explorer.anew.layout.display == "none"
+
+
+def test_a_map_given_for_another_scene_is_veiled_from_the_start(scene, a_map):
+    found = fj.explorer(scene.replace(k1=103e3), a_map, t1=0.4)
+    assert found.anew.layout.display == ""
+
+
+@pytest.mark.slow
+def test_the_verdict_agrees_with_the_contact_events(scene, monkeypatch):
+    """The map's own engine: a soft kick dies out, and with k1 = 103 000 a hard one does not."""
+    monkeypatch.setattr("fivjax.notebook.explore.bistability_map", fj.bistability_map)
+    found = fj.explorer(scene, t1=0.4)
+    for changes, verdict in (({"p": 1.0}, "sliding"), ({"k1": 103e3, "p": 2.0}, "limit cycle")):
+        for name, value in changes.items():
+            found.sliders[name].value = value
+        found.wait()
+        assert f"verdict: {verdict}" in found.said.value
+        assert ("<br>0 contact events" in found.said.value) == (verdict == "sliding")
+
+
+def test_rounding_is_not_drawn_as_motion(explorer):
+    """At p = 1 nothing moves: the panels showed rounding, 1e-12 m/s², with what the numbers have in common over a label."""
+    assert limits(1e-12 * np.sin(np.arange(9.0)), 0.1) == pytest.approx((-0.05, 0.05))
+    assert limits([0.0, 2.0], 0.1) == pytest.approx((-0.1, 2.1))
+    assert limits([np.nan, np.nan], 0.1) == pytest.approx((-0.05, 0.05))
+    explorer.sliders["p"].value = 1.0
+    figure = inspect.getclosurevars(explorer._panels).nonlocals["canvas"].figure
+    wave, _, _, orbit = (axes.lines[0] for axes in figure.axes)
+    for line in (wave, orbit):
+        axes = line.axes
+        assert np.ptp(line.get_ydata()) < 1e-3 * np.ptp(axes.get_ylim())
+        assert axes.xaxis.get_offset_text().get_text() == ""
+        assert "+" not in axes.yaxis.get_offset_text().get_text()
+        assert max(len(label.get_text()) for label in axes.get_yticklabels()) <= 6
+    assert np.ptp(orbit.get_xdata()) < 1e-3 * np.ptp(orbit.axes.get_xlim())
+    explorer.sliders["p"].value = 1.3
+
+
+def test_sliders_keep_their_width(explorer):
+    """In a window of 900 pixels they shrank to stubs: now the picture moves below them."""
+    beside = explorer.widget.children[0]
+    assert beside.layout.flex_flow == "row wrap"
+    for slider in explorer.sliders.values():
+        assert slider.layout.min_width == slider.layout.width and slider.layout.flex == "0 0 auto"
 
 
 def test_what_the_scene_refuses_is_said(explorer):
@@ -104,7 +214,9 @@ def test_what_the_scene_refuses_is_said(explorer):
 
 def test_missing_widgets_are_named(scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    with pytest.raises(ImportError, match=r"needs ipywidgets.*fivjax\[notebook\]"):
+    with pytest.raises(
+        ImportError, match=r"needs ipywidgets.*`pip install ipywidgets anywidget`.*`pip install \"\.\[notebook\]\"`"
+    ):
         fj.explorer(scene)
 
 

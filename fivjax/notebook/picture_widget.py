@@ -1,4 +1,4 @@
-"""A picture in a notebook that says where it was clicked. Needs anywidget; `explorer` asks for it with a sentence."""
+"""A picture in a notebook that says where it was clicked. Needs anywidget; `explore` says how to get it where it is missing."""
 
 from typing import final
 
@@ -10,14 +10,14 @@ function render({ model, el }) {
   const image = document.createElement("img");
   image.className = "fivjax-" + model.get("name");
   image.style.maxWidth = "100%";
-  if (model.get("clickable")) image.style.cursor = "crosshair";
+  if (model.get("answers_clicks")) image.style.cursor = "crosshair";
   const draw = () => {
     const old = image.src;
     image.src = URL.createObjectURL(new Blob([model.get("png")], { type: "image/png" }));
     if (old) URL.revokeObjectURL(old);
   };
   image.addEventListener("click", (event) => {
-    if (!model.get("clickable")) return;
+    if (!model.get("answers_clicks")) return;
     const box = image.getBoundingClientRect();
     model.set("clicked", [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]);
     model.save_changes();
@@ -37,5 +37,5 @@ class Picture(anywidget.AnyWidget):
     _esm = SCRIPT
     name = traitlets.Unicode().tag(sync=True)
     png = traitlets.Bytes().tag(sync=True)
-    clickable = traitlets.Bool(False).tag(sync=True)
+    answers_clicks = traitlets.Bool(False).tag(sync=True)
     clicked = traitlets.List().tag(sync=True)

@@ -1,0 +1,78 @@
+"""The explorer's map: drawn once, marked where the sliders are, veiled where it is of another scene, answering clicks."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from ..model.scene import Scene
+from ..plot import results as plot
+from ..plot.results import VERMILION
+from ..verdicts.verdict import Verdict
+from .panels import png
+
+
+class MapPicture:
+    """A map of two axes, with the scene that it was made for: the dataset's own where that is known, else the one given."""
+
+    def __init__(self, dataset: xr.Dataset, scene: Scene):
+        self.dataset = dataset
+        self.scene = Scene.from_dataset(dataset) if "scene" in dataset.attrs else scene
+        self.values = {str(name): dataset[name].values for name in dataset["verdict"].dims}
+        figure = plot.bistability(dataset)
+        self._canvas = FigureCanvasAgg(figure)
+        self._canvas.draw()
+        self.axes = figure.axes[0]
+        self._drawn = self._canvas.copy_from_bbox(figure.bbox)
+        (self._mark,) = self.axes.plot([], [], "o", ms=10, mfc="none", mec=VERMILION, mew=2.5, animated=True)
+        self._veil = self.axes.axhspan(0, 1, color="white", alpha=0.75, animated=True)
+        self._veil.set(transform=self.axes.transAxes)
+        place = {"ha": "center", "va": "center", "transform": self.axes.transAxes, "wrap": True}
+        self._words = self.axes.text(0.5, 0.5, "", **place, animated=True, weight="bold")
+
+    def differences(self, scene: Scene) -> dict[str, tuple[float | None, float | None]]:
+        """What a scene has otherwise than the map's, beside the map's axes: by name, the map's value and the scene's."""
+        ours, theirs = ({name: float(x) for name, x in one.parameters.items()} for one in (self.scene, scene))
+        names = [name for name in dict.fromkeys([*ours, *theirs]) if name not in self.values]
+        return {name: (ours.get(name), theirs.get(name)) for name in names if ours.get(name) != theirs.get(name)}
+
+    def verdict(self, scene: Scene) -> tuple[Verdict, float] | None:
+        """The verdict of a scene that the map holds exactly, and when it was decided (s); None for any other scene."""
+        at = {name: float(scene.parameters[name]) for name in self.values if name in scene.parameters}
+        if self.differences(scene) or any(not np.any(self.values[name] == x) for name, x in at.items()):
+            return None
+        found = self.dataset.sel(at)
+        when = float(found["decided_at"]) if "decided_at" in found else np.nan
+        return Verdict(int(found["verdict"])), when
+
+    def marked(self, scene: Scene) -> bytes:
+        """The map as PNG, with the scene's place marked; veiled, and with words over it, where it is of another scene."""
+        self._canvas.restore_region(self._drawn)
+        different = self.differences(scene)
+        if different:
+            self._words.set_text(stale(different))
+            self.axes.draw_artist(self._veil)
+            self.axes.draw_artist(self._words)
+        else:
+            self._mark.set_data(*([float(scene.parameters[name])] for name in self.values))
+            self.axes.draw_artist(self._mark)
+        return png(self._canvas)
+
+    def nearest(self, right: float, down: float) -> dict[str, float] | None:
+        """The map's values nearest to a place, given as shares of the picture's width and height; None beside the map."""
+        width, height = self._canvas.get_width_height()
+        place = right * width, (1 - down) * height
+        if not self.axes.bbox.contains(*place):
+            return None
+        at = self.axes.transData.inverted().transform(place)
+        return {
+            name: float(values[np.argmin(np.abs(values - value))])
+            for (name, values), value in zip(self.values.items(), at, strict=True)
+        }
+
+
+def stale(different: dict[str, tuple[float | None, float | None]]) -> str:
+    """What is said over a map that is of another scene than the one shown."""
+    ours, theirs = (
+        ", ".join(f"{name} = {pair[k]:g}" for name, pair in different.items() if pair[k] is not None) for k in (0, 1)
+    )
+    return f"This map is of {ours or 'another friction law'};\nshown is {theirs or 'another friction law'}."

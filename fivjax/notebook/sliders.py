@@ -1,0 +1,55 @@
+"""The explorer's sliders: which parameters have one, over what range, in what steps, and how they stand beside a picture."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..foundation.quantities import QUANTITIES
+from ..model.scene import Scene
+
+FIRST = ("mu", "mu_static", "mu_dynamic", "p", "belt_speed")
+RANGES = {
+    "mu": (0.0, 0.6),
+    "mu_static": (0.0, 0.8),
+    "mu_dynamic": (0.0, 0.8),
+    "p": (1.0, 3.0),
+    "belt_speed": (0.1, 10.0),
+}
+# What a structure's parameters range over, as shares of their own values.
+SHARES = (0.5, 1.5)
+# A slider keeps its width however narrow the notebook is: the picture moves below it instead.
+SLIDER = {"width": "330px", "min_width": "330px", "flex": "0 0 auto"}
+BESIDE = {"flex_flow": "row wrap", "align_items": "flex-start"}
+PICTURE = {"flex": "1 1 480px", "max_width": "680px"}
+
+
+def parameters_shown(scene: Scene, also: Mapping) -> list[str]:
+    """The names of the parameters that have a slider, in order."""
+    names = [name for name in FIRST if name in scene.parameters] + list(scene.structure.parameters)
+    return list(dict.fromkeys([*names, *also]))
+
+
+def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
+    """A slider for one parameter; it reaches its own value and both ends of the map's axis of that name."""
+    low, high = ranges.get(name) or RANGES.get(name) or tuple(share * value for share in SHARES)
+    reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
+    low, high = float(min(low, *reached)), float(max(high, *reached))
+    if low == high:
+        high = low + 1.0
+    # Steps of 1, 2 or 5 times a power of ten, at least five hundred of them: a value that was typed lies on one.
+    finest = (high - low) / 500
+    power = 10.0 ** np.floor(np.log10(finest))
+    step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
+    # A browser rounds to steps from the lower end; the scene's own value has to be one of them.
+    low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
+    unit = QUANTITIES[name][1] if name in QUANTITIES else "1"
+    return widgets.FloatSlider(
+        value,
+        min=low,
+        max=high,
+        step=step,
+        description=name if unit == "1" else f"{name} ({unit})",
+        readout_format=f".{max(0, -int(np.floor(np.log10(step) + 1e-9)))}f",
+        style={"description_width": "9em"},
+        layout=SLIDER,
+    )
