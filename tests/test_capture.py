@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fivjax.contact import Status
-from fivjax.verdicts.capture import Returned, adapted_norm, free_on_section, neighbourhood
+from fivjax.verdicts.capture import Returned, adapted_norm, free_on_section, neighbourhood, trial
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
 WEIGHTS = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
@@ -31,7 +31,7 @@ def found(matrix, returned):
     jacobian = np.zeros((6, 6))
     scale = WEIGHTS[FREE]
     jacobian[np.ix_(FREE, FREE)] = matrix / scale[:, None] * scale
-    return neighbourhood(CENTRE, *SLIDING, jacobian, WEIGHTS, FREE, returned)
+    return neighbourhood(trial(CENTRE, *SLIDING, jacobian, WEIGHTS, FREE), returned)
 
 
 def test_the_section_and_the_contact_mode_hold_their_coordinates():

@@ -112,23 +112,46 @@ def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray
         return None
 
 
-def neighbourhood(
+class Trial(NamedTuple):
+    """A stable cycle with the norm of the module's text, about which a neighbourhood is sought."""
+
+    centre: Float[np.ndarray, " 2n"]
+    status: int
+    direction: float
+    norm: Float[np.ndarray, "2n 2n"]
+    steps: Float[np.ndarray, "m 2n"]  # deviations of the points to be checked, for a radius of one
+    sizes: Float[np.ndarray, " m"]  # of these, in the norm
+    allowed: float  # the contraction asked for
+    largest: float  # the radius to begin with
+
+    def states(self, radius: float) -> Float[np.ndarray, "1+m 2n"]:
+        """Where the return map is to be evaluated: the centre, to compare with, and the points."""
+        return np.concatenate([self.centre[None], self.centre + radius * self.steps])
+
+    def passed(self, radius: float, images: Returned) -> Neighbourhood | None:
+        """The neighbourhood of this radius, if the images of `states` show that it is one."""
+        ratios = np.linalg.norm((images.y[1:] - self.centre) @ self.norm.T, axis=1) / (radius * self.sizes)
+        alike = _same_mode(images.status, images.direction, self.status, self.direction)
+        # Not a number is not below anything.
+        if not (np.all(alike & (images.events == images.events[0])) and np.all(ratios <= self.allowed)):
+            return None
+        contraction = float(np.max(ratios))
+        return Neighbourhood(self.centre, self.status, self.direction, self.norm, radius, contraction, len(self.sizes))
+
+
+def trial(
     centre: Float[np.ndarray, " 2n"],
     status: int,
     direction: float,
     jacobian: Float[np.ndarray, "2n 2n"],
     weights: Float[np.ndarray, " 2n"],
     free: Int[np.ndarray, " f"],
-    returned: ReturnMap,
-) -> Neighbourhood | None:
-    """The largest of a halving series of ellipsoids that the return map is checked to contract into itself.
+) -> Trial | None:
+    """What is to be checked about a cycle; none where it is not stable by a margin.
 
     **Arguments:** `centre`, the cycle's state on the section; `status` and `direction`, its contact mode; `jacobian`, the
-    derivative of the return map `returned` there; `weights` of the state's coordinates, and the places `free` on the section
+    derivative of the return map there; `weights` of the state's coordinates, and the places `free` on the section
     (`free_on_section`). States are deviations from the sliding equilibrium.
-
-    **Returns:** none where the cycle is not stable by a margin, or no ellipsoid of at least `SMALLEST` of the cycle's size
-    passes: what comes near such a cycle stays undecided.
     """
     scale = weights[free]
     found = adapted_norm(scale[:, None] * jacobian[np.ix_(free, free)] / scale)
@@ -136,7 +159,6 @@ def neighbourhood(
     if found is None or size == 0:
         return None
     root, rate = found
-    allowed = 0.5 * (1 + rate)
     directions = _directions(len(free))
     shells = np.concatenate([share * directions for share in SHELLS])
     # Of unit size in the norm, as deviations of the state.
@@ -145,14 +167,22 @@ def neighbourhood(
     norm = np.diag(weights)
     norm[np.ix_(free, free)] = root * scale
     sizes = np.linalg.norm(shells, axis=1)
-    radius = LARGEST * size
-    while radius >= SMALLEST * size:
-        # The centre comes first, to be compared with.
-        images = returned(np.concatenate([centre[None], centre + radius * steps]))
-        ratios = np.linalg.norm((images.y[1:] - centre) @ norm.T, axis=1) / (radius * sizes)
-        alike = _same_mode(images.status, images.direction, status, direction) & (images.events == images.events[0])
-        if np.all(alike) and np.all(ratios <= allowed):  # not a number is not below anything
-            return Neighbourhood(centre, status, direction, norm, radius, float(np.max(ratios)), len(shells))
+    return Trial(centre, status, direction, norm, steps, sizes, 0.5 * (1 + rate), LARGEST * size)
+
+
+def neighbourhood(attempt: Trial | None, returned: ReturnMap) -> Neighbourhood | None:
+    """The largest of a halving series of ellipsoids that the return map is checked to contract into itself.
+
+    None where there is nothing to be tried, or no ellipsoid of at least `SMALLEST` of the cycle's size passes: what comes near
+    such a cycle stays undecided.
+    """
+    if attempt is None:
+        return None
+    radius = attempt.largest
+    while radius >= SMALLEST / LARGEST * attempt.largest:
+        found = attempt.passed(radius, returned(attempt.states(radius)))
+        if found is not None:
+            return found
         radius = 0.5 * radius
     return None
 
