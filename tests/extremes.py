@@ -1,4 +1,4 @@
-"""Lanes drawn over the ranges that fivjax claims to handle, and what an independent solver says of one of them."""
+"""Trajectories drawn over the ranges that fivjax claims to handle, and what an independent solver says of one of them."""
 
 import math
 
@@ -12,7 +12,7 @@ RANGES = {
     "belt_speed": (1e-6, 1e4, "decades"),
     "theta": (-1.2, 1.2, "even"),
     "mu": (0.0, 3.0, "even"),
-    "mu_static": (1.0, 5.0, "even"),  # relative to mu; half of all lanes have one coefficient only
+    "mu_static": (1.0, 5.0, "even"),  # relative to mu; half of all trajectories have one coefficient only
     "p": (0.0, 1000.0, "kick"),
     "damping": (0.0, 1e2, "damping"),  # of each spring with its mass, relative to critical
     "mass_ratio": (1e-6, 1e6, "decades"),
@@ -21,7 +21,7 @@ RANGES = {
     "duration": (1e-9, 1e9, "decades"),
     "restitution": (0.0, 1.0, "even"),
 }
-# A share of all lanes has one of these instead.
+# A share of all trajectories has one of these instead.
 CORNERS = {
     "theta": (0.0, -1.2, 1.2),
     "mu": (0.0, 3.0, 0.227),
@@ -37,7 +37,7 @@ M1, K1 = 0.53, 1e5
 
 
 def draw(count: int, seed: int, corners: float = 0.2) -> dict[str, np.ndarray]:
-    """Parameters of a belt oscillator with friction that does not fall, by the names of a scene; one lane per element."""
+    """Parameters of a belt oscillator with friction that does not fall, by the names of a scene; one trajectory per element."""
     rng = np.random.default_rng(seed)
     found = {}
     for name, (low, high, kind) in RANGES.items():
@@ -77,32 +77,32 @@ def draw_falling(count: int, seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def row(lanes: dict[str, np.ndarray], index: int) -> dict[str, float]:
-    return {name: float(values[index]) for name, values in lanes.items()}
+def row(trajectories: dict[str, np.ndarray], index: int) -> dict[str, float]:
+    return {name: float(values[index]) for name, values in trajectories.items()}
 
 
-def scene(lane: dict[str, float]) -> fj.Scene:
-    if "decay" in lane:
-        return FALLING.replace(**lane)
-    return CONSTANT.replace(**{"mu_static": lane["mu"], **lane})
+def scene(trajectory: dict[str, float]) -> fj.Scene:
+    if "decay" in trajectory:
+        return FALLING.replace(**trajectory)
+    return CONSTANT.replace(**{"mu_static": trajectory["mu"], **trajectory})
 
 
 CONSTANT = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.2), 3.0, fj.Pulse(100.0, 1.2))
 FALLING = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.2, 0.5), 3.0, fj.Pulse(100.0, 1.2))
 
 
-def slow_period(lane: dict[str, float]) -> float:
+def slow_period(trajectory: dict[str, float]) -> float:
     """The longest of the periods that its masses and springs could make, s."""
-    return 2 * math.pi * math.sqrt((lane["m1"] + lane["m2"]) / min(lane["k1"], lane["k2"]))
+    return 2 * math.pi * math.sqrt((trajectory["m1"] + trajectory["m2"]) / min(trajectory["k1"], trajectory["k2"]))
 
 
-def fastest_rate(lane: dict[str, float]) -> float:
+def fastest_rate(trajectory: dict[str, float]) -> float:
     """Of the free structure, overdamped motion included, rad/s."""
-    matrices = model(lane)
+    matrices = model(trajectory)
     inverse, n = np.linalg.inv(matrices.mass), len(matrices.mass)
     generator = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ matrices.stiffness, -inverse @ matrices.damping]])
     return float(np.max(np.abs(np.linalg.eigvals(generator))))
 
 
-def model(lane: dict[str, float]) -> oracle.Model:
-    return oracle.paper_model(**lane)
+def model(trajectory: dict[str, float]) -> oracle.Model:
+    return oracle.paper_model(**trajectory)

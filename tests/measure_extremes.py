@@ -1,10 +1,10 @@
 """What holds at the extremes: the README's table and figures.
 
-    python tests/measure_extremes.py [lanes] [confirm] [energy] [table] [resume] [refusals]
+    python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [resume] [refusals]
 
-Each word picks one study; without any, all run. `EXTREMES_LANES` sets how many lanes are drawn (100,000 unless given),
+Each word picks one study; without any, all run. `EXTREMES_TRAJECTORIES` sets how many trajectories are drawn (100,000 unless given),
 `EXTREMES_ASKED` of about how many of them `confirm` asks the reference (300 unless given).
-`confirm` needs no `lanes` before it; both keep what they ran in the temporary folder. The reference is `tests/oracle.py`.
+`confirm` needs no `trajectories` before it; both keep what they ran in the temporary folder. The reference is `tests/oracle.py`.
 """
 
 import itertools
@@ -34,20 +34,20 @@ from fivjax.simulation.trajectory import start_state, states_at
 from fivjax.steppers.base import MOST_ADVANCES
 from fivjax.verdicts.verdict import Verdict
 
-COUNT = int(os.environ.get("EXTREMES_LANES", "100000"))
+COUNT = int(os.environ.get("EXTREMES_TRAJECTORIES", "100000"))
 ASKED = int(os.environ.get("EXTREMES_ASKED", "300"))
 T_MAX, MAX_STEPS = 20.0, 2048
 SURE = 0.1  # share of a difference that the reference's own uncertainty must not reach
-PATIENCE = 5  # s that the oracle gets for one lane
+TIME_LIMIT = 5  # s that the oracle gets for one trajectory
 TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest step of its own
 
 
-def decided(lanes: dict, energy: bool = False) -> Verdicts:
-    start = extremes.FALLING if "decay" in lanes else extremes.CONSTANT
+def decided(trajectories: dict, energy: bool = False) -> Verdicts:
+    start = extremes.FALLING if "decay" in trajectories else extremes.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
         return engine.run_to_verdict(
             start,
-            lanes,
+            trajectories,
             fj.EventExact(),
             t_max=T_MAX,
             memory=2e9,
@@ -59,20 +59,20 @@ def decided(lanes: dict, energy: bool = False) -> Verdicts:
 
 
 def drawn() -> list[tuple[dict, np.ndarray, np.ndarray]]:
-    """All lanes, those with falling friction apart, with their verdicts and last events: run once, then kept in a file."""
+    """All trajectories, those with falling friction apart, with their verdicts and last events: run once, then kept in a file."""
     falling = COUNT // 25
     draws = [extremes.draw(COUNT - falling, seed=1), extremes.draw_falling(falling, seed=6)]
     kept = Path(tempfile.gettempdir()) / f"fivjax-extremes-{COUNT}.npz"
     if not kept.exists():
-        outcomes = [decided(lanes) for lanes in draws]
-        columns = {f"verdict{k}": outcome.verdict for k, outcome in enumerate(outcomes)}
-        columns |= {f"last{k}": outcome.last_event for k, outcome in enumerate(outcomes)}
-        columns |= {f"amplitude{k}": outcome.amplitude for k, outcome in enumerate(outcomes)}
+        all_verdicts = [decided(trajectories) for trajectories in draws]
+        columns = {f"verdict{k}": verdicts.verdict for k, verdicts in enumerate(all_verdicts)}
+        columns |= {f"last{k}": verdicts.last_event for k, verdicts in enumerate(all_verdicts)}
+        columns |= {f"amplitude{k}": verdicts.amplitude for k, verdicts in enumerate(all_verdicts)}
         np.savez(kept, **columns)
     with np.load(kept) as columns:
         unfit = [np.sum((columns[f"verdict{k}"] >= 0) & ~np.isfinite(columns[f"amplitude{k}"])) for k in (0, 1)]
-        print(f"decided lanes with numbers that are not finite: {sum(unfit)}")
-        return [(lanes, columns[f"verdict{k}"], columns[f"last{k}"]) for k, lanes in enumerate(draws)]
+        print(f"decided trajectories with numbers that are not finite: {sum(unfit)}")
+        return [(trajectories, columns[f"verdict{k}"], columns[f"last{k}"]) for k, trajectories in enumerate(draws)]
 
 
 def counts(verdict: np.ndarray) -> str:
@@ -80,11 +80,13 @@ def counts(verdict: np.ndarray) -> str:
     return ", ".join(f"{count} {name}" for name, count in found.items())
 
 
-def lanes_() -> None:
-    """Lanes over all ranges at once: each has a status."""
+def trajectories_() -> None:
+    """Trajectories over all ranges at once: each has a status."""
     begin = time.perf_counter()
     for name, (_, verdict, _) in zip(("friction that does not fall", "falling friction"), drawn(), strict=True):
-        print(f"{name}, {len(verdict)} lanes: {counts(verdict)}; none: {int(np.sum(verdict == Verdict.NOT_RUN))}")
+        print(
+            f"{name}, {len(verdict)} trajectories: {counts(verdict)}; none: {int(np.sum(verdict == Verdict.NOT_RUN))}"
+        )
     print(f"{time.perf_counter() - begin:.0f} s")
 
 
@@ -100,7 +102,7 @@ def limited(function, *arguments):
 
     before = signal.signal(signal.SIGALRM, stop)
     # Again and again: an exception inside a callback of the interpreter's is swallowed.
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE, 1.0)
+    signal.setitimer(signal.ITIMER_REAL, TIME_LIMIT, 1.0)
     try:
         return function(*arguments)
     except (TooSlow, oracle.ZenoError, RuntimeError, ValueError, IndexError, FloatingPointError, MemoryError):
@@ -117,9 +119,9 @@ def painleve(model: oracle.Model) -> bool:
     return inverse[n, n] <= model.friction.static * abs(inverse[n, t])
 
 
-def judged(lane: dict, verdict: int, last_event: float) -> bool | None:
-    """Whether the independent solver confirms a lane's status or its reason; None where it cannot say."""
-    model = extremes.model(lane)
+def judged(trajectory: dict, verdict: int, last_event: float) -> bool | None:
+    """Whether the independent solver confirms a trajectory's status or its reason; None where it cannot say."""
+    model = extremes.model(trajectory)
     with np.errstate(all="ignore"):
         if verdict == Verdict.PAINLEVE:
             return painleve(model)
@@ -135,21 +137,21 @@ def judged(lane: dict, verdict: int, last_event: float) -> bool | None:
                 return None
             return found.kind == {0: "sliding", 1: "limit cycle"}[verdict]
         if verdict == Verdict.UNBOUNDED:
-            follow = oracle.simulate if "decay" in lane else oracle.propagate
+            follow = oracle.simulate if "decay" in trajectory else oracle.propagate
             run = limited(follow, model, 2 * T_MAX, np.linspace(T_MAX, 2 * T_MAX, 20))
             if run is None:
                 return None
             sticks = np.all(run.status == oracle.STICK) and all(event[0] < T_MAX for event in run.events)
-            return bool((sticks and wedged(model)) or run.N[-1] > 1e9 * model.load.force)
+            return bool((sticks and jammed(model)) or run.N[-1] > 1e9 * model.load.force)
         if verdict == Verdict.TOO_MANY_EVENTS:
             return endless(model, last_event)
-        if verdict == Verdict.STEP_FAILURE and T_MAX * extremes.fastest_rate(lane) / TURN_OF_A_STEP <= MAX_STEPS:
+        if verdict == Verdict.STEP_FAILURE and T_MAX * extremes.fastest_rate(trajectory) / TURN_OF_A_STEP <= MAX_STEPS:
             return False
-        # Neither status says where the lane ends; the state on the way there is the same.
-        return same_state(lane, model)
+        # Neither status says where the trajectory ends; the state on the way there is the same.
+        return same_state(trajectory, model)
 
 
-def wedged(model: oracle.Model) -> bool:
+def jammed(model: oracle.Model) -> bool:
     """Whether the belt, carrying the stuck contact along slowly, raises N faster than T asks for, from the springs alone."""
     rest = np.flatnonzero(~np.isin(np.arange(len(model.mass)), [model.tangential, model.normal]))
     shift = np.zeros(len(model.mass))
@@ -161,7 +163,7 @@ def wedged(model: oracle.Model) -> bool:
 
 
 def endless(model: oracle.Model, last_event: float) -> bool | None:
-    """Whether events accumulate for the independent solver too, at the instant at which they did for the lane."""
+    """Whether events accumulate for the independent solver too, at the instant at which they did for the trajectory."""
 
     def accumulate() -> bool:
         try:
@@ -173,15 +175,15 @@ def endless(model: oracle.Model, last_event: float) -> bool | None:
     return limited(accumulate)
 
 
-def same_state(lane: dict, model: oracle.Model) -> bool | None:
+def same_state(trajectory: dict, model: oracle.Model) -> bool | None:
     """Whether both solvers are in the same state after three slow periods, or sixty of the fastest if that is less."""
-    t1 = min(T_MAX, 3 * extremes.slow_period(lane), 60 * 2 * np.pi / extremes.fastest_rate(lane))
+    t1 = min(T_MAX, 3 * extremes.slow_period(trajectory), 60 * 2 * np.pi / extremes.fastest_rate(trajectory))
     run = limited(oracle.simulate, model, t1, np.array([0.0, t1]))
     if run is None or len(run.q) < 2:
         return None
-    ours = fj.simulate(extremes.scene(lane), t1, t1)
+    ours = fj.simulate(extremes.scene(trajectory), t1, t1)
     length = np.max(np.abs(run.q))
-    speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / extremes.slow_period(lane))
+    speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / extremes.slow_period(trajectory))
 
     def apart(q, v):
         return max(np.max(np.abs(q - run.q[-1])) / length, np.max(np.abs(v - run.v[-1])) / speed)
@@ -197,35 +199,39 @@ def same_state(lane: dict, model: oracle.Model) -> bool | None:
     return False
 
 
-def at_corners(lanes: dict) -> np.ndarray:
-    """How many of a lane's parameters lie on a corner of the ranges."""
-    return sum(np.isin(lanes[name], extremes.CORNERS[name]).astype(int) for name in extremes.CORNERS if name in lanes)
+def at_corners(trajectories: dict) -> np.ndarray:
+    """How many of a trajectory's parameters lie on a corner of the ranges."""
+    return sum(
+        np.isin(trajectories[name], extremes.CORNERS[name]).astype(int)
+        for name in extremes.CORNERS
+        if name in trajectories
+    )
 
 
 def confirm(count: int = ASKED) -> None:
-    """Lanes of every status, half of each from the corners, by the independent solver."""
-    (lanes, verdict, last), (falling, falling_verdict, falling_last) = drawn()
-    groups = [(lanes, verdict, last, code) for code in np.unique(verdict)]
+    """Trajectories of every status, half of each from the corners, by the independent solver."""
+    (trajectories, verdict, last), (falling, falling_verdict, falling_last) = drawn()
+    groups = [(trajectories, verdict, last, code) for code in np.unique(verdict)]
     groups += [(falling, falling_verdict, falling_last, code) for code in np.unique(falling_verdict)]
     rng, each = np.random.default_rng(3), -(-count // len(groups))
     total = 0
-    for lanes, verdict, last, code in groups:
+    for trajectories, verdict, last, code in groups:
         members = rng.permutation(np.flatnonzero(verdict == code))
         # From the corners inwards, and any, in turn.
-        cornered = members[np.argsort(-at_corners(lanes)[members], kind="stable")]
+        cornered = members[np.argsort(-at_corners(trajectories)[members], kind="stable")]
         chosen = list(dict.fromkeys(np.stack([cornered, members], axis=1).ravel()))[: 2 * each]
         answers = []
         for index in chosen:
-            lane = extremes.row(lanes, index)
-            answers.append(judged(lane, int(code), float(last[index])))
+            trajectory = extremes.row(trajectories, index)
+            answers.append(judged(trajectory, int(code), float(last[index])))
             if answers[-1] is False:
-                print("contradicted:", Verdict(int(code)).name, lane, flush=True)
+                print("contradicted:", Verdict(int(code)).name, trajectory, flush=True)
             if sum(answer is not None for answer in answers) >= each:
                 break
         tally = {word: answers.count(word) for word in (True, False, None)}
         total += tally[True]
         print(
-            f"{Verdict(int(code)).name.lower():>16}{' (falling)' if 'decay' in lanes else '':10}: {tally[True]} confirmed, "
+            f"{Verdict(int(code)).name.lower():>16}{' (falling)' if 'decay' in trajectories else '':10}: {tally[True]} confirmed, "
             f"{tally[False]} contradicted, {tally[None]} on which the reference gave up",
             flush=True,
         )
@@ -233,26 +239,26 @@ def confirm(count: int = ASKED) -> None:
 
 
 def energy(count: int = 8192) -> None:
-    """The residual of the balance in units of the energy exchanged (net, by line), over every finished lane."""
+    """The residual of the balance in units of the energy exchanged (net, by line), over every finished trajectory."""
     count = min(COUNT, count)
     draws = {
         "friction that does not fall": extremes.draw(count, seed=4),
         "falling friction": extremes.draw_falling(count // 8, seed=9),
     }
-    for name, lanes in draws.items():
-        outcome = decided(lanes, energy=True)
-        finished = (outcome.verdict >= 0) | (outcome.verdict == Verdict.UNDECIDED)
-        residual, through = outcome.energy["energy_residual"], outcome.energy["energy_exchanged"]
+    for name, trajectories in draws.items():
+        verdicts = decided(trajectories, energy=True)
+        finished = (verdicts.verdict >= 0) | (verdicts.verdict == Verdict.UNDECIDED)
+        residual, through = verdicts.energy["energy_residual"], verdicts.energy["energy_exchanged"]
         moved = finished & (through > 0)
         share = np.where(moved, residual / np.where(moved, through, 1.0), 0.0)
         print(
-            f"{name}: {int(finished.sum())} of {len(share)} lanes finished, {int(moved.sum())} of them exchanged energy; residual "
+            f"{name}: {int(finished.sum())} of {len(share)} trajectories finished, {int(moved.sum())} of them exchanged energy; residual "
             f"≤ 1e-8 of it on {np.mean(share[moved] <= 1e-8):.3%}, median {np.median(share[moved]):.0e}, worst {share.max():.0e}"
         )
         beyond = np.flatnonzero(share > 1e-8)
         for index in beyond[np.argsort(-share[beyond])]:
-            lane = extremes.row(lanes, index)
-            print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in lane.items()})
+            trajectory = extremes.row(trajectories, index)
+            print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in trajectory.items()})
 
 
 PAPER = dict(belt_speed=3.0, theta=0.01, mu=0.227, p=1.3, c1=1.0, c2=1.0, m1=0.53, m2=0.045, k1=1e5, k2=1.01e5,
@@ -406,7 +412,7 @@ def refusals() -> None:
 
 
 STUDIES = {
-    "lanes": lanes_,
+    "trajectories": trajectories_,
     "confirm": confirm,
     "energy": energy,
     "table": table,

@@ -61,7 +61,7 @@ def table2() -> None:
 
 
 def map_() -> None:
-    """The paper's map, 64 × 64, and 200 of its lanes by the oracle."""
+    """The paper's map, 64 × 64, and 200 of its trajectories by the oracle."""
     m = paper_map(64)
     print("64 × 64:", {name: count for name, count in json.loads(m.attrs["counts"]).items() if count})
     kinds = {0: "sliding", 1: "limit cycle"}
@@ -75,11 +75,11 @@ def map_() -> None:
         open_ += verdict < 0
         agree += verdict >= 0 and kind == kinds[verdict]
         differ += verdict >= 0 and kind != kinds[verdict]
-    print(f"oracle: {agree} lanes agree, {differ} differ, {open_} undecided")
+    print(f"oracle: {agree} trajectories agree, {differ} differ, {open_} undecided")
 
 
 def speed() -> None:
-    """Maps of two sizes: wall time, that of all cores, and lane-cycles (one trajectory over 1/68 s) per second."""
+    """Maps of two sizes: wall time, that of all cores, and trajectory-cycles (one trajectory over 1/68 s) per second."""
     for points, calls in ((64, ("first call", "warm", "warm", "warm")), (256, ("warm", "warm"))):
         for call in calls:
             begin, cores = time.perf_counter(), time.process_time()
@@ -88,7 +88,7 @@ def speed() -> None:
             undecided = np.asarray(m["verdict"] < 0)
             cycles = 68 * np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"]).sum()
             print(
-                f"{points} × {points}, {call}: {wall:.1f} s ({cores:.1f} s of cores), {cycles / wall:.2g} lane-cycles/s, "
+                f"{points} × {points}, {call}: {wall:.1f} s ({cores:.1f} s of cores), {cycles / wall:.2g} trajectory-cycles/s, "
                 f"{cycles / cores:.2g} per core; undecided {undecided.mean():.2%}, "
                 f"farthest from a boundary in p: {_farthest(m, undecided):.1g}",
                 flush=True,
@@ -96,13 +96,13 @@ def speed() -> None:
 
 
 def _farthest(m, undecided: np.ndarray) -> float:
-    """How far in p an undecided lane is from the nearest change between sliding and limit cycle at its μ, at most."""
+    """How far in p an undecided trajectory is from the nearest change between sliding and limit cycle at its μ, at most."""
     p, verdict, worst = np.asarray(m["p"]), np.asarray(m["verdict"].transpose("mu", "p")), 0.0
     for row, open_ in zip(verdict, np.asarray(undecided), strict=True):
         known = np.flatnonzero(row >= 0)
         changes = [0.5 * (p[a] + p[b]) for a, b in itertools.pairwise(known) if row[a] != row[b]]
-        for lane in np.flatnonzero(open_):
-            worst = max(worst, min((abs(p[lane] - change) for change in changes), default=np.inf))
+        for trajectory in np.flatnonzero(open_):
+            worst = max(worst, min((abs(p[trajectory] - change) for change in changes), default=np.inf))
     return worst
 
 
@@ -118,7 +118,7 @@ def start() -> None:
 
 
 def memory() -> None:
-    """What a map adds to the memory of a process that has compiled all it needs, at its highest, per lane."""
+    """What a map adds to the memory of a process that has compiled all it needs, at its highest, per trajectory."""
 
     def resident() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
@@ -135,7 +135,7 @@ def memory() -> None:
     paper_map(256)
     over.set()
     watching.join()
-    print(f"{(highest[0] - before) / 1e3 / 256**2:.2f} kB per lane, 65,536 lanes")
+    print(f"{(highest[0] - before) / 1e3 / 256**2:.2f} kB per trajectory, 65,536 trajectories")
 
 
 def paper_map(points: int):

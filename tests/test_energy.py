@@ -14,8 +14,8 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
+from fivjax.cycles.section_map import mechanics_about_sliding
 from fivjax.maps.engine import run_to_verdict
-from fivjax.maps.progress import measured_from_rest
 from fivjax.plot import energy as plot_energy
 from fivjax.simulation import energy as accounts
 from fivjax.verdicts.verdict import Verdict
@@ -432,7 +432,7 @@ def test_a_batch_of_ledgers_equals_a_loop(paper_scene):
 @eqx.filter_jit
 def entered_with_mistakes(scene, wrong, lost_impacts, t1):
     """A trajectory by its own physics, as lanes of a map are followed, but entered as if another scene's."""
-    method, mechanics, mistaken = fj.EventExact(), measured_from_rest(scene), measured_from_rest(wrong)
+    method, mechanics, mistaken = fj.EventExact(), mechanics_about_sliding(scene), mechanics_about_sliding(wrong)
     books, wrong_books = accounts.Books(scene), accounts.Books(wrong)
     load = scene.load(0.0) - scene.load.final
     y0 = jnp.array([0.0, 0.0, 0.0, 2.5, -1.0, 0.0])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, Rest, State
+from ..contact import Contact, Mechanics, State
 from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
 from ..simulation.energy import Books, Ledger, enter, mechanical_energy, open_ledger
@@ -35,7 +35,7 @@ class Progress(eqx.Module):
     """One trajectory on its way to a verdict."""
 
     t: Float[Array, ""]
-    y: State  # as a deviation from the sliding equilibrium under the final load, see `measured_from_rest`
+    y: State  # as a deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
     contact: Contact
     recurrence: Recurrence
     events: Int[Array, ""]  # status changes so far
@@ -51,7 +51,7 @@ class Setting(eqx.Module):
     scene: Scene
     method: AbstractStepper | Windowed
     resolution: recurrence.Resolution
-    mechanics: Mechanics  # see `measured_from_rest`
+    mechanics: Mechanics  # see `mechanics_about_sliding`
     prepared: Any  # the method's own, see `AbstractStepper.prepare`
     modes: SlidingModes
     drift: StickingDrift
@@ -63,17 +63,6 @@ class EnergyRecord(eqx.Module):
 
     ledger: Ledger
     vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
-
-
-def measured_from_rest(scene: Scene) -> Mechanics:
-    """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
-
-    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals: events
-    would be decided, and the balance of energy upset, by noise.
-    """
-    load = scene.load.final
-    _, normal_force = steady_sliding(scene, load)
-    return Mechanics(scene).about(Rest(scene, load, normal_force), scene.structure)
 
 
 def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Progress:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..contact import Mechanics
+from ..cycles.section_map import mechanics_about_sliding
 from ..foundation.compiling import compiled
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
@@ -25,7 +26,6 @@ from ..verdicts.ensemble import Attractor
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 from .flattened import Flattened, flatten
-from .progress import measured_from_rest
 
 # Parameters that trajectories of one group may differ in: the load's history, which leaves the mechanics alone.
 HISTORY = ("p", "duration", "start")
@@ -110,7 +110,7 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
-        mechanics = measured_from_rest(own)
+        mechanics = mechanics_about_sliding(own)
         return mechanics, method.prepare(mechanics), linear_sliding(own), sticking_drift(own)
 
     return jax.vmap(one)(values)
