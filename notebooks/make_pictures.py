@@ -20,7 +20,7 @@ FOLDER = Path(__file__).parent
 
 # Which pictures of a notebook are kept, counted from the top, and under what name.
 KEPT = {
-    "01_quickstart": {1: "lane"},
+    "01_quickstart": {1: "trajectory"},
     "02_paper": {5: "kicks", 8: "energy"},
     "03_linear_theory": {1: "sensitivity"},
     "05_calibration": {0: "calibration"},
