@@ -1,0 +1,394 @@
+"""Verdicts and amplitudes of maps against the independent solver in `reference`, which runs each lane until it fades for
+certain or for ten thousand periods.
+
+    python tests/measure_verdicts.py random [--structures N] [--kicks K] [--seed S]
+    python tests/measure_verdicts.py cases [ghost] [invented] [single] [kick] [growth] [amplitudes]
+    python tests/measure_verdicts.py folds [--kicks K]
+    python tests/measure_verdicts.py maps [--side N]
+
+`random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value;
+`folds` looks just below the friction where the paper's limit cycle ends; `maps` at the paper's map at belt speeds 1 and
+0.5; `cases` at scenes that were once answered wrongly. `--threads` is for the reference alone.
+"""
+
+import argparse
+import dataclasses
+import time
+
+import numpy as np
+import reference
+
+import fivjax as fj
+
+NEAR = 1e-2  # relative distance from the critical friction that counts as near it
+
+
+# ------------------------------------------------------------------------------------------------------------- counting
+
+
+@dataclasses.dataclass
+class Tally:
+    """What came of comparing lanes: counts, apart for lanes near the stability limit and away from it."""
+
+    lanes: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
+    undecided: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
+    failed: int = 0
+    sliding: int = 0
+    cycles: int = 0
+    false_sliding: int = 0
+    false_cycles: int = 0
+    fading_cycles: int = 0
+    quiet_cycles: int = 0
+    amplitudes: list = dataclasses.field(default_factory=list)
+    untold: int = 0
+    examples: list = dataclasses.field(default_factory=list)
+    map_time: float = 0.0
+    reference_time: float = 0.0
+
+    def add(self, scenes, verdict, amplitude, near=False, name="", threads=1):
+        """Compare lanes (dictionaries of `reference`, codes, m/s); returns what the reference says."""
+        began = time.perf_counter()
+        truth = judged(scenes, threads)
+        self.reference_time += time.perf_counter() - began
+        side = "near" if near else "away"
+        verdict, amplitude = np.ravel(verdict), np.ravel(amplitude)
+        self.lanes[side] += len(verdict)
+        self.undecided[side] += int((verdict == -1).sum())
+        self.failed += int((verdict < -1).sum())
+        said_sliding, said_cycle = verdict == 0, verdict == 1
+        fades = truth.fate == "slides"
+        known = truth.fate != "gave up"
+        lives = truth.fate == "sustained"
+        fading = lives & truth.shrinking
+        quiet = lives & (truth.late_events == 0)
+        wrong_sliding = said_sliding & known & ~fades & ~fading
+        wrong_cycle = said_cycle & known & (fades | (truth.fate == "unbounded"))
+        self.sliding += int(said_sliding.sum())
+        self.cycles += int(said_cycle.sum())
+        self.untold += int((~known).sum())
+        self.false_sliding += int(wrong_sliding.sum())
+        self.false_cycles += int(wrong_cycle.sum())
+        self.fading_cycles += int((said_cycle & fading & ~quiet).sum())
+        self.quiet_cycles += int((said_cycle & quiet).sum())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.abs(amplitude / truth.amplitude - 1.0)
+        both = said_cycle & lives & ~fading
+        self.amplitudes += error[both].tolist()
+        for kind, where in (
+            ("slides not", wrong_sliding),
+            ("no limit cycle", wrong_cycle),
+            ("amplitude", both & (error > 0.01)),
+        ):
+            if where.any():
+                i = int(np.argmax(where))
+                self.examples.append(
+                    f"{kind}: {name} p={scenes[i]['p']!r} and {int(where.sum()) - 1} more; map {verdict[i]}, {amplitude[i]:.6g} m/s; "
+                    f"reference {truth.fate[i]}, {truth.amplitude[i]:.6g} m/s, last event {truth.last_event[i]:.6g} s"
+                )
+        return truth
+
+    def show(self, examples=30):
+        """Print the counts."""
+        errors = np.array(self.amplitudes or [0.0])
+        for line in self.examples[:examples]:
+            print("   ", line)
+        print(f"lanes: {sum(self.lanes.values())}; called sliding: {self.sliding}; called limit cycle: {self.cycles}")
+        print(f"called sliding, but sustained: {self.false_sliding}")
+        print(f"called limit cycle, but slide in the end (or grow without bound): {self.false_cycles}")
+        print(f"called limit cycle, still shrinking after ten thousand periods: {self.fading_cycles}")
+        print(f"called limit cycle, without events in the reference's last tenth: {self.quiet_cycles}")
+        print(f"amplitudes off by more than 1 %: {int((errors > 0.01).sum())} of {len(self.amplitudes)}; ", end="")
+        print(
+            f"> 3 %: {int((errors > 0.03).sum())}, > 50 %: {int((errors > 0.5).sum())}, largest {100 * errors.max():.3g} %"
+        )
+        for side, lanes in self.lanes.items():
+            share = 100.0 * self.undecided[side] / max(lanes, 1)
+            print(
+                f"undecided {side} the stability limit: {self.undecided[side]} of {lanes} ({share:.2f} %)".replace(
+                    "away the", "away from the"
+                )
+            )
+        print(f"failed in the map: {self.failed}; given up by the reference: {self.untold}")
+        print(f"time: maps {self.map_time:.0f} s, reference {self.reference_time:.0f} s")
+
+
+def judged(scenes, threads=1):
+    """The reference's fates; what still shrinks after ten thousand periods is given ten times as many."""
+    truth = reference.fate(scenes, threads=threads)
+    slow = np.flatnonzero((truth.fate == "sustained") & truth.shrinking)
+    if len(slow):
+        longer = reference.fate([scenes[i] for i in slow], periods=1e5, threads=threads)
+        for field in dataclasses.fields(truth):
+            getattr(truth, field.name)[slow] = getattr(longer, field.name)
+    return truth
+
+
+def lanes_of(scene, **axes):
+    """The dictionaries of a map's lanes, in the order of its verdicts."""
+    base = reference.of_scene(scene)
+    grids = np.meshgrid(*axes.values(), indexing="ij")
+    out = []
+    for values in zip(*(g.ravel() for g in grids), strict=True):
+        lane = {**base, **{name: float(value) for name, value in zip(axes, values, strict=True)}}
+        if "mu" in axes:
+            lane["mu_static"] = lane["mu"]
+        out.append(lane)
+    return out
+
+
+def compare(tally, scene, near=False, name="", threads=1, **axes):
+    """Run a map and compare it."""
+    began = time.perf_counter()
+    found = fj.bistability_map(scene, progress=False, **axes)
+    tally.map_time += time.perf_counter() - began
+    truth = tally.add(lanes_of(scene, **axes), found["verdict"].values, found["amplitude"].values, near, name, threads)
+    return found, truth
+
+
+# --------------------------------------------------------------------------------------------------------------- random
+
+
+def draw(rng, near):
+    """A structure and scene: returns the scene, and a line that makes it again."""
+
+    def log(low, high):
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    while True:
+        m1, k1 = log(0.05, 5.0), log(1e4, 1e6)
+        parts = dict(
+            m1=m1,
+            m2=m1 * log(0.01, 1.0),
+            k1=k1,
+            k2=k1 * log(0.4, 2.5),
+            theta=float(rng.choice([-1, 1])) * log(1e-3, 0.5),
+        )
+        parts |= dict(c1=2.0 * log(3e-4, 0.03) * np.sqrt(k1 * m1), c2=2.0 * log(3e-4, 0.03) * np.sqrt(parts["k2"] * m1))
+        structure = fj.belt_oscillator(**parts)
+        critical = float(fj.cea.critical_friction(structure))
+        if near:
+            if not 0.005 < critical < 1.5:
+                continue
+            mu = critical * (1.0 + float(rng.choice([-1, 1])) * log(1e-5, NEAR))
+        else:
+            mu = float(rng.uniform(0.01, 0.8))
+            if abs(mu / critical - 1.0) < NEAR:
+                continue
+        if mu >= 0.95 * fj.painleve_friction(structure):
+            continue
+        belt = log(0.05, 50.0)
+        scene = fj.Scene(structure, fj.Coulomb(mu=mu), belt_speed=belt, load=fj.Pulse(100.0, 1.0, 0.1))
+        words = ", ".join(f"{k}={v!r}" for k, v in parts.items())
+        return scene, f"mu={mu!r} (critical {critical:.8g}), v={belt!r}, {words}"
+
+
+def random(structures, kicks, seed, threads):
+    """Random structures with random kicks, half of them near the stability limit."""
+    rng = np.random.default_rng(seed)
+    tally = Tally()
+    for i in range(structures):
+        near = i % 2 == 0
+        scene, name = draw(rng, near)
+        p = np.sort(rng.uniform(0.0, 6.0, kicks))
+        compare(tally, scene, near, f"[{i}] {name}", threads, p=p)
+        if i % 20 == 19:
+            print(
+                f"{i + 1} structures: false sliding {tally.false_sliding}, false cycles {tally.false_cycles}, ", end=""
+            )
+            print(
+                f"amplitudes {int((np.array(tally.amplitudes) > 0.01).sum())}, undecided {tally.undecided}", flush=True
+            )
+    tally.show()
+    return tally
+
+
+# ---------------------------------------------------------------------------------------------------------------- folds
+
+
+def paper(mu, v, p=1.2, duration=0.1, **parts):
+    """The paper's oscillator with other values."""
+    return fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(mu=mu), belt_speed=v, load=fj.Pulse(100.0, p, duration))
+
+
+SPEEDS = (0.3, 0.5, 1.0, 1.7, 3.0)
+ABOUT = (0.1156, 0.1265, 0.1679, 0.0274, 0.0274)
+
+
+def fold(v, about, width=1e-3, kicks=24, tolerance=2e-6):
+    """The friction below which no cycle is left at this belt speed: followed down from above by the reference.
+
+    At each friction the run starts where the last one that lived was; a step in friction that kills it is halved.
+    """
+    mu, step = about * 1.02, about * width
+    lanes = [reference.paper_scene(mu=mu, belt_speed=v, p=p) for p in np.linspace(1.5, 6.0, kicks)]
+    alive = reference.fate(lanes, periods=3000)
+    start = next(s for s, f in zip(alive.section, alive.fate, strict=True) if f == "sustained")
+    while step > tolerance * mu:
+        state = (start[1:4], start[4:7])
+        run = reference.fate(
+            [reference.paper_scene(mu=mu - step, belt_speed=v, deviation=state)], periods=20_000, more=1
+        )
+        if run.fate[0] == "sustained" and run.late_events[0] > 0:
+            mu, start = mu - step, run.section[0]
+        else:
+            step *= 0.5
+    return mu
+
+
+def folds(kicks, threads):
+    """Kicks just below the end of the paper's limit cycle, at five belt speeds."""
+    total = Tally()
+    for v, about in zip(SPEEDS, ABOUT, strict=True):
+        mu_fold = fold(v, about)
+        tally = Tally()
+        for below in (1e-4, 4e-4, 1.5e-3, 5e-3, 1e-2, 3e-2):
+            mu = mu_fold * (1.0 - below)
+            compare(
+                tally,
+                paper(mu, v),
+                False,
+                f"mu={mu!r} ({below:g} below), v={v:g}",
+                threads,
+                p=np.linspace(1.05, 6.0, kicks),
+            )
+        print(f"\nv = {v:g}: fold at mu = {mu_fold:.7f}")
+        tally.show(6)
+        for name in ("false_sliding", "false_cycles", "sliding", "cycles"):
+            setattr(total, name, getattr(total, name) + getattr(tally, name))
+    print(f"\nall: called sliding {total.sliding}, wrongly {total.false_sliding}; ", end="")
+    print(f"called limit cycle {total.cycles}, wrongly {total.false_cycles}")
+
+
+def maps(side, threads):
+    """The paper's map at two more belt speeds."""
+    for v in (1.0, 0.5):
+        tally = Tally()
+        compare(
+            tally,
+            paper(0.2, v),
+            False,
+            f"v={v:g}",
+            threads,
+            mu=np.linspace(0.05, 0.228, side),
+            p=np.linspace(1.0, 4.0, side),
+        )
+        print(f"\n{side} x {side} map at v = {v:g}")
+        tally.show()
+
+
+# ---------------------------------------------------------------------------------------------------------------- cases
+
+
+def ghost():
+    """31 lanes and 32 lanes just below a fold: all slide."""
+    for n in (31, 32):
+        tally = Tally()
+        compare(tally, paper(0.163, 1.0), p=np.linspace(3.0, 6.0, n))
+        yield f"{n} lanes", tally.false_cycles == 0 and tally.cycles == 0, f"{tally.cycles} called limit cycle"
+
+
+def invented():
+    """Critical kicks where none squeals."""
+    for mu, v in ((0.163, 1.0), (0.166, 1.0), (0.1235, 0.5), (0.114, 0.3)):
+        found = fj.critical_perturbation(paper(mu, v), progress=False)
+        truth = judged([reference.paper_scene(mu=mu, belt_speed=v, p=p) for p in np.linspace(1.0, 5.0, 401)])
+        squeal = int((truth.fate != "slides").sum())
+        p_crit = float(np.ravel(found["p_crit"])[0])
+        yield (
+            f"mu = {mu}, v = {v}",
+            np.isnan(p_crit) == (squeal == 0),
+            f"p_crit {p_crit:.6f}; {squeal} of 401 kicks squeal",
+        )
+
+
+HEAVY = dict(m1=1.2, m2=0.014, c1=29.0, c2=0.125, k1=56.8e3, k2=61.4e3, theta=0.1)
+
+
+def single():
+    """A lane by itself that decays slowly with friction and fast without."""
+    yield from _one(paper(0.0981, 1.0, **HEAVY), 2.0)
+
+
+def kick():
+    """Returns that are seen under a long kick's load say nothing about what comes after it."""
+    yield from _one(paper(0.1, 1.0, duration=5.0), 0.02)
+
+
+def _one(scene, p):
+    tally = Tally()
+    found, truth = compare(tally, scene, p=np.array([p]))
+    right = int(found["verdict"][0]) == 0 and truth.fate[0] == "slides"
+    yield (
+        "",
+        right,
+        f"verdict {int(found['verdict'][0])}; reference {truth.fate[0]}, last event {truth.last_event[0]:.4f} s",
+    )
+
+
+def growth():
+    """Just above the stability limit small motions grow so slowly that no event comes for a long time."""
+    structure = fj.belt_oscillator()
+    mu = float(fj.cea.critical_friction(structure)) * (1.0 + 1.7e-4)
+    tally = Tally()
+    found, truth = compare(tally, paper(mu, 1.164), True, p=np.linspace(1.0001, 1.002, 40))
+    wrong = tally.false_sliding + tally.false_cycles + tally.quiet_cycles
+    said, amounts = np.unique(found["verdict"], return_counts=True)
+    # a limit cycle is right where the reference has reached it in the time that the map had
+    early = (found["verdict"].values == 1) & (found["contact_events"].values == 0)
+    yield (
+        "",
+        wrong == 0 and not early.any(),
+        (
+            f"verdicts {dict(zip(said.tolist(), amounts.tolist(), strict=True))}, limit cycles before any event {int(early.sum())}; "
+            f"reference {np.unique(truth.fate).tolist()}"
+        ),
+    )
+
+
+def amplitudes():
+    """Two cycles coexist: each lane has its own amplitude, whatever runs beside it."""
+    for n in (31, 32):
+        tally = Tally()
+        found, truth = compare(tally, paper(0.227, 0.5), p=np.linspace(1.0537, 1.0545, n))
+        off = np.array(tally.amplitudes)
+        here, there = np.unique(np.round(found["amplitude"], 4)), np.unique(np.round(truth.amplitude, 4))
+        yield (
+            f"{n} lanes",
+            bool((off < 0.01).all()) and tally.false_cycles == 0,
+            f"map {here[:4]}, reference {there[:4]}",
+        )
+
+
+CASES = dict(ghost=ghost, invented=invented, single=single, kick=kick, growth=growth, amplitudes=amplitudes)
+
+
+def cases(names):
+    """Scenes that were once answered wrongly."""
+    for name in names or CASES:
+        for label, right, told in CASES[name]():
+            print(f"{'right' if right else 'WRONG'}  {name} {label}: {told}", flush=True)
+
+
+def main():
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", choices=["random", "cases", "folds", "maps"])
+    parser.add_argument("names", nargs="*", choices=[[], *CASES], help="which cases")
+    parser.add_argument("--structures", type=int, default=500)
+    parser.add_argument("--kicks", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--side", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=1)
+    chosen = parser.parse_args()
+    if chosen.study == "random":
+        random(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
+    elif chosen.study == "folds":
+        folds(chosen.kicks, chosen.threads)
+    elif chosen.study == "maps":
+        maps(chosen.side, chosen.threads)
+    else:
+        cases(chosen.names)
+
+
+if __name__ == "__main__":
+    main()
