@@ -111,9 +111,11 @@ _MODAL = np.dtype(
         ("re", "f8", 196),
         ("im", "f8", 196),
         ("reach", "f8", (2, 14)),
+        ("growth", "f8", 14),
         ("rate", "f8"),
         ("quadratic", "f8"),
-        ("usable", "i8"),
+        ("modes", "i4"),
+        ("usable", "i4"),
     ]
 )
 
@@ -211,20 +213,22 @@ def _modal(data, modal):
     and to the slip speed is less than what either has. With falling friction d|c|/dt <= -rate |c| + quadratic |c|^2 in
     the sum norm, while the slip speed keeps at least half of the belt's.
     """
-    modal["usable"] = 0
+    modal["modes"] = modal["usable"] = 0
     lin = _linear(data)
     if lin is None:
         return
     values, V = np.linalg.eig(lin.matrix)
     rate = -values.real.max()
-    if not rate > 0 or not np.linalg.cond(V) < 1e12:
+    if not np.linalg.cond(V) < 1e12:
         return
     k = len(values)
     W = np.linalg.inv(V)
     reach = np.abs(lin.rows @ V)
     modal["re"][: k * k], modal["im"][: k * k] = W.real.ravel(), W.imag.ravel()
     modal["reach"][:, :k] = reach
-    modal["rate"] = rate
+    modal["growth"][:k], modal["rate"], modal["modes"] = values.real, rate, 1
+    if rate <= 0:
+        return
     if data.falling:
         half = math.exp(-data.decay * abs(data.belt) / 2)
         drop = data.mu_s - data.mu_d

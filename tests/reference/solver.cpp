@@ -48,8 +48,9 @@ struct FateData {
 };
 struct Modal {  // of linearised sliding: c = W (z of the contact coordinates), |N deviation| and |v_t| by sum reach |c|
     double re[196], im[196], reach[2][14];
+    double growth[14];       // real parts of the eigenvalues, 1/s
     double rate, quadratic;  // slowest decay (1/s); d|c|/dt <= -rate |c| + quadratic |c|^2
-    int usable;
+    int modes, usable;       // whether W and growth are known, and whether all modes decay
 };
 struct Record {
     // in
@@ -678,25 +679,70 @@ struct Solver {
 
     // ---------------------------------------------------------------------------------------------- the run
 
-    // the linear future of forward sliding keeps N > 0 and the direction of slip for ever
-    bool settled(const Modal& md) const {
-        if (!md.usable || mode != SLIDE || sigma != m.sigma0 || load != 0 || next_jump != infinity) return false;
+    int amplitudes(const Modal& md, double* size) const {
         int k = 2 * m.nc;
-        double sum = 0, size[14], zc[14];
+        double zc[14];
         for (int i = 0; i < m.nc; i++) zc[i] = z[m.c[i]], zc[m.nc + i] = z[n + m.c[i]];
         for (int i = 0; i < k; i++) {
             double a = 0, b = 0;
             for (int j = 0; j < k; j++) a += md.re[i * k + j] * zc[j], b += md.im[i * k + j] * zc[j];
-            size[i] = std::sqrt(a * a + b * b), sum += size[i];
+            size[i] = std::sqrt(a * a + b * b);
         }
+        return k;
+    }
+
+    bool at_home() const { return mode == SLIDE && sigma == m.sigma0 && load == 0 && next_jump == infinity; }
+
+    // the linear future of forward sliding keeps N > 0 and the direction of slip for ever
+    bool settled(const Modal& md) const {
+        if (!md.usable || !at_home()) return false;
+        double size[14], sum = 0, a = 0, b = 0;
+        int k = amplitudes(md, size);
+        for (int i = 0; i < k; i++) sum += size[i], a += md.reach[0][i] * size[i], b += md.reach[1][i] * size[i];
         if (s.falling) {
             double r0 = 0, r1 = 0;
             for (int i = 0; i < k; i++) r0 = std::max(r0, md.reach[0][i]), r1 = std::max(r1, md.reach[1][i]);
             return md.quadratic * sum < 0.9 * md.rate && r0 * sum < 0.99 && r1 * sum < 0.5;
         }
-        double a = 0, b = 0;
-        for (int i = 0; i < k; i++) a += md.reach[0][i] * size[i], b += md.reach[1][i] * size[i];
         return a < 1 - 1e-9 && b < 1 - 1e-9;
+    }
+
+    // Many steps of forward sliding at once, where the same bound shows that no event can come in that time.
+    std::vector<std::vector<real>> powers;  // of the step's matrix, each the square of the one before
+    bool leap(const Modal& md, double until) {
+        if (!md.modes || s.falling || !at_home()) return false;
+        Tab& tb = table(SLIDE, sigma);
+        double size[14];
+        int k = amplitudes(md, size), D = 2 * n;
+        for (int e = 14; e >= 5; e--) {
+            double time = tb.h * (1 << e), a = 0, b = 0;
+            if (t + time > until) continue;
+            for (int i = 0; i < k; i++) {
+                double far = size[i] * std::max(1.0, std::exp(md.growth[i] * time));
+                a += md.reach[0][i] * far, b += md.reach[1][i] * far;
+            }
+            if (!(a < 1 - 1e-6 && b < 1 - 1e-6)) continue;
+            if (powers.empty()) {
+                powers.emplace_back(D * D);
+                for (int j = 0; j < D; j++)
+                    for (int i = 0; i < D; i++) powers[0][i * D + j] = tb.P[j][i / 8][i % 8];
+            }
+            while ((int)powers.size() <= e) {
+                const auto& P = powers.back();
+                std::vector<real> Q(D * D, 0);
+                for (int i = 0; i < D; i++)
+                    for (int l = 0; l < D; l++)
+                        for (int j = 0; j < D; j++) Q[i * D + j] += P[i * D + l] * P[l * D + j];
+                powers.push_back(Q);
+            }
+            real to[16] = {};
+            for (int i = 0; i < D; i++)
+                for (int j = 0; j < D; j++) to[i] += powers[e][i * D + j] * z[j];
+            for (int i = 0; i < D; i++) z[i] = to[i];
+            t += time;
+            return true;
+        }
+        return false;
     }
 
     // t_max: where the run ends at the latest; patience: how far it goes on while no event comes
@@ -846,6 +892,7 @@ struct Solver {
                 fate = SLIDES;
                 break;
             }
+            if (md && quiet >= 32 && quiet % 32 == 0) leap(*md, window_end);
             if (t >= window_end) {
                 double size = 0;
                 for (int i = 0; i < n; i++)
@@ -863,7 +910,7 @@ struct Solver {
                 bool constant = amplitude[9] == 0 || (s.falling && std::fabs(amplitude[9] / amplitude[8] - 1) < 1e-9);
                 bool waits = late[9] == 0 && mode == SLIDE && !constant;
                 bool woke = wanted > 10 && late[9] > 0 && late[0] == 0;  // events after a long quiet
-                if (windows >= more * 10 || !(waits || woke)) break;
+                if (!(waits && windows < more * 10) && !(woke && windows < more * 10 + 10)) break;
                 wanted++;
             }
         }
