@@ -9,8 +9,12 @@ class Ending(enum.IntEnum):
     FINISHED = 0
     NOT_FINITE = -2
     TOO_MANY_EVENTS = -6
+    UNBOUNDED = -7
     STEP_FAILURE = -8
 
+
+# Motion this much larger than its start, the belt's motion and what the load can cause has no bound.
+GROWTH = 1e9
 
 ENDING = {
     Ending.FINISHED: "reached its end",
@@ -18,6 +22,8 @@ ENDING = {
     "parameters",
     Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
     "change the restitution or the belt speed a little",
+    Ending.UNBOUNDED: "the motion grew a billionfold beyond its start, the belt's speed and what the load can cause, and the "
+    "rows from there on are NaN; take a smaller step, or lower the friction",
     Ending.STEP_FAILURE: "the fastest vibration needs too many steps between two saved rows, and the rows from there on are "
     "NaN; lower `dt_save`",
 }

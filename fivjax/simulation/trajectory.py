@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
@@ -21,7 +21,7 @@ from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
-from .ending import ENDING, Ending
+from .ending import ENDING, GROWTH, Ending
 from .energy import Books, Energy, Ledger
 from .spans import MODES, Begin, go_on
 
@@ -123,10 +123,11 @@ def simulate(
       is faster, `jax.grad` about ten times. It matters only inside a transformation.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
-    being finite, or contact events come without end, the rows from there on are NaN; `run.outcome` (an `Ending`) and
-    `run.meaning` (a sentence) say which.
+    being finite, grows without bound, or contact events come without end, the rows from there on are NaN; `run.outcome`
+    (an `Ending`) and `run.meaning` (a sentence) say which.
 
-    **Raises:** `ValueError` for times that are not positive, a start below the belt or of the wrong shape, no sliding
+    **Raises:** `ValueError` for times that are not positive, a `dt_save` below the step of a method that takes the step it
+    is told (`WhereSwitched`), a start below the belt or of the wrong shape, no sliding
     equilibrium to start from, or friction beyond Painlevé's limit.
     """
     method = EventExact() if method is None else method
@@ -136,6 +137,11 @@ def simulate(
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)
     arguments.one_of("derivatives", derivatives, MODES)
+    if not method.chooses_its_steps and dt_save < method.dt * (1 - 1e-9):
+        raise ValueError(
+            f"Argument `dt_save` must be at least the method's step, but is {dt_save:g} s and `dt` is {method.dt:g} s. Steps "
+            f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
+        )
     refuse_painleve(scene)
     rows = math.ceil(t1 / dt_save - 1e-9)
     if rows > MOST_ROWS:
@@ -156,6 +162,7 @@ def simulate(
     found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
     # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
+    grown = found.pop("grown")
     settings = (
         ("method", describe_method(method)),
         ("dt", float(method.dt)),
@@ -163,7 +170,7 @@ def simulate(
         ("t1", float(t1)),
         ("start", start),
     )
-    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, most), settings=settings)
+    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, grown, most), settings=settings)
 
 
 def _compiled_rows(count: int) -> int:
@@ -171,13 +178,16 @@ def _compiled_rows(count: int) -> int:
     return power_of_4(max(count, LEAST_ROWS)) if count <= MOST_REPEATED else count
 
 
-def _ending(scene: Scene, method: AbstractStepper, rows: dict, most: int) -> Array | np.int8:
-    """How the rows end: an `Ending`. Under a transformation, where no one can look, every failure is not finite."""
+def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int) -> Array | np.int8:
+    """How the rows end: an `Ending`. Under a transformation, where no one can look, other failures are not finite."""
     finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
     if not is_known(finite):
-        return jnp.where(jnp.all(finite), Ending.FINISHED, Ending.NOT_FINITE).astype(jnp.int8)
+        failure = jnp.where(jnp.any(grown), Ending.UNBOUNDED, Ending.NOT_FINITE)
+        return jnp.where(jnp.all(finite), Ending.FINISHED, failure).astype(jnp.int8)
     if np.all(finite):
         return np.int8(Ending.FINISHED)
+    if np.any(grown):
+        return np.int8(Ending.UNBOUNDED)
     first = int(np.argmin(finite))
     if first == 0:
         return np.int8(Ending.NOT_FINITE)
@@ -218,10 +228,11 @@ def _simulate(
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
     y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, derivatives)
-    # What follows a number that was not reached is none either, also where the contact would hold it at zero.
-    reached = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
-    y = jnp.where(reached[:, None], y, jnp.nan)
     load = jax.vmap(scene.load)(saved)
+    # What follows a number that was not reached is none either, also where the contact would hold it at zero.
+    finite = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
+    grown = finite & (jnp.cumsum(_grown(scene, saved, load, y)) > 0)
+    y = jnp.where((finite & ~grown)[:, None], y, jnp.nan)
     # A row on a jump of the load shows what follows from it, as its load does.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
     contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
@@ -238,8 +249,22 @@ def _simulate(
         "normal_force": normal_force,
         "friction_force": friction_force,
         "load": load,
+        "grown": grown,
         "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
     }
+
+
+def _grown(
+    scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T 2n"]
+) -> Bool[Array, " T"]:
+    """Which states are a billionfold beyond what the start, the belt and the load can explain."""
+    structure = scene.structure
+    weights, n = structure.weights, structure.size
+    belt = weights[n + structure.tangential] * jnp.abs(scene.belt_speed)
+    # A load that nothing holds back accelerates a free structure for as long as it lasts.
+    pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * jnp.max(jnp.abs(load)) * t
+    expected = jnp.max(jnp.abs(weights * y[0])) + belt + pushed
+    return jnp.max(jnp.abs(weights * y), axis=-1) > GROWTH * expected
 
 
 def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:

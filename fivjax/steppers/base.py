@@ -90,6 +90,8 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     dt: eqx.AbstractVar[float]
     # Advances between two looks at whether a lane's verdict is known: a few periods of vibration.
     round: eqx.AbstractClassVar[int]
+    # Whether it finds out itself how far an advance may reach; if not, `dt` is its step, and decides its error.
+    chooses_its_steps: ClassVar[bool] = True
     term_structure: ClassVar = diffrax.ODETerm
 
     @property

@@ -316,7 +316,8 @@ def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Flo
     A Newton step from a converged root, with the slope taken as given, changes nothing but the derivative, and makes it
     one order more exact: after the first step derivatives are right, after the second one derivatives of derivatives, too.
     """
-    chosen = jnp.arange(fires.shape[0]) == jnp.argmax(fires)
+    # An index of 64 bits could not be lowered in a program that computes with 32.
+    chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
     for _ in range(2):
         values, slopes = _value_and_slope(scaled, x)
         value = jnp.sum(jnp.where(chosen, values, 0.0))

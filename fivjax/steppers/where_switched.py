@@ -23,7 +23,8 @@ class WhereSwitched(AbstractStepper):
     after an event, whatever the solver's order, and a touch shorter than a step goes unseen.
 
     **Arguments:** `solver`, for instance `diffrax.Tsit5()`; `dt`, the step in s (in a plain `diffeqsolve`, the step
-    size controller decides).
+    size controller decides). Steps end on saved instants, so `simulate` takes equal parts of the time between two of them,
+    each `dt` at most, and refuses a `dt` that is longer than that time.
 
     A load's jumps should be step ends; `simulate` and the maps see to that, elsewhere use `diffrax.StepTo` or
     `diffrax.ClipStepSizeController`.
@@ -36,6 +37,7 @@ class WhereSwitched(AbstractStepper):
     dt: float
 
     round: ClassVar = 1024
+    chooses_its_steps: ClassVar = False
     interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation
 
     def __init__(self, solver: diffrax.AbstractERK | None = None, dt: float = 5e-5):

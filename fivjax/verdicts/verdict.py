@@ -16,7 +16,7 @@ class Verdict(enum.IntEnum):
     PAINLEVE = -4
     NOT_RUN = -5
     TOO_MANY_EVENTS = Ending.TOO_MANY_EVENTS
-    UNBOUNDED = -7
+    UNBOUNDED = Ending.UNBOUNDED
     STEP_FAILURE = Ending.STEP_FAILURE
 
 
