@@ -27,7 +27,7 @@ from .model.scene import Scene as Scene
 from .model.scene import painleve_friction as painleve_friction
 from .model.scene import sliding_equilibrium as sliding_equilibrium
 from .model.structure import Structure as Structure
-from .model.structure import belt_oscillator as belt_oscillator
+from .model.belt import belt_oscillator as belt_oscillator
 from .notebook.display import show as show
 from .notebook.explore import explorer as explorer
 from .paper.report import reproduce as reproduce

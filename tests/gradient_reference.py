@@ -24,17 +24,14 @@ def richardson(function, value: float, step: float, levels: int = 4) -> tuple[np
 
 def point_mass(stiffness, damping=0.0) -> fj.Structure:
     """One unit mass with a spring along the belt: coordinates along it and away from it."""
-    along = np.array([[1.0, 0.0], [0.0, 0.0]])
-    return fj.Structure(
-        np.eye(2),
-        damping * along,
-        stiffness * along,
-        np.array([0.0, -1.0]),
-        tangential=0,
-        normal=1,
-        parameters={"stiffness": stiffness, "damping": damping},
-        builder=point_mass,
+    return fj.Structure.from_parameters(
+        _matrices, {"stiffness": stiffness, "damping": damping}, tangential=0, normal=1, dampers=("damping",)
     )
+
+
+def _matrices(stiffness, damping):
+    along = np.array([[1.0, 0.0], [0.0, 0.0]])
+    return np.eye(2), damping * along, stiffness * along, np.array([0.0, -1.0])
 
 
 def bouncing_height(t: float, bounces: int, force, restitution, height=1.0):

@@ -81,7 +81,9 @@ def test_a_structure_of_an_unknown_builder_comes_back_as_its_matrices():
     """Only names of parameters are lost; refusing would lose the scene."""
 
     def rig(k=1e5):
-        return fj.Structure(*MATRICES, [0.0, 0.0, -1.0], parameters={"k": k}, builder=rig)
+        return fj.Structure.from_parameters(
+            lambda k: (*MATRICES, jnp.array([0.0, 0.0, -1.0])), {"k": k}, tangential=0, normal=2, builder=rig
+        )
 
     scene = fj.Scene(rig(), fj.Coulomb(0.2), 3.0)
     found = fj.Scene.from_dataset(empty(scene))

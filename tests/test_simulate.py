@@ -1,5 +1,6 @@
 """Trajectories against the independent oracle, and the three transients of Section 3."""
 
+import diffrax
 import jax
 import numpy as np
 import oracle
@@ -206,3 +207,25 @@ def test_a_run_says_how_it_ended(paper_scene):
     fast = fj.simulate(paper_scene.replace(m2=0.53e-6, k2=1e11), 1.0, 0.5)
     assert fast.outcome == fj.Ending.STEP_FAILURE and "dt_save" in fast.meaning
     assert np.all(np.isnan(fast.velocity[-1]))
+
+
+def test_growth_without_bound_is_a_failure_with_a_name(paper_scene):
+    """Rejects a run of Tsit5 with steps far too long that ends at 1e123 m/s and is said to have reached its end."""
+    run = fj.simulate(paper_scene, 0.5, 1e-2, fj.WhereSwitched(diffrax.Tsit5(), dt=5e-3))
+    assert run.outcome == fj.Ending.UNBOUNDED
+    assert "smaller step" in run.meaning
+    lost = np.isnan(run.velocity[:, 0])
+    assert lost[-1]
+    assert not lost[0]
+    # Nothing follows the first row that is lost.
+    assert np.all(np.diff(lost.astype(int)) >= 0)
+    assert np.nanmax(np.abs(run.velocity)) < 1e12
+
+
+def test_a_mass_that_nothing_holds_back_does_not_grow_without_bound():
+    """Shows that free fall from rest, without a belt's motion to compare with, is no failure however far it goes."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.zeros((2, 2)), [1.0, 1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.ConstantLoad(1.0))
+    run = fj.simulate(scene, 1e6, 1e5, y0=([0.0, 1e-9], [0.0, 0.0]))
+    assert run.outcome == fj.Ending.FINISHED
+    assert run.displacement[-1] == pytest.approx([5e11, 5e11], rel=1e-9)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.model.structure import Springs
+from fivjax.model.springs import Springs
 
 # A few products and sums of double-precision numbers; anything wrong in a formula is off by many orders more.
 ROUNDING = 1e-14

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from ..model.friction import AbstractFriction
 from ..model.scene import Scene
-from ..model.structure import Springs, Structure
+from ..model.springs import Springs
+from ..model.structure import Structure
 
 
 class Rest(eqx.Module):
@@ -45,14 +46,14 @@ class Mechanics(eqx.Module):
     from_springs: Float[Array, "n n"] | None = None  # -M⁻¹Bᵀk, 1/s²
 
     def __init__(self, scene: Scene):
-        structure = scene.structure
+        structure, matrices = scene.structure, scene.structure.matrices
         n = structure.size
-        forces = jnp.zeros((n, 2), structure.mass.dtype)
+        forces = jnp.zeros((n, 2), matrices.mass.dtype)
         forces = forces.at[structure.tangential, 0].set(1.0).at[structure.normal, 1].set(1.0)
         right = jnp.concatenate(
-            [-structure.stiffness, -structure.damping, structure.load_direction[:, None], forces], axis=1
+            [-matrices.stiffness, -matrices.damping, matrices.load_direction[:, None], forces], axis=1
         )
-        solved = jnp.linalg.solve(structure.mass, right)
+        solved = jnp.linalg.solve(matrices.mass, right)
         self.free_position = solved[:, :n]
         self.free_velocity = solved[:, n : 2 * n]
         self.free_load = solved[:, 2 * n]
@@ -72,8 +73,9 @@ class Mechanics(eqx.Module):
         Forces are then as exact as a small deviation can tell them, those of the springs included: of a rigid motion,
         however far it goes, there are none.
         """
-        springs = Springs(structure.stiffness)
-        from_springs = -jnp.linalg.solve(structure.mass, springs.stretch.T * springs.rates)
+        matrices = structure.matrices
+        springs = Springs(matrices.stiffness)
+        from_springs = -jnp.linalg.solve(matrices.mass, springs.stretch.T * springs.rates)
         return self._with_reference(rest, springs, from_springs)
 
     @property

@@ -63,6 +63,34 @@ def is_known(value) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
+def is_differentiated_in_reverse(value) -> bool:
+    """Whether `jax.grad`, `jax.vjp` or `jax.linearize` waits for this value, as far as a tracer tells."""
+    while isinstance(value, jax.core.Tracer):
+        # Its class is not public. Where it has another name, the refusal that asks for this is left to JAX.
+        if type(value).__name__ == "LinearizeTracer":
+            return True
+        value = getattr(value, "primal", getattr(value, "val", None))
+    return False
+
+
+def refusing_reverse_in_single_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """`function`, refused under reverse derivatives in a program in single precision, which JAX cannot take.
+
+    It transposes double-precision code after the call, outside the context that makes double precision available.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not jax.config.jax_enable_x64 and any(map(is_differentiated_in_reverse, jax.tree.leaves((args, kwargs)))):
+            raise TypeError(
+                "Reverse derivatives (`jax.grad`, `jax.vjp`) of a simulation need double precision around them. Write "
+                "`with jax.enable_x64(True):` around the call of `jax.grad`, or use `jax.jacfwd` or `fivjax.derivatives`."
+            )
+        return function(*args, **kwargs)
+
+    return wrapped
+
+
 def real(value) -> Array:
     """`value` as a float64 JAX array, also where a caller in single precision handed over float32."""
     return jnp.asarray(value, dtype=jnp.float64)

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ..foundation.quantities import QUANTITIES
+from .belt import belt_oscillator
 from .friction import AbstractFriction
 from .load import AbstractLoad
-from .structure import Structure, belt_oscillator
+from .structure import Structure
 
 # Functions that make a structure from named parameters.
 BUILDERS = {"belt_oscillator": belt_oscillator}
@@ -32,6 +33,7 @@ def describe(scene) -> dict:
         **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
         "tangential": structure.tangential,
         "normal": structure.normal,
+        "coordinates": list(structure.coordinates),
     }
 
 
@@ -73,16 +75,13 @@ def arguments_of_scene(description: Mapping) -> dict:
 
 
 def _structure(description: Mapping) -> Structure:
-    matrices = {name: np.asarray(description[name]) for name in MATRICES}
     builder = BUILDERS.get(description["structure"])
     if builder is not None:
         names = builder().parameters
         if set(names) <= set(description["parameters"]):
-            structure = builder(**{name: description["parameters"][name] for name in names})
-            # Matrices that were changed by hand say more than the parameters that they were made of.
-            if all(np.array_equal(np.asarray(getattr(structure, name)), matrix) for name, matrix in matrices.items()):
-                return structure
-    return Structure(**matrices, tangential=description["tangential"], normal=description["normal"])
+            return builder(**{name: description["parameters"][name] for name in names})
+    places = {name: description[name] for name in ("tangential", "normal", "coordinates") if name in description}
+    return Structure(**{name: np.asarray(description[name]) for name in MATRICES}, **places)
 
 
 def _part(kind: type, what: str, name: str, parameters: Mapping):

@@ -155,8 +155,9 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
     reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
     q = jnp.insert(reduced, structure.normal, 0.0)
-    normal_force = structure.stiffness[structure.normal] @ q
-    normal_force = normal_force - structure.load_direction[structure.normal] * force
+    matrices = structure.matrices
+    normal_force = matrices.stiffness[structure.normal] @ q
+    normal_force = normal_force - matrices.load_direction[structure.normal] * force
     return q, normal_force
 
 
@@ -176,7 +177,7 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
 def refuse_painleve(scene: Scene) -> None:
     """Refuse friction at which the contact problem has no unique solution, where its value is known."""
     largest = scene.friction.static
-    if is_known(largest) and is_known(scene.structure.mass):
+    if is_known(largest):
         limit = painleve_friction(scene.structure)
         if is_known(limit) and float(largest) >= limit:
             raise ValueError(

@@ -42,7 +42,7 @@ def sliding_matrices(
     free = sliding_coordinates(structure.size, structure.normal)
     mass, damping, stiffness = (
         sliding_rows(structure, matrix, friction)[:, free]
-        for matrix in (structure.mass, structure.damping, structure.stiffness)
+        for matrix in structure.matrices[:3]
     )
     return mass, damping, stiffness
 

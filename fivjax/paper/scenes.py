@@ -12,7 +12,7 @@ import numpy as np
 from ..model.friction import AbstractFriction, Coulomb, ExponentialDecay
 from ..model.load import Pulse
 from ..model.scene import Scene, sliding_equilibrium
-from ..model.structure import belt_oscillator
+from ..model.belt import belt_oscillator
 from ..simulation.trajectory import Trajectory, simulate
 
 # Table 1, as printed: value and unit.

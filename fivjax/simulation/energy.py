@@ -49,7 +49,8 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation.precision import returning_numpy
 from ..model.scene import Scene
-from ..model.structure import Springs, Structure
+from ..model.springs import Springs
+from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment
 

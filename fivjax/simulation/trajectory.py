@@ -14,7 +14,13 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled, power_of_4
-from ..foundation.precision import in_double_precision, is_known, known_to_numpy, real
+from ..foundation.precision import (
+    in_double_precision,
+    is_known,
+    known_to_numpy,
+    real,
+    refusing_reverse_in_single_precision,
+)
 from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
@@ -88,7 +94,7 @@ class Trajectory(eqx.Module):
                 "friction_force": ("t", np.asarray(self.friction_force)),
                 "load": ("t", np.asarray(self.load)),
             },
-            coords={"t": np.asarray(self.t), "coordinate": np.arange(self.displacement.shape[1])},
+            coords={"t": np.asarray(self.t), "coordinate": list(self.scene.structure.coordinates)},
         )
         if self.energy is not None:
             dataset = dataset.assign({name: ("t", np.asarray(x)) for name, x in self.energy.variables().items()})
@@ -97,6 +103,7 @@ class Trajectory(eqx.Module):
         )
 
 
+@refusing_reverse_in_single_precision
 @in_double_precision
 def simulate(
     scene: Scene,
@@ -126,9 +133,11 @@ def simulate(
     being finite, grows without bound, or contact events come without end, the rows from there on are NaN; `run.outcome`
     (an `Ending`) and `run.meaning` (a sentence) say which.
 
+    Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` also where double precision is off; `jax.grad` needs it on.
+
     **Raises:** `ValueError` for times that are not positive, a `dt_save` below the step of a method that takes the step it
-    is told (`WhereSwitched`), a start below the belt or of the wrong shape, no sliding
-    equilibrium to start from, or friction beyond Painlevé's limit.
+    is told (`WhereSwitched`), a start below the belt or of the wrong shape, no sliding equilibrium to start from, or
+    friction beyond Painlevé's limit; `TypeError` under reverse derivatives without double precision.
     """
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")

@@ -1,0 +1,73 @@
+"""Checks on what a structure is made of: symmetric matrices of one size, indices and names of coordinates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.precision import is_known
+
+
+def check_matrix(name: str, matrix, *, definite: bool) -> None:
+    if not is_known(matrix):
+        return
+    array = arguments.numeric_array(name, matrix).astype(np.float64)
+    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+        raise ValueError(f"Argument `{name}` must be a square matrix, but has shape {array.shape}.")
+    if array.shape[0] < 2:
+        raise ValueError(
+            f"Argument `{name}` must have at least two rows (a tangential and a normal coordinate), but has "
+            f"{array.shape[0]}."
+        )
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"Argument `{name}` must be finite, but holds {array[~np.isfinite(array)][0]}.")
+    # Rounding in sums of a few products; a matrix entered by hand is either symmetric or wrong by far more.
+    asymmetry = np.abs(array - array.T)
+    if np.any(asymmetry > 1e-9 * np.abs(array).max()):
+        i, j = np.unravel_index(np.argmax(asymmetry), array.shape)
+        raise ValueError(
+            f"Argument `{name}` must be symmetric, but entry ({i}, {j}) is {array[i, j]:g} and entry ({j}, {i}) is "
+            f"{array[j, i]:g}. Friction does not belong here: give the symmetric matrix of the free structure."
+        )
+    # Judged after scaling the diagonal to one, so that masses of very different size do not look indefinite.
+    diagonal = np.diag(array)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    # One side after the other: of the smallest numbers there are, the product of two such scales is infinite.
+    lowest = np.linalg.eigvalsh(array * scale * scale[:, None])[0]
+    if definite and lowest <= 0:
+        raise ValueError(
+            f"Argument `{name}` must be positive definite, but its smallest eigenvalue (diagonal scaled to one) is "
+            f"{lowest:.3g}. Every coordinate needs a positive mass."
+        )
+    if lowest < -1e-9:
+        raise ValueError(
+            f"Argument `{name}` must be positive semi-definite, but its smallest eigenvalue (diagonal scaled to one) "
+            f"is {lowest:.3g}. Negative springs or dampers are not modelled."
+        )
+
+
+def check_shapes(n: int, **matrices) -> None:
+    for name, matrix in matrices.items():
+        if matrix.shape != (n, n):
+            raise ValueError(
+                f"Argument `{name}` must have shape ({n}, {n}) to go with the mass matrix, but has shape {matrix.shape}."
+            )
+
+
+def checked_index(name: str, index, n: int) -> int:
+    if isinstance(index, bool) or not isinstance(index, int | np.integer):
+        raise TypeError(f"Argument `{name}` must be the index of a coordinate, but is {arguments.describe(index)}.")
+    if not 0 <= index < n:
+        raise ValueError(f"Argument `{name}` must be between 0 and {n - 1}, but is {index}.")
+    return int(index)
+
+
+def checked_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
+    """The names of the coordinates, q0, q1, … unless given."""
+    if names is None:
+        return tuple(f"q{i}" for i in range(n))
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f"Argument `coordinates` must be a list of names, but is {names!r}.")
+    if len(names) != n or len(set(names)) != n:
+        raise ValueError(f"Argument `coordinates` must hold {n} different names, but is {list(names)!r}.")
+    return tuple(names)

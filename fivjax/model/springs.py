@@ -1,0 +1,38 @@
+"""A stiffness matrix as springs that are each stretched by the motion, so that a rigid motion stretches none."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Springs(eqx.Module):
+    r"""A stiffness matrix as so many springs, $K = B^T \mathrm{diag}(k) B$ with a triangular $B$.
+
+    Structures may be free to move as a whole. In $Kq$ the stiff springs cancel then only to rounding, which pulls a soft
+    structure back that has come far; the stretches $Bq$ of such a motion are zero, and so are the forces.
+    """
+
+    stretch: Float[Array, "n n"]  # B, how displacements stretch the springs
+    rates: Float[Array, " n"]  # k, N/m; exactly zero where the structure is free
+
+    def __init__(self, stiffness: Float[Array, "n n"]):
+        n, left, columns, rates = stiffness.shape[0], stiffness, [], []
+        eps = float(jnp.finfo(stiffness.dtype).eps)
+        for k in range(n):
+            rate = left[k, k]
+            # What elimination leaves of a stiffness that is no larger than its rounding is none.
+            rate = jnp.where(rate > 16 * n * eps * stiffness[k, k], rate, 0.0)
+            column = jnp.where(jnp.arange(n) > k, left[:, k] / jnp.where(rate > 0, rate, 1.0), 0.0)
+            column = jnp.where(rate > 0, column, 0.0).at[k].set(1.0)
+            left = left - rate * column[:, None] * column[None, :]
+            columns.append(column)
+            rates.append(rate)
+        self.stretch, self.rates = jnp.stack(columns), jnp.stack(rates)
+
+    def stretches(self, displacement: Float[Array, " n"]) -> Float[Array, " n"]:
+        """How far each spring is stretched, in m."""
+        return jnp.sum(self.stretch * displacement, axis=-1)
+
+    def energy(self, displacement: Float[Array, " n"]) -> Float[Array, ""]:
+        """The energy stored in them, in J."""
+        return 0.5 * jnp.sum(self.rates * self.stretches(displacement) ** 2)
