@@ -19,15 +19,17 @@ from .linear import design as design
 from .maps.bistability import bistability_map as bistability_map
 from .maps.threshold import critical_perturbation as critical_perturbation
 from .maps.tradeoff_study import tradeoff as tradeoff
+from .model.belt import belt_oscillator as belt_oscillator
+from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import Coulomb as Coulomb
 from .model.friction import ExponentialDecay as ExponentialDecay
+from .model.load import AbstractLoad as AbstractLoad
 from .model.load import ConstantLoad as ConstantLoad
 from .model.load import Pulse as Pulse
 from .model.scene import Scene as Scene
 from .model.scene import painleve_friction as painleve_friction
 from .model.scene import sliding_equilibrium as sliding_equilibrium
 from .model.structure import Structure as Structure
-from .model.belt import belt_oscillator as belt_oscillator
 from .notebook.display import show as show
 from .notebook.explore import explorer as explorer
 from .paper.report import reproduce as reproduce
@@ -42,6 +44,7 @@ from .simulation.energy_cycles import energy_per_cycle as energy_per_cycle
 from .simulation.energy_cycles import energy_per_event as energy_per_event
 from .simulation.trajectory import Trajectory as Trajectory
 from .simulation.trajectory import simulate as simulate
+from .steppers.base import AbstractStepper as AbstractStepper
 from .steppers.base import vector_field as vector_field
 from .steppers.event_exact import EventExact as EventExact
 from .steppers.where_switched import WhereSwitched as WhereSwitched

@@ -4,6 +4,7 @@ import json
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr

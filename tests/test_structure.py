@@ -3,6 +3,7 @@
 import math
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -373,3 +374,58 @@ def test_springs_of_any_stiffness():
             stretch, rates = np.asarray(springs.stretch), np.asarray(springs.rates)
         assert np.sum(rates > 0) == rank and np.all(rates >= 0)
         np.testing.assert_allclose(stretch.T * rates @ stretch, root @ root.T, atol=1e-13)
+
+
+# --------------------------------------------------------------------------------------- one truth
+
+
+def test_matrices_follow_parameters_wherever_these_are_changed():
+    """Rejects a structure whose matrices and parameters disagree after one of them is changed behind its back."""
+    structure = fj.belt_oscillator()
+    with jax.enable_x64(True):
+        harder = eqx.tree_at(lambda s: s.parameters["c1"], structure, jnp.asarray(7.0))
+    np.testing.assert_array_equal(harder.damping, fj.belt_oscillator(c1=7.0).damping)
+    assert set(harder.damping_parts) == {"c1", "c2"}
+    with pytest.raises(TypeError, match="as_matrices") as refusal:
+        eqx.tree_at(lambda s: s.damping, structure, jnp.zeros((3, 3)))
+    assert sentence(str(refusal.value))
+
+
+def test_a_matrix_may_be_changed_once_parameters_are_forgotten():
+    """Shows the remedy that the refusal names: what is left of it has no parameters to disagree with."""
+    with jax.enable_x64(True):
+        undamped = eqx.tree_at(lambda s: s.damping, fj.belt_oscillator().as_matrices(), jnp.zeros((3, 3)))
+    assert not np.any(undamped.damping)
+    assert undamped.parameters == {}
+    assert undamped.coordinates == ("x2", "y1", "y2")
+    np.testing.assert_array_equal(undamped.mass, fj.belt_oscillator().mass)
+
+
+def test_a_batch_of_structures_has_a_batch_of_matrices():
+    """Shows that structures out of `vmap` can be read as each of them can."""
+    with jax.enable_x64(True):
+        batch = jax.vmap(lambda k1: fj.belt_oscillator(k1=k1))(jnp.array([9e4, 1e5]))
+    assert batch.stiffness.shape == (2, 3, 3)
+    np.testing.assert_allclose(batch.stiffness[1], fj.belt_oscillator().stiffness, rtol=1e-15)
+
+
+def test_derivatives_of_matrices_in_parameters():
+    """Rejects matrices that are constants to `grad`: of Eq. 5, K[1, 1] is k2, and M[0, 0] is m1 cos²θ + m2."""
+    with jax.enable_x64(True):
+        slopes = jax.grad(lambda k2: fj.belt_oscillator(k2=k2).stiffness[1, 1])(1e5)
+        by_theta = jax.grad(lambda theta: fj.belt_oscillator(theta=theta).mass[0, 0])(0.3)
+    assert float(slopes) == 1.0
+    assert float(by_theta) == pytest.approx(-0.53 * math.sin(0.6), rel=1e-14)
+
+
+def test_coordinates_have_names():
+    """Shows names in datasets; rejects names that are too few, repeated or no names."""
+    assert fj.belt_oscillator().coordinates == ("x2", "y1", "y2")
+    assert fj.Structure(**GOOD).coordinates == ("q0", "q1", "q2")
+    assert fj.Structure(**GOOD, coordinates=["a", "b", "c"]).coordinates == ("a", "b", "c")
+    for names in (["a", "b"], ["a", "b", "a"]):
+        with pytest.raises(ValueError, match=r"`coordinates` must hold 3 different names"):
+            fj.Structure(**GOOD, coordinates=names)
+    for names in ("abc", [0, 1, 2]):
+        with pytest.raises(TypeError, match=r"`coordinates` must be a list of names"):
+            fj.Structure(**GOOD, coordinates=names)

@@ -91,6 +91,12 @@ def refusing_reverse_in_single_precision(function: Callable[P, R]) -> Callable[P
     return wrapped
 
 
+def real_if_real(leaf):
+    """A real number or array of them as `real` has it; anything else (integers, words) unchanged."""
+    is_real = isinstance(leaf, float) or (hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.floating))
+    return real(leaf) if is_real else leaf
+
+
 def real(value) -> Array:
     """`value` as a float64 JAX array, also where a caller in single precision handed over float32."""
     return jnp.asarray(value, dtype=jnp.float64)

@@ -41,14 +41,7 @@ class StabilityLimit(eqx.Module):
 
 def bare(structure: Structure) -> Structure:
     """The structure without the memory of how it was made: one compiled program serves every builder."""
-    return Structure(
-        structure.mass,
-        structure.damping,
-        structure.stiffness,
-        structure.load_direction,
-        structure.tangential,
-        structure.normal,
-    )
+    return Structure(*structure.matrices, structure.tangential, structure.normal)
 
 
 def _is_a_limit(value):

@@ -37,7 +37,6 @@ HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
 
 @compiled
 def _coalescence(structure, direction):
-    structure = structure.as_matrices()
     undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
     loop, scale = friction_loop(undamped, direction)
     limit = first_limit(loop)

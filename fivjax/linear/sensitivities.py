@@ -109,7 +109,7 @@ def _slopes(structure: Structure, direction):
 
 
 def _named_parameters(structure: Structure):
-    if structure.builder is not None and structure.parameters:
+    if structure.parameters:
         return dict(structure.parameters), lambda parameters: structure.replace(**parameters)
     rows, columns = np.triu_indices(structure.size)
     values = {

@@ -9,7 +9,9 @@ import abc
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.jet import jet
 from jaxtyping import Array, Float
 
@@ -17,9 +19,23 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
 from .printing import as_call
 
+# Where a law is looked at: m/s.
+SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 121)])
+
 
 class AbstractFriction(eqx.Module):
-    """What `contact` and `verdict` ask of a friction law."""
+    r"""A friction law: what `contact` and the verdicts ask of one, and what they rely on.
+
+    - `law(v)` is the coefficient at slip speed $v \ge 0$ in m/s, smooth and also defined a little below zero.
+    - $0 \le μ(v) \le$ `static` for all $v \ge 0$: a contact that slips more easily while it sticks would chatter without end,
+      and Painlevé's limit is asked of `static`.
+    - `variation(v)` bounds $|μ'|$ and $|μ''|$ at and above $v$: proofs that sliding goes on rest on it.
+    - `constant` says that μ never changes.
+
+    A scene checks this where values are known, at slip speeds from 0 to 1e6 m/s, and holds the law's numbers in double
+    precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes by
+    the same name.
+    """
 
     # Constant friction makes every status linear; exact methods rest on that.
     constant: eqx.AbstractClassVar[bool]
@@ -32,6 +48,33 @@ class AbstractFriction(eqx.Module):
     @abc.abstractmethod
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         """The coefficient of friction while sliding at this slip speed."""
+
+    def check(self) -> None:
+        """Refuse a law that breaks its contract, where its values are known."""
+        static, speeds = self.static, jnp.asarray(SPEEDS)
+        mu, slope, bend, bounds = _sampled(self, speeds)
+        if not all(map(is_known, (static, mu))):
+            return
+        static, mu, name = float(static), np.asarray(mu), type(self).__name__
+
+        def refuse(wrong, rule: str):
+            if np.any(wrong):
+                at = int(np.argmax(wrong))
+                raise ValueError(
+                    f"The friction law `{name}` must {rule}, but is {mu[at]:g} at a slip speed of {SPEEDS[at]:g} m/s, with "
+                    f"`static` {static:g}. See `fivjax.AbstractFriction` for what a law promises."
+                )
+
+        refuse(~np.isfinite(mu) | ~np.isfinite(static), "be finite at every slip speed")
+        refuse(mu < 0, "not be negative")
+        # A law written as a sum may exceed its own largest value by rounding.
+        refuse(mu > static * (1 + 1e-12), "be at most `static` at every slip speed")
+        if self.constant:
+            refuse(mu != mu[0], "not change with slip speed where `constant` is true")
+        for what, values, bound in (("|μ'|", slope, bounds[0]), ("|μ''|", bend, bounds[1])):
+            # The largest from each speed on.
+            largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
+            refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
 
     def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
         """The last Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one)."""
@@ -46,6 +89,17 @@ class AbstractFriction(eqx.Module):
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))
+
+
+@jax.jit
+def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
+    slope = jax.grad(law)
+    return (
+        jax.vmap(law)(speeds),
+        jax.vmap(slope)(speeds),
+        jax.vmap(jax.grad(slope))(speeds),
+        jax.vmap(law.variation)(speeds),
+    )
 
 
 class Coulomb(AbstractFriction):
@@ -73,6 +127,9 @@ class Coulomb(AbstractFriction):
     @property
     def static(self) -> Float[Array, ""]:
         return self.mu if self.mu_static is None else self.mu_static
+
+    def check(self) -> None:
+        """The constructor has."""
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu
@@ -105,6 +162,9 @@ class ExponentialDecay(AbstractFriction):
     @property
     def static(self) -> Float[Array, ""]:
         return self.mu_static
+
+    def check(self) -> None:
+        """The constructor has."""
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)

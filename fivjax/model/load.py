@@ -5,18 +5,27 @@ through one.
 """
 
 import abc
+from itertools import pairwise
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from ..foundation.precision import in_double_precision, real
+from ..foundation.precision import in_double_precision, is_known, real
 from .printing import as_call
 
 
 class AbstractLoad(eqx.Module):
-    """What the steppers ask of a load."""
+    """A load: what the steppers ask of one, and what they rely on.
+
+    - `load(t)` is constant between its jumps: `force` before the first, `final` after the last.
+    - `jumps` are in order.
+
+    A scene checks this where values are known, and holds the load's numbers in double precision. Fields are the load's
+    parameters; what `replace` and maps change must be a field that the constructor takes by the same name.
+    """
 
     # Before any jump: the load whose sliding equilibrium a run starts from.
     force: eqx.AbstractVar[Float[Array, ""]]
@@ -34,6 +43,33 @@ class AbstractLoad(eqx.Module):
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The load at an instant that is not a jump, in N."""
+
+    def check(self) -> None:
+        """Refuse a load that breaks its contract, where its values are known."""
+        name, jumps, force, final = type(self).__name__, self.jumps, self.force, self.final
+        if not all(map(is_known, (jumps, force, final))):
+            return
+        jumps = np.asarray(jumps)
+        if jumps.ndim != 1 or not np.all(np.isfinite(jumps)) or np.any(np.diff(jumps) < 0):
+            raise ValueError(
+                f"The jumps of the load `{name}` must be finite instants in order, but are {jumps.tolist()}."
+            )
+        ends = [min([0.0, *jumps]) - 1.0, *jumps, max([0.0, *jumps]) + 1.0]
+        between = [
+            [float(self(jnp.asarray(a + share * (b - a)))) for share in (0.01, 0.5, 0.99)] for a, b in pairwise(ends)
+        ]
+        for values, (begin, end) in zip(between, pairwise(ends), strict=True):
+            if begin < end and not np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
+                raise ValueError(
+                    f"The load `{name}` must be constant between its jumps, but goes from {values[0]:g} N to {values[-1]:g} N "
+                    f"between {begin:g} s and {end:g} s."
+                )
+        for what, promised, found in (("force", force, between[0][1]), ("final", final, between[-1][1])):
+            if not np.isclose(found, float(promised), rtol=1e-12, atol=0):
+                when = "before its first jump" if what == "force" else "after its last jump"
+                raise ValueError(
+                    f"The load `{name}` must be `{what}` {when}, but is {found:g} N instead of {float(promised):g} N."
+                )
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))
@@ -59,6 +95,9 @@ class ConstantLoad(AbstractLoad):
     @property
     def final(self) -> Float[Array, ""]:
         return self.force
+
+    def check(self) -> None:
+        """It is made so."""
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         return self.force
@@ -93,6 +132,9 @@ class Pulse(AbstractLoad):
     @property
     def final(self) -> Float[Array, ""]:
         return self.force
+
+    def check(self) -> None:
+        """It is made so."""
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         kicked = (t >= self.start) & (t < self.start + self.duration)

@@ -3,12 +3,13 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from ..foundation.precision import in_double_precision, is_known, real, returning_numpy
+from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
 from .friction import AbstractFriction
 from .load import AbstractLoad, ConstantLoad
@@ -58,6 +59,10 @@ class Scene(eqx.Module):
         arguments.real_number("belt_speed", belt_speed)
         arguments.real_number("restitution", restitution, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
+        # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
+        friction, load = jax.tree.map(real_if_real, (friction, load))
+        friction.check()
+        load.check()
         self.structure = structure
         self.friction = friction
         self.belt_speed = real(belt_speed)
@@ -70,7 +75,8 @@ class Scene(eqx.Module):
         """Every numeric parameter by the name that `replace` and the axes of a map know it by."""
         found = {"belt_speed": self.belt_speed, "restitution": self.restitution}
         for part in (self.friction, self.load):
-            found.update({name: value for name, value in vars(part).items() if value is not None})
+            # What else is in a law of the user's own, words and switches, is no parameter.
+            found.update({name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)})
         return {**found, **self.structure.parameters}
 
     @in_double_precision

@@ -40,10 +40,7 @@ def sliding_matrices(
 ) -> tuple[Float[Array, "m m"], Float[Array, "m m"], Float[Array, "m m"]]:
     """M, C and K of the sliding motion (Eq. 3) under constant friction σμ, in kg, N·s/m and N/m."""
     free = sliding_coordinates(structure.size, structure.normal)
-    mass, damping, stiffness = (
-        sliding_rows(structure, matrix, friction)[:, free]
-        for matrix in structure.matrices[:3]
-    )
+    mass, damping, stiffness = (sliding_rows(structure, matrix, friction)[:, free] for matrix in structure.matrices[:3])
     return mass, damping, stiffness
 
 

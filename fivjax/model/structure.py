@@ -35,7 +35,8 @@ class Matrices(NamedTuple):
 class FromParameters(eqx.Module):
     """Parameters by name, and the function from them to the matrices."""
 
-    parameters: dict[str, Float[Array, "..."]]
+    values: dict[str, Float[Array, "..."]]
+    names: tuple[str, ...] = eqx.field(static=True)  # in the order that they were given in, which JAX does not keep
     matrices_of: Callable[..., tuple] = eqx.field(static=True)
     # Which parameters are dampers: the damping matrix is a sum of parts, each proportional to one of them.
     dampers: tuple[str, ...] = eqx.field(static=True)
@@ -45,7 +46,12 @@ class FromParameters(eqx.Module):
     @property
     def matrices(self) -> Matrices:
         """Worked out anew each time, compiled as a whole."""
-        return self._at(self.parameters)
+        return self._at(self.values)
+
+    @property
+    def parameters(self) -> dict[str, Float[Array, "..."]]:
+        """The values by name."""
+        return {name: self.values[name] for name in self.names}
 
     @property
     def damping_parts(self) -> dict[str, Float[Array, "n n"]]:
@@ -55,7 +61,7 @@ class FromParameters(eqx.Module):
             name: self._at(
                 {
                     other: jnp.zeros_like(value) if other in self.dampers and other != name else value
-                    for other, value in self.parameters.items()
+                    for other, value in self.values.items()
                 }
             ).damping
             for name in self.dampers
@@ -177,7 +183,7 @@ class Structure(eqx.Module):
         unknown = [name for name in dampers if name not in parameters]
         if unknown:
             raise ValueError(f"Argument `dampers` must name parameters, but has {unknown[0]!r}.")
-        source = FromParameters(parameters, matrices_of, tuple(dampers), builder)
+        source = FromParameters(parameters, tuple(parameters), matrices_of, tuple(dampers), builder)
         checked = cls(*source.matrices, tangential, normal, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
 

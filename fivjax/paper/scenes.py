@@ -9,10 +9,10 @@ import dataclasses
 
 import numpy as np
 
+from ..model.belt import belt_oscillator
 from ..model.friction import AbstractFriction, Coulomb, ExponentialDecay
 from ..model.load import Pulse
 from ..model.scene import Scene, sliding_equilibrium
-from ..model.belt import belt_oscillator
 from ..simulation.trajectory import Trajectory, simulate
 
 # Table 1, as printed: value and unit.

@@ -163,8 +163,9 @@ class Books(eqx.Module):
     final_load: Float[Array, ""]
 
     def __init__(self, scene: Scene):
-        self.structure = scene.structure
-        self.springs = Springs(scene.structure.stiffness)
+        # Read in every step: worked out once.
+        self.structure = scene.structure.as_matrices()
+        self.springs = Springs(self.structure.stiffness)
         self.dampers = scene.structure.damping_parts
         self.final_load = scene.load.final
 
