@@ -170,11 +170,13 @@ def test_gradients_in_a_process_without_double_precision():
         import fivjax as fj
         from fivjax import cea
         structure = fj.belt_oscillator()
-        gradient = jax.grad(cea.critical_friction)(structure)
+        gradient = jax.grad(cea.critical_friction)(structure.as_matrices())
         assert gradient.stiffness.dtype == np.float64 and gradient.mass.dtype == np.float64
         by_name = -4.6249593467e-05
         row = np.array([np.cos(0.01), 0.0, -np.sin(0.01)])
         assert abs(row @ np.asarray(gradient.stiffness) @ row - by_name) < 1e-9 * abs(by_name)
+        by_parameter = jax.grad(cea.critical_friction)(structure).parameters["k1"]
+        assert abs(float(by_parameter) - by_name) < 1e-9 * abs(by_name)
         limit = lambda k1: cea.critical_friction(structure.replace(k1=k1))
         assert abs(jax.jit(jax.grad(limit))(100e3) - by_name) < 1e-6 * abs(by_name)
         rate = jax.grad(lambda mu: cea.growth_rate(structure, mu))(0.3)

@@ -263,9 +263,7 @@ def _simulate(
     }
 
 
-def _grown(
-    scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T 2n"]
-) -> Bool[Array, " T"]:
+def _grown(scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T 2n"]) -> Bool[Array, " T"]:
     """Which states are a billionfold beyond what the start, the belt and the load can explain."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
