@@ -117,7 +117,7 @@ def test_a_full_disk_costs_nothing_that_was_finished(paper_scene, whole, tmp_pat
             raise OSError(errno.ENOSPC, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr("fivjax.io.datasets.os.fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.warns(UserWarning, match="No space left on device"):
         m = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     assert same(m, whole)
