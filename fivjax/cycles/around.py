@@ -14,7 +14,7 @@ from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
-from .section_map import Point, mechanics_about_sliding
+from .section_map import Point, flow_with_jacobian, mechanics_about_sliding
 
 # Places in a segment where the tangential speed is looked at; about its largest, Newton's method finds the peak.
 SAMPLES = 24
@@ -162,27 +162,6 @@ def word(segments: Round) -> tuple[Phase, ...]:
     return tuple(Phase(Status(status), duration) for (status, _), duration in letters)
 
 
-@compiled
-def monodromy(
-    scene: Scene, stepper: EventExact, start: Point, after: Float[Array, ""], period: Float[Array, ""]
-) -> Float[Array, "2n 2n"]:
-    """The derivative of the motion over one period, from the state a time `after` (s) past a start, inside a segment.
-
-    Every event's saltation matrix is in it, because event times are differentiated implicitly.
-    """
-    mechanics = mechanics_about_sliding(scene)
-    zero = jnp.zeros((), start.y.dtype)
-    base = follow(stepper, mechanics, start.contact, zero, start.y, after, kind="lax")
-
-    def over_a_period(y):
-        return follow(stepper, mechanics, base.contact, zero, y, period, kind="lax").y
-
-    def along(direction):
-        return jax.jvp(over_a_period, (base.y,), (direction,))[1]
-
-    return jax.vmap(along, out_axes=1)(jnp.eye(base.y.shape[0], dtype=base.y.dtype))
-
-
 def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
@@ -193,7 +172,8 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
     longest = int(np.argmax(moving * segments.h))
     contact = jax.tree.map(lambda leaf: jnp.asarray(leaf[longest]), segments.contact)
     start = Point(jnp.asarray(segments.y[longest]), contact)
-    matrix = np.asarray(monodromy(scene, stepper, start, jnp.asarray(0.5 * segments.h[longest]), jnp.asarray(period)))
+    middle, _ = flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
+    _, matrix = flow_with_jacobian(scene, stepper, middle, period)
     free = free_coordinates(scene, Status(int(segments.contact.status[longest])))
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]

@@ -76,8 +76,8 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
 
 
 def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> tuple[Return, np.ndarray]:
-    found, jacobian = return_with_jacobian(scene, stepper, point, jnp.asarray(crossings, jnp.int32))
-    return jax.tree.map(jnp.asarray, found), np.asarray(jacobian)
+    found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
+    return jax.tree.map(jnp.asarray, found), jacobian
 
 
 def _same_mode(a: Point, b: Point) -> bool:

@@ -117,7 +117,7 @@ def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: i
     """The points of the section on one period from the given one on."""
     points = [np.asarray(point.y)]
     for _ in range(crossings - 1):
-        found, _ = return_with_jacobian(scene, stepper, point, jnp.asarray(1, jnp.int32))
+        found, _ = return_with_jacobian(scene, stepper, point, 1)
         point = found.point
         points.append(np.asarray(point.y))
     return np.stack(points)

@@ -19,7 +19,7 @@ from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, point_of, under_final_load
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
-from .torus import torus_of
+from .torus import on_torus, torus_of
 
 # Loads that trajectories are released from, in final loads.
 RELEASES = (1.2, 1.5, 2.0, 3.0, 4.5, 6.0)
@@ -36,7 +36,7 @@ NEARLY = 0.1
 SAME = 1e-6
 # A motion has died out when it has no events any more and is this much smaller than the belt's motion, or has shrunk so much.
 FADED = 1e-6
-# Looks after which a motion that is neither periodic nor fading is tried as a torus.
+# Every so many looks a motion that is neither periodic nor fading is tried as a torus.
 TORUS_AFTER = 8
 
 
@@ -85,7 +85,7 @@ def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
     """All stable limit cycles that a search meets, the one with the largest amplitude first.
 
     Trajectories are released at rest from several multiples of the final load, and from each of `starts` (states `(2n,)`
-    in m and m/s, or trajectories). More than one cycle may coexist; there may be others that no trajectory of the search came to.
+    in m and m/s, or trajectories). More than one cycle may coexist; there may be others that no trajectory came to.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
     """
@@ -131,10 +131,10 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             if not events[-POINTS // 2 :].any() and _has_faded(scene, sizes[k], begun[k], look):
                 continue
             here = jax.tree.map(lambda leaf, k=k: leaf[k, -1], returns.point)
-            if _known(found, weights, y[k]):
+            if _known(scene, found, weights, y[k]):
                 continue
             cycle = _closed_near(scene, stepper, here, weights * y[k])
-            if cycle is None and look >= TORUS_AFTER and _keeps_its_size(sizes[k]):
+            if cycle is None and look % TORUS_AFTER == TORUS_AFTER - 1 and _keeps_its_size(sizes[k]):
                 cycle = torus_of(scene, stepper, here)
             if cycle is not None and cycle.stable and not _among(found, cycle):
                 found.append(cycle)
@@ -187,10 +187,12 @@ def _keeps_its_size(sizes: np.ndarray) -> bool:
     return bool(abs(np.log(np.mean(sizes[half:]) / np.mean(sizes[:half]))) < 0.05)
 
 
-def _known(found: list[LimitCycle], weights: np.ndarray, points: np.ndarray) -> bool:
+def _known(scene: Scene, found: list[LimitCycle], weights: np.ndarray, points: np.ndarray) -> bool:
     """Whether the last points lie on a cycle that is known already."""
     for cycle in found:
-        if cycle.kind != "periodic":
+        if cycle.kind == "torus":
+            if on_torus(scene, cycle, weights * points):
+                return True
             continue
         target = weights * cycle.points[0]
         apart = np.linalg.norm(weights * points[-2 * cycle.crossings :] - target, axis=-1) / np.linalg.norm(target)

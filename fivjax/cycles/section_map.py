@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact, Mechanics, Rest, State
@@ -67,15 +68,18 @@ def longest_return(scene: Scene) -> Float[Array, ""]:
     return 100 * 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
 
 
-def section_return(
-    stepper: EventExact, scene: Scene, mechanics: Mechanics, point: Point, crossings: Int[Array, ""] | int
+def moved(
+    stepper: EventExact,
+    mechanics: Mechanics,
+    start: Point,
+    crossings: Int[Array, ""] | int,
+    longest: Float[Array, ""],
 ) -> Return:
-    """From a point of the section, or any other start, to its `crossings`-th crossing; differentiable forward.
+    """The motion from a start to its `crossings`-th crossing of the section, or for a time `longest` (s).
 
-    Not a number where the section is not met within `longest_return` for each crossing.
+    Whichever comes first, and `arrived` says which. Differentiable forward.
     """
     none = jnp.zeros((), jnp.int32)
-    budget = longest_return(scene) * crossings
 
     def observe(total, segment: Segment):
         crossed, events, segments, peak = total
@@ -90,11 +94,11 @@ def section_return(
     after = follow(
         stepper,
         mechanics,
-        point.contact,
-        jnp.zeros((), point.y.dtype),
-        point.y,
-        budget,
-        total=(none, none, none, jnp.zeros((), point.y.dtype)),
+        start.contact,
+        jnp.zeros((), start.y.dtype),
+        start.y,
+        longest,
+        total=(none, none, none, jnp.zeros((), start.y.dtype)),
         observe=observe,
         until=lambda total: total[0] >= crossings,
         at_section=True,
@@ -103,20 +107,49 @@ def section_return(
     )
     crossed, events, segments, peak = after.total
     arrived = (crossed >= crossings) & jnp.all(jnp.isfinite(after.y))
-    y = jnp.where(arrived, after.y, jnp.nan)
-    return Return(Point(y, after.contact), budget - after.left, events, segments, peak, arrived)
+    return Return(Point(after.y, after.contact), longest - after.left, events, segments, peak, arrived)
+
+
+def section_return(
+    stepper: EventExact, scene: Scene, mechanics: Mechanics, point: Point, crossings: Int[Array, ""] | int
+) -> Return:
+    """From a point of the section, or any other start, to its `crossings`-th crossing.
+
+    Not a number where the section is not met within `longest_return` for each crossing.
+    """
+    found = moved(stepper, mechanics, point, crossings, longest_return(scene) * crossings)
+    y = jnp.where(found.arrived, found.point.y, jnp.nan)
+    return found._replace(point=Point(y, found.point.contact))
+
+
+def return_with_jacobian(
+    scene: Scene, stepper: EventExact, point: Point, crossings: int
+) -> tuple[Return, Float[np.ndarray, "2n 2n"]]:
+    """The return map at a point, and its derivative: saltation at each event and at the section included."""
+    found, jacobian = _moved_with_jacobian(
+        scene, stepper, point, jnp.asarray(crossings, jnp.int32), jnp.asarray(jnp.inf)
+    )
+    return found, np.where(found.arrived, np.asarray(jacobian), np.nan)
+
+
+def flow_with_jacobian(
+    scene: Scene, stepper: EventExact, start: Point, time: float
+) -> tuple[Point, Float[np.ndarray, "2n 2n"]]:
+    """Where the motion is after a time (s), and its derivative in the start at that fixed time."""
+    # The same program as the return map's, with crossings that are never reached.
+    never = jnp.asarray(np.iinfo(np.int32).max, jnp.int32)
+    found, jacobian = _moved_with_jacobian(scene, stepper, start, never, jnp.asarray(time, jnp.float64))
+    return found.point, np.asarray(jacobian)
 
 
 @compiled
-def return_with_jacobian(
-    scene: Scene, stepper: EventExact, point: Point, crossings: Int[Array, ""]
-) -> tuple[Return, Float[Array, "2n 2n"]]:
-    """The return map at a point, and its derivative: saltation at each event and at the section included."""
+def _moved_with_jacobian(scene: Scene, stepper: EventExact, point: Point, crossings, time):
     mechanics = mechanics_about_sliding(scene)
+    longest = jnp.minimum(time, longest_return(scene) * crossings)
 
     def along(direction):
         def state(y):
-            found = section_return(stepper, scene, mechanics, Point(y, point.contact), crossings)
+            found = moved(stepper, mechanics, Point(y, point.contact), crossings, longest)
             return found.point.y, found
 
         _, tangent, found = jax.jvp(state, (point.y,), (direction,), has_aux=True)
