@@ -76,8 +76,12 @@ class AbstractFriction(eqx.Module):
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
             refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
 
-    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
-        """The last Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one)."""
+    def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
+        """The next Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one).
+
+        `friction` has the coefficients of μ that are known; a law with a recurrence of its own needs no more than these.
+        """
+        del friction
         order = len(slip) - 1
         derivatives = [math.factorial(k) * slip[k] for k in range(1, order + 1)]
         _, series = jet(self.__call__, (slip[0],), (derivatives,))
@@ -169,13 +173,11 @@ class ExponentialDecay(AbstractFriction):
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)
 
-    def next_term(self, slip: list[Float[Array, ""]]) -> Float[Array, ""]:
+    def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
         # The exponential's own recurrence, Ė = -d u̇ E, does not start anew at every order as the general way does.
         order = len(slip) - 1
-        falling = [self(slip[0]) - self.mu_dynamic]
-        for k in range(1, order + 1):
-            falling.append(-self.decay / k * sum(j * slip[j] * falling[k - j] for j in range(1, k + 1)))
-        return falling[order]
+        falling = [friction[0] - self.mu_dynamic, *friction[1:]]
+        return -self.decay / order * sum(j * slip[j] * falling[order - j] for j in range(1, order + 1))
 
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         # Both derivatives shrink in size with slip speed, so the bound is the value at the lower end.

@@ -187,7 +187,7 @@ def _series(
             normal_forces.append(physics.total_forces(own, *sliding)[1])
         else:
             if not mechanics.friction.constant:
-                friction.append(mechanics.friction.next_term(slips))
+                friction.append(mechanics.friction.next_term(slips, friction))
             varying = sum((friction[j] * normal_forces[k - j] for j in range(1, len(friction))), none)
             normal = -(free[mechanics.normal] + contact.direction * g_tn * varying) / compliance
             normal_forces.append(normal)
