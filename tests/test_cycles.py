@@ -1,0 +1,155 @@
+"""Limit cycles against closed forms, against ODE solvers of another kind (`reference/cycles.json`), and against trajectories."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+
+REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
+
+
+def paper(belt_speed: float, mu: float = 0.227, **others) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), belt_speed=belt_speed, load=fj.ConstantLoad(100.0), **others)
+
+
+def benchmark_a(belt_speed: float) -> fj.Scene:
+    """A unit mass on a belt with exponentially falling friction; its normal coordinate never opens."""
+    structure = fj.Structure(np.eye(2), np.diag([0.1, 0.0]), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    return fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), belt_speed, fj.ConstantLoad(1.0))
+
+
+@pytest.fixture(scope="module")
+def cycle() -> fj.LimitCycle:
+    return fj.limit_cycle(paper(1.0))
+
+
+@pytest.fixture(scope="module")
+def saddle(cycle) -> fj.LimitCycle:
+    return fj.saddle_cycle(paper(1.0), cycle)
+
+
+def test_block_on_a_belt_has_the_closed_form_s_period_and_multipliers():
+    """Stick and slip times follow from Δ = F_s - F_d alone; after sticking nothing is left of a deviation."""
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.5, mu_static=1.0), belt_speed=0.2, load=fj.ConstantLoad(1.0))
+    cycle = fj.limit_cycle(scene)
+    slip, stick = 2.0 * (np.pi - np.arctan(0.5 / 0.2)), 2.0 * 0.5 / 0.2
+    assert cycle.period == pytest.approx(slip + stick, rel=1e-12)
+    durations = {phase.status: phase.duration for phase in cycle.word}
+    assert durations[fj.Status.STICK] == pytest.approx(stick, rel=1e-12)
+    assert durations[fj.Status.SLIDE] == pytest.approx(slip, rel=1e-12)
+    np.testing.assert_allclose(cycle.multipliers, [1.0, 0.0], atol=1e-12)
+    assert cycle.stable
+
+
+def test_the_paper_s_cycle_is_the_reference_s(cycle):
+    expected = next(case for case in REFERENCE["paper"]["periodic"] if case["belt_speed"] == 1.0)
+    assert cycle.kind == "periodic" and cycle.stable and cycle.residual < 1e-12
+    assert cycle.period == pytest.approx(expected["period"], rel=1e-12)
+    assert cycle.amplitude == pytest.approx(expected["peak_speed"], rel=1e-12)
+    np.testing.assert_allclose(cycle.deviation[:3], expected["deviation"], atol=1e-14)
+    np.testing.assert_allclose(cycle.state[3:], expected["velocity"], atol=1e-11)
+    nontrivial = [complex(*value) for value in expected["multipliers"]]
+    np.testing.assert_allclose(cycle.multipliers, [1.0, *nontrivial], atol=1e-9)
+    # The reference begins its cycle elsewhere in the word, and cuts the phase that the section is in.
+    modes = [int(phase.status) for phase in cycle.word]
+    assert modes == expected["modes"][:-1]
+    assert sum(phase.duration for phase in cycle.word) == pytest.approx(cycle.period, rel=1e-13)
+
+
+def test_one_period_by_simulation_ends_where_it_began(cycle):
+    run = cycle.trajectory(2000)
+    assert run.t[-1] == pytest.approx(cycle.period, rel=1e-14)
+    np.testing.assert_allclose(run.velocity[-1], run.velocity[0], atol=1e-11)
+    np.testing.assert_allclose(run.displacement[-1], run.displacement[0], atol=1e-14)
+    assert np.abs(run.velocity[:, 0]).max() == pytest.approx(cycle.amplitude, rel=1e-3)
+    lines = np.fft.rfft(run.velocity[:-1, 0])[1:4] * 2 / 2000
+    np.testing.assert_allclose(np.abs(cycle.harmonics[:3, 0]), np.abs(lines), rtol=1e-3)
+
+
+def test_energy_per_period_balances(cycle):
+    """Over a period nothing is stored: what the contact puts in, dampers and impacts take."""
+    energy = cycle.energy
+    gained = energy["stick_work"] + energy["slide_work"] + energy["load_work"]
+    lost = energy["damping_work"] + energy["impact_loss"]
+    assert lost > 1e-3
+    assert gained == pytest.approx(lost, rel=1e-9)
+
+
+def test_multipliers_are_those_of_differences(cycle):
+    """A trajectory beside the cycle approaches it at the rate of the largest multiplier but one, return by return."""
+    apart = cycle.deviation * 1e-6
+    state = cycle.state + apart * np.array([1, 1, 0, 0, 1, 0])
+    run = fj.simulate(cycle.scene, t1=30 * cycle.period, dt_save=cycle.period, y0=state)
+    away = np.linalg.norm(run.velocity - run.velocity[-1], axis=1)[4:16]
+    rate = np.exp(np.polyfit(np.arange(len(away)), np.log(away), 1)[0])
+    assert rate == pytest.approx(abs(cycle.multipliers[1]), rel=0.05)
+
+
+def test_the_saddle_has_one_direction_outside_and_lies_between_sliding_and_the_cycle(cycle, saddle):
+    outside = np.abs(saddle.multipliers) > 1 + 1e-9
+    assert outside.sum() == 1 and not saddle.stable and saddle.residual < 1e-12
+    assert saddle.amplitude < cycle.amplitude
+    # Beside it, trajectories leave to either side.
+    weights = np.asarray(saddle.scene.structure.weights)
+    for share, stays in ((1.02, True), (0.98, False)):
+        equilibrium = saddle.state - saddle.deviation
+        run = fj.simulate(saddle.scene, t1=3.0, dt_save=0.015, y0=equilibrium + share * saddle.deviation)
+        sizes = np.linalg.norm(
+            weights * (np.concatenate([run.displacement, run.velocity], axis=1) - equilibrium), axis=1
+        )
+        assert (sizes[-40:].max() > np.linalg.norm(weights * saddle.deviation)) == stays
+
+
+def test_from_a_start_newton_finds_the_unstable_cycle_too(saddle):
+    again = fj.limit_cycle(paper(1.0), start=(saddle.state, saddle.contact.status))
+    assert again.period == pytest.approx(saddle.period, rel=1e-12) and not again.stable
+    nearby = fj.limit_cycle(paper(1.01), start=saddle)
+    assert abs(nearby.period - saddle.period) < 1e-3 * saddle.period and not nearby.stable
+
+
+def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
+    """At 3 m/s the motion beats for ever, some 14 returns to a beat; its peak is the reference's over a long run."""
+    torus = fj.limit_cycle(paper(3.0))
+    assert torus.kind == "torus" and torus.stable
+    peaks = {case["belt_speed"]: case["peak_speed"] for case in REFERENCE["paper"]["peaks"]}
+    assert torus.amplitude == pytest.approx(peaks[3.0], rel=1e-4)
+    assert 1 / abs(torus.rotation_number) == pytest.approx(14, abs=0.5)
+    assert abs(abs(torus.multipliers[0]) - 1) < 0.01 and abs(torus.multipliers[1]) < 0.99
+
+
+@pytest.mark.parametrize("belt_speed", [0.3, 1.0])
+def test_below_the_fold_there_is_none(belt_speed):
+    """Just below its fold the cycle's ghost holds trajectories for hundreds of periods; it is no cycle."""
+    fold = {0.3: 0.1156, 1.0: 0.1679}[belt_speed]
+    with pytest.raises(fj.NoLimitCycle, match="No limit cycle was met"):
+        fj.limit_cycle(paper(belt_speed, mu=0.99 * fold))
+
+
+@pytest.mark.parametrize(
+    ("start", "fragment"),
+    [(np.zeros(5), "shape"), ("here", "must")],
+)
+def test_starts_of_the_wrong_kind_are_refused(start, fragment):
+    with pytest.raises((TypeError, ValueError), match=fragment):
+        fj.limit_cycle(paper(1.0), start=start)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("belt_speed", [1.2, 1.4, 1.6, 1.8])
+def test_benchmark_a_against_another_kind_of_solver(belt_speed):
+    """The unstable cycle of pure sliding and the stick-slip cycle, against DOP853 with its variational equation."""
+    sliding = REFERENCE["benchmark_a"]["sliding"][str(belt_speed)]
+    stick_slip = REFERENCE["benchmark_a"]["stick_slip"][str(belt_speed)]
+    cycle = fj.limit_cycle(benchmark_a(belt_speed))
+    durations = {phase.status: phase.duration for phase in cycle.word}
+    assert durations[fj.Status.SLIDE] == pytest.approx(stick_slip["slip_time"], abs=1e-9)
+    assert durations[fj.Status.STICK] == pytest.approx(stick_slip["stick_time"], abs=1e-9)
+    saddle = fj.saddle_cycle(benchmark_a(belt_speed), cycle)
+    assert saddle.period == pytest.approx(sliding["period"], abs=1e-9)
+    np.testing.assert_allclose(saddle.multipliers, [sliding["multiplier"], 1.0], atol=1e-8)
+    run = saddle.trajectory(4000)
+    assert run.displacement[:, 0].max() == pytest.approx(sliding["peak_displacement"], abs=2e-6)
