@@ -1,8 +1,8 @@
 # The public names and where they stand; `__init__.py` reads this file.
 
 from . import plot as plot
-from .calibration.fit import Calibration as Calibration
 from .calibration.fit import calibrate as calibrate
+from .calibration.result import Calibration as Calibration
 from .contact import Status as Status
 from .cycles.cycle import LimitCycle as LimitCycle
 from .cycles.saddle import saddle_cycle as saddle_cycle
@@ -12,8 +12,8 @@ from .cycles.search import limit_cycles as limit_cycles
 from .io.datasets import open as open
 from .io.datasets import save as save
 from .io.files import save_figure as save_figure
+from .io.recording_files import read_recording as read_recording
 from .io.recordings import Recording as Recording
-from .io.recordings import read_recording as read_recording
 from .linear import cea as cea
 from .linear import design as design
 from .maps.bistability import bistability_map as bistability_map

@@ -1,6 +1,6 @@
 """A measured limit cycle beside that of a scene: frequency, harmonics, and fractions of time in the statuses.
 
-Both are exact. The recording's come from all of its samples with the errors that its noise makes (`features`); the scene's
+Both are exact. The recording's come from all of its samples with the errors that its noise makes (`harmonics`); the scene's
 from one closed period (`shooting`).
 """
 
@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 from ..io.recordings import Averaged, Channel, Recording, averaged
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from . import features
-from .misfit import AbstractMisfit, Compared, noise_of_means, sliding_frequencies
+from .harmonics import beating, fitted_harmonics, taper, without_lines
+from .misfit import AbstractMisfit, Compared, sliding_frequencies
+from .noise import noise_of_means
 from .shooting import Cycle, around, settled
 
 MOST_HARMONICS = 8
@@ -23,6 +24,8 @@ CYCLE_BLOCKS = (28, 48)
 CYCLE_PERIODS = 30
 # Errors of a guess: of the frequency, relative; of lines, as shares of the largest; of fractions of time, of it all.
 ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
+# What sampling folds down of lines far up, onto fitted lines, relative to the largest, and onto the frequency, relative.
+FOLDED, FOLDED_FREQUENCY = 1e-4, 1e-7
 # What lies about the fundamental without being part of it, relative: from here on a vibration beats.
 BEATS = 0.01
 
@@ -41,10 +44,11 @@ class CycleMisfit(AbstractMisfit):
     method: AbstractStepper
     width: Float[Array, ""]  # of a block, s
     fundamental: Float[Array, "2"]  # of the first channel at the first block's middle, as measured: cosine and sine
+    harmonic_part: Float[Array, "B k"]  # of the means, as measured
     beating: Float[Array, ""]  # size of what lies between the harmonics, relative
     count: int = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
-    fitted_by_elimination: int = eqx.field(static=True, default=0)
+    projected: int = eqx.field(static=True, default=0)
 
     @property
     def frequency(self) -> Float[Array, ""]:
@@ -87,40 +91,43 @@ class CycleMisfit(AbstractMisfit):
 
 
 def _referred(frequency, found):
-    """`features.referred`, to be differentiated."""
+    """`harmonics.referred`, to be differentiated."""
     size = jnp.sqrt(found[0, 0].real ** 2 + found[0, 0].imag ** 2)
     turned = found * (found[0, 0].conj() / size) ** jnp.arange(1, found.shape[0] + 1)[:, None]
     rest = turned.ravel()[1:]
     return jnp.concatenate([jnp.stack([frequency, size]), rest.real, rest.imag])
 
 
-def cycle_misfit(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> CycleMisfit:
+def misfit_of_cycle(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> CycleMisfit:
     """A recording of a limit cycle, averaged over blocks, ready to be compared."""
     width = float(blocks.edges[1] - blocks.edges[0])
     sigma = noise_of_means(recording, blocks)
     lowest, highest = _searched(scene, recording)
-    frequency = features.harmonics(blocks.means, width, 1, lowest, highest, sigma).frequency
+    frequency = fitted_harmonics(blocks.means, width, 1, lowest, highest, sigma).frequency
     count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
     lowest, highest = 0.6 * frequency, 1.6 * frequency
-    frequency = features.harmonics(blocks.means, width, count, lowest, highest, sigma).frequency
-    left, lines = features.without_lines(blocks.means, width, frequency, count)
+    frequency = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma).frequency
+    left, lines = without_lines(blocks.means, width, frequency, count)
     if recording.noise is None:
         # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
         sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / max(len(left) - 2 * count - 1, 1)))
-    measured = features.harmonics(blocks.means, width, count, lowest, highest, sigma)
+    measured = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma)
     fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
     of_samples = sigma * np.sqrt(blocks.per_block)
+    folded = np.full(len(measured.values), FOLDED * measured.values[1])
+    folded[0] = FOLDED_FREQUENCY * measured.frequency
     return CycleMisfit(
         means=jnp.asarray(blocks.means),
         sigma=jnp.asarray(sigma),
         known={name: jnp.asarray(value) for name, value in recording.known.items()},
         measured=jnp.asarray(measured.values),
-        whitening=jnp.asarray(np.linalg.inv(np.linalg.cholesky(measured.covariance))),
+        whitening=jnp.asarray(np.linalg.inv(np.linalg.cholesky(measured.covariance + np.diag(folded**2)))),
         fractions=jnp.asarray(fractions),
         method=method,
         width=jnp.asarray(width),
         fundamental=jnp.asarray([lines[0, 0].real, -lines[0, 0].imag]),
-        beating=jnp.asarray(features.between_lines(recording.values, 1 / recording.rate, frequency, of_samples)),
+        harmonic_part=jnp.asarray(blocks.means - left - (blocks.means - left).mean(axis=0)),
+        beating=jnp.asarray(beating(recording.values, 1 / recording.rate, frequency, of_samples)),
         count=count,
         channels=recording.channels,
     )
@@ -130,7 +137,7 @@ def cycle_rate(recording: Recording, scene: Scene) -> float:
     """Blocks per second for a limit cycle, so many to a period that what averaging folds down lies between its lines."""
     blocks = averaged(recording, 16 * sliding_frequencies(scene, recording).max())
     width = float(blocks.edges[1] - blocks.edges[0])
-    frequency = features.harmonics(
+    frequency = fitted_harmonics(
         blocks.means, width, 1, *_searched(scene, recording), noise_of_means(recording, blocks)
     ).frequency
     samples = recording.rate / frequency
@@ -147,8 +154,8 @@ def _folded(per_period: float) -> float:
     m = np.arange(1, 13)
     aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
     t = np.linspace(0, 1, 401)
-    taper = features.taper(len(t))
-    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ taper) / taper.sum()
+    weight = taper(len(t))
+    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ weight) / weight.sum()
     return float(np.sum(seen * MOST_HARMONICS / (m * per_period)))
 
 

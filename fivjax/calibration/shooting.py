@@ -75,8 +75,8 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
         return (y, after.contact), (y, after.contact)
 
     longest = int(LONGEST * LOOKS) + 1
-    spans = jnp.full(2 * longest + 1, 1 / (LOOKS * frequency)).at[0].set(SETTLING_PERIODS / frequency)
-    _, (states, contacts) = jax.lax.scan(to_next, (y0, status_from_forces(mechanics, load, y0)), spans)
+    durations = jnp.full(2 * longest + 1, 1 / (LOOKS * frequency)).at[0].set(SETTLING_PERIODS / frequency)
+    _, (states, contacts) = jax.lax.scan(to_next, (y0, status_from_forces(mechanics, load, y0)), durations)
     speed = states[:, n + tangential]
     rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
     begin = jnp.argmax(rises) + 1

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..calibration.fit import Calibration
+from ..calibration.result import Calibration
 from ..foundation import arguments
 from ..linear.cea import Sensitivity
 from ..plot import calibration as plot_calibration

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..calibration.fit import Calibration
+from ..calibration.result import Calibration
 from ..io.datasets import QUANTITIES
 
 MEASURED, FITTED, LEFT = "#56B4E9", "#000000", "#D55E00"
@@ -39,9 +39,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
     lines = []
     for name in fit.names:
         unit = QUANTITIES.get(name, ("", "1"))[1]
-        unit = "" if unit == "1" else f" {unit}"
-        told = fit.identifiable[name]
-        value = f"{fit.values[name]:.6g} ± {fit.uncertainty[name]:.2g}{unit}" if told else fit.untold
-        lines.append(f"{name} = {value}")
+        unit = "" if unit == "1" or not fit.identifiable[name] else f" {unit}"
+        lines.append(f"{name} = {fit.value_text(name)}{unit}")
     figure.suptitle("\n".join([str(fit.outcome).split(":")[0], *lines]), ha="left", x=0.02, fontsize="small")
     return figure

@@ -1,4 +1,4 @@
-"""Where fits set out from: a scene's own parameters, and others around them."""
+"""Where fits begin: a scene's own parameters, and others around them."""
 
 import jax
 import jax.numpy as jnp
@@ -11,35 +11,36 @@ from ..model.scene import Scene
 from .parameters import FreeParameters
 
 # Scenes that are looked at, by their sliding modes alone, for each that is followed to its limit cycle.
-TRIED_PER_START = 128
+TRIED_PER_GUESS = 128
 # How close to the measured frequency two sliding modes are sought: a limit cycle vibrates where modes have come together.
 CLOSE = 0.03
 
 
-def hypercube(
+def latin_hypercube(
     parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int
 ) -> Float[np.ndarray, "s k"]:
-    """Unbounded numbers of the scene's own values, then of others up to `spread` (relative) beside them: a Latin hypercube."""
-    own = np.array([float(scene.parameters[name]) for name in parameters.names])
-    rng = np.random.default_rng(seed)
-    strata = np.stack([rng.permutation(count - 1) for _ in own], axis=1) + rng.random((count - 1, len(own)))
-    factors = 1 + spread * (2 * strata / max(count - 1, 1) - 1)
-    return np.array([parameters.unbounded(values) for values in (own, *(own * factors))])
+    """Unbounded numbers of the scene's own values, then of others up to `spread` (relative) beside them."""
+    from scipy.stats import qmc
+
+    own = _own_values(parameters, scene)
+    shares = qmc.LatinHypercube(len(own), rng=seed).random(count - 1)
+    return _unbounded(parameters, np.vstack([own, own * (1 + spread * (2 * shares - 1))]))
 
 
-def vibrating(
+def near_frequencies(
     parameters: FreeParameters, scene: Scene, frequencies: list[float], count: int, spread: float, seed: int
 ) -> Float[np.ndarray, "s k"]:
     """The scene's own values, then such around them whose sliding modes lie at the measured frequencies (Hz).
 
-    A start that is `spread` too low lies `1/(1 - spread)` below the truth, so that far are they sought. Where fewer than
+    A guess that is `spread` too low lies `1/(1 - spread)` below the truth, so that far are they sought. Where fewer than
     `count` have two modes close to the frequency, those that come closest.
     """
-    own = np.array([float(scene.parameters[name]) for name in parameters.names])
-    rng = np.random.default_rng(seed)
+    from scipy.stats import qmc
+
+    own = _own_values(parameters, scene)
     widest = -np.log1p(-spread)
-    factors = np.exp(rng.uniform(-widest, widest, (TRIED_PER_START * count, len(own))))
-    tried = np.array([parameters.unbounded(values) for values in own * factors])
+    shares = qmc.LatinHypercube(len(own), rng=seed).random(TRIED_PER_GUESS * count)
+    tried = _unbounded(parameters, own * np.exp(widest * (2 * shares - 1)))
     matrices = np.asarray(state_matrices(parameters, scene, jnp.asarray(tried)))
     modes = np.abs(np.linalg.eigvals(matrices).imag) / (2 * np.pi)
     apart = np.zeros(len(tried))
@@ -49,6 +50,14 @@ def vibrating(
         apart = np.maximum(apart, away / frequency)
     order = np.argsort(np.maximum(apart, CLOSE), kind="stable")[: count - 1]
     return np.concatenate([parameters.unbounded(own)[None], tried[order]])
+
+
+def _own_values(parameters: FreeParameters, scene: Scene) -> Float[np.ndarray, " k"]:
+    return np.array([float(scene.parameters[name]) for name in parameters.names])
+
+
+def _unbounded(parameters: FreeParameters, values: Float[np.ndarray, "s k"]) -> Float[np.ndarray, "s k"]:
+    return np.array([parameters.unbounded(row) for row in values])
 
 
 @compiled

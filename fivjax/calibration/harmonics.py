@@ -1,11 +1,8 @@
-r"""What a vibration is told by: poles and shapes of a small motion, harmonics of one that repeats.
+r"""Harmonics of a measured limit cycle: its frequency, its Fourier coefficients, and how far noise moves them.
 
-Features know no phase, so a fit to them has no false minima a period apart.
-
-- A small motion is a sum of $a\,φ\,e^{λt}$: `poles` finds λ (growth rate and frequency) and φ (mode shape) by shift
-  invariance of the signal's subspace (ESPRIT; Roy and Kailath 1989), all channels together.
-- A limit cycle is a Fourier series: `harmonics` finds its frequency and its coefficients, referred to the phase of the
-  first channel's fundamental, and how they err; `between_lines` says whether it is one at all.
+A limit cycle is a Fourier series. `fitted_harmonics` finds its frequency and its coefficients, referred to the phase of the
+first channel's fundamental, with their covariance; `beating` says whether the vibration repeats at all. None of these
+depends on a phase, so a fit to them has no false minima a period apart.
 """
 
 from typing import NamedTuple
@@ -13,47 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-# Rows of the Hankel matrix: long enough to part two modes that beat within the recording, short enough to be quick.
-MOST_ROWS = 240
 REFINEMENTS = 5
-
-
-class Poles(NamedTuple):
-    """Poles with positive frequency, the strongest first."""
-
-    values: Complex[np.ndarray, " j"]  # 1/s
-    shapes: Complex[np.ndarray, "j k"]  # shares of the channels, as measured
-    explained: float  # share of the signal's energy that these poles account for
-
-
-def poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> Poles:
-    """The `count` strongest pairs of poles of evenly spaced signals, `dt` s apart; fewer where there are fewer."""
-    size = np.sqrt(np.mean(means**2, axis=0))
-    if not np.all(size > 0):
-        return Poles(np.zeros(0, complex), np.zeros((0, means.shape[1]), complex), 0.0)
-    signals = means / size
-    length = min(len(signals) // 2, MOST_ROWS)
-    windows = np.lib.stride_tricks.sliding_window_view(signals, length, axis=0)  # (B - length + 1, k, length)
-    hankel = windows.transpose(1, 2, 0).reshape(signals.shape[1] * length, -1)
-    # The left subspace is wanted alone, so the smaller Gram matrix does; what it squares away is far below the noise.
-    _, vectors = np.linalg.eigh(hankel @ hankel.T)
-    basis = vectors[:, -2 * count :].reshape(signals.shape[1], length, -1)
-    earlier, later = (part.reshape(-1, basis.shape[-1]) for part in (basis[:, :-1], basis[:, 1:]))
-    shift = np.linalg.lstsq(earlier, later, rcond=None)[0]
-    found = np.log(np.linalg.eigvals(shift).astype(complex)) / dt
-    # The motion between two instants turns by less than half a turn; what turns as far as that is noise.
-    upper = found[(found.imag > 1e-3 * np.pi / dt) & (found.imag < 0.9 * np.pi / dt)]
-    if upper.size == 0:
-        return Poles(upper, np.zeros((0, means.shape[1]), complex), 0.0)
-    t = dt * np.arange(len(signals))
-    both = np.concatenate([upper, upper.conj()])
-    # Each column at most 1, also where a spurious pole grows fast.
-    waves = np.exp(both[None, :] * t[:, None] - np.maximum(both.real, 0)[None, :] * t[-1])
-    shares = np.linalg.lstsq(waves, signals.astype(complex), rcond=None)[0]
-    left = signals - (waves @ shares).real
-    energy = np.linalg.norm(waves[:, : len(upper)], axis=0) * np.linalg.norm(shares[: len(upper)], axis=1)
-    order = np.argsort(-energy)
-    return Poles(upper[order], (shares[: len(upper)] * size)[order], 1.0 - float(np.mean(left**2)))
 
 
 class Harmonics(NamedTuple):
@@ -64,7 +21,7 @@ class Harmonics(NamedTuple):
     covariance: Float[np.ndarray, "m m"]
 
 
-def harmonics(
+def fitted_harmonics(
     means: Float[np.ndarray, "B k"],
     dt: float,
     count: int,
@@ -166,7 +123,7 @@ def _in_order(frequency, size, turned):
     return np.concatenate([[frequency, size], rest.real, rest.imag])
 
 
-def between_lines(
+def beating(
     signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigma: Float[np.ndarray, " k"]
 ) -> float:
     """How much a vibration beats: the size of what lies about its fundamental without being part of it, relative to that.
@@ -184,9 +141,9 @@ def between_lines(
     low = np.fft.rfftfreq(len(signals), dt) < 1.5 * frequency
     # Half of the power of a real signal is at the negative frequencies.
     noise = np.sum(low) * np.sum(weight**2) * signals.shape[1]
-    beating = max(np.sum(spectrum[low]) - 2 * noise, 0.0) / (0.5 * len(signals) * np.sum(weight**2))
+    between = max(np.sum(spectrum[low]) - 2 * noise, 0.0) / (0.5 * len(signals) * np.sum(weight**2))
     fundamental = np.sum(0.5 * (shares[1] ** 2 + shares[3] ** 2))
-    return float(np.sqrt(beating / fundamental)) if fundamental > 0 else 0.0
+    return float(np.sqrt(between / fundamental)) if fundamental > 0 else 0.0
 
 
 def without_lines(

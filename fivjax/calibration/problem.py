@@ -1,0 +1,164 @@
+"""What one fit compares: a scene with free parameters beside its recordings, as residuals with their Jacobian.
+
+What is compiled is one function of one point for each kind of residual (`_coarse`, `_compared`), with its whole Jacobian in
+forward mode; it serves every guess, every step and every fit of the same shape. A limit cycle brings unknowns of its own
+(`cycle_closing`).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..foundation.compiling import compiled
+from ..model.scene import Scene
+from .cycle_closing import corrected, is_closed, predicted
+from .cycle_misfit import CycleMisfit
+from .least_squares import Evaluated
+from .misfit import OFFSET_UNIT, AbstractMisfit
+from .parameters import FreeParameters
+from .shooting import Cycle
+
+# Far from the answer, each parameter is drawn towards its start by one standard deviation per this factor of e: what coarse
+# residuals do not tell stays where it was.
+REGULARISATION = 0.7
+# Shares of the recording below this are far from the answer.
+WHOLE = 1.0
+MOST_NEWTON_STEPS = 10
+
+
+class Problem(eqx.Module):
+    """Everything that the residuals of one fit need; all but names and shapes are arrays, so it compiles once."""
+
+    scene: Scene
+    parameters: FreeParameters
+    misfits: tuple[AbstractMisfit, ...]
+    references: Float[Array, " r"]  # time offsets that the moved ones are measured from, s
+    moved: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """How many parameters are free; unknown time offsets come after them."""
+        return len(self.parameters.names)
+
+    def offsets(self, x) -> list:
+        """Time offsets of all recordings, in s."""
+        found, at = [], self.size
+        for k, moved in enumerate(self.moved):
+            found.append(self.references[k] + OFFSET_UNIT * x[at] if moved else self.references[k])
+            at += moved
+        return found
+
+    def at(self, u) -> Scene:
+        """The scene with these parameters."""
+        return self.parameters.scene(self.scene, u)
+
+    @property
+    def cycles(self) -> list[CycleMisfit]:
+        """Those recordings that show a limit cycle."""
+        return [m for m in self.misfits if isinstance(m, CycleMisfit)]
+
+    def coarse(self, u: np.ndarray, u0: np.ndarray) -> Evaluated:
+        """Residuals that lead to the right period from afar, with a regularisation towards `u0`."""
+        residual, jacobian = _coarse(self, jnp.asarray(u), jnp.asarray(u0))
+        return Evaluated(np.asarray(residual), np.asarray(jacobian))
+
+    def compared(self, x: np.ndarray, x0: np.ndarray, share: float, about: "About | None") -> Evaluated:
+        """The scene beside the first `share` of the recordings, at a point of a fit that set out at `x0`.
+
+        Cycles are closed by Newton's method from where they were (`about`), or from what the scene settles on.
+        """
+        point, begin, window = jnp.asarray(x), jnp.asarray(x0), jnp.asarray(float(share))
+        cycles = ()
+        if self.cycles:
+            cycles = _settled(self, point) if about is None else predicted(self.tangential, point - about.x, about)
+        for _ in range(MOST_NEWTON_STEPS):
+            found = _compared(self, point, begin, window, cycles)
+            cycles, correction = found.about.cycles, float(found.correction)
+            # What is not finite will not close any more.
+            if is_closed(correction) or not np.isfinite(correction):
+                break
+        residual, jacobian = np.asarray(found.residual), np.asarray(found.jacobian)
+        if not (is_closed(correction) and np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+            return Evaluated(np.full_like(residual, np.inf), np.zeros_like(jacobian), found.about)
+        return Evaluated(residual, jacobian, found.about)
+
+    @property
+    def tangential(self) -> int:
+        return self.scene.structure.tangential
+
+
+class About(NamedTuple):
+    """What belongs to a point beside its residuals."""
+
+    x: Float[Array, " j"]
+    cycles: tuple[Cycle, ...]
+    follow: tuple[Float[Array, "2n j"], ...]  # how the unknowns of each cycle follow the parameters
+    systems: tuple[Float[Array, "2n 2n"], ...]  # how what does not close follows the unknowns
+    models: list[Float[Array, "B k"]]
+
+
+class _Compared(NamedTuple):
+    residual: Float[Array, " r"]
+    jacobian: Float[Array, "r j"]
+    correction: Float[Array, ""]  # of the cycles, the largest, relative; infinite where one changed its contact mode
+    about: About
+
+
+@compiled
+def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[Cycle, ...]) -> _Compared:
+    size, count = len(x), 2 * problem.scene.structure.size
+    tangential = problem.tangential
+
+    def beside(unknowns):
+        x, own = unknowns[:size], list(problem.offsets(unknowns[:size]))
+        places = [k for k, m in enumerate(problem.misfits) if isinstance(m, CycleMisfit)]
+        for i, k in enumerate(places):
+            own[k] = cycles[i].at(unknowns[size + i * count : size + (i + 1) * count], tangential)
+        scene = problem.at(x[: problem.size])
+        found = [m.compared(scene, o, share) for m, o in zip(problem.misfits, own, strict=True)]
+        # Far from the answer the harmonics of a limit cycle alone may not tell a parameter.
+        towards = jnp.where(share < WHOLE, (x - x0)[: problem.size] / REGULARISATION, 0.0)
+        residual = jnp.concatenate([*(one.residual for one in found), towards])
+        unclosed = [found[k].unclosed for k in places]
+        contacts = [found[k].contact for k in places]
+        return jnp.concatenate([residual, *unclosed]), (residual, unclosed, contacts, [one.model for one in found])
+
+    unknowns = jnp.concatenate([x, *(cycle.unknowns(tangential) for cycle in cycles)])
+    slopes, (residual, unclosed, contacts, models) = jax.jacfwd(beside, has_aux=True)(unknowns)
+    rows = residual.shape[0]
+    jacobian, correction = slopes[:rows, :size], jnp.zeros(())
+    better, follow, systems = [], [], []
+    for i, (cycle, gap, contact) in enumerate(zip(cycles, unclosed, contacts, strict=True)):
+        own = slice(rows + i * count, rows + (i + 1) * count), slice(size + i * count, size + (i + 1) * count)
+        systems.append(slopes[own])
+        solved = jnp.linalg.solve(systems[-1], jnp.concatenate([slopes[own[0], :size], gap[:, None]], axis=1))
+        follow.append(-solved[:, :-1])
+        # The parameters move the cycle, too; and to first order the residuals are those of the closed one.
+        towards = slopes[:rows, own[1]]
+        jacobian = jacobian + towards @ follow[-1]
+        residual = residual - towards @ solved[:, -1]
+        closer, moved = corrected(problem.scene.structure, cycle, -solved[:, -1], gap, contact)
+        better.append(closer)
+        correction = jnp.maximum(correction, moved)
+    about = About(x, tuple(better), tuple(follow), tuple(systems), models)
+    return _Compared(residual, jacobian, correction, about)
+
+
+@compiled
+def _settled(problem: Problem, x: Float[Array, " j"]) -> tuple[Cycle, ...]:
+    return tuple(m.settled(problem.at(x[: problem.size])) for m in problem.cycles)
+
+
+@compiled
+def _coarse(problem: Problem, u: Float[Array, " k"], u0: Float[Array, " k"]):
+    def coarse(u):
+        scene = problem.at(u)
+        found = jnp.concatenate([*(m.coarse(scene) for m in problem.misfits), (u - u0) / REGULARISATION])
+        return found, found
+
+    jacobian, residual = jax.jacfwd(coarse, has_aux=True)(u)
+    return residual, jacobian

@@ -1,0 +1,156 @@
+"""What a calibration found: a fitted scene, how far to trust it, and how the fit ended."""
+
+import enum
+
+import equinox as eqx
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from ..io.datasets import labelled
+from ..io.recordings import Recording
+from ..model.scene import Scene
+from .covariance import combinations
+from .goodness_of_fit import WhatIsLeft
+
+
+class FitOutcome(enum.StrEnum):
+    """How a calibration ended, as a sentence."""
+
+    CONVERGED = "converged"
+    STRUCTURE_LEFT = (
+        "converged, but what is left is not noise: the scene cannot explain all of the recording, so how far the parameters "
+        "are off is not known; correct or free what differs from the scene"
+    )
+    DOES_NOT_FIT = (
+        "the model does not fit: most of what was recorded is left, and it is not noise; check regime, channels and units, "
+        "and correct or free what differs from the scene"
+    )
+    NOT_CONVERGED = "not converged: the last fit ran out of steps; start closer, free fewer parameters or set bounds"
+    NO_SIGNAL = "no signal: what was recorded does not stand out of the noise, so it tells nothing about the parameters"
+    BEATS = (
+        "not fitted: a recording of a limit cycle does not repeat, it beats or has not settled, so it has no harmonics to "
+        "compare; record it later or with a slower belt, or record how it starts, as a kick or as sliding"
+    )
+    UNSTABLE = (
+        "not stable: the limit cycle that fits best would not last in this scene, so it is not what was measured; start "
+        "closer, or free what differs from the scene"
+    )
+
+
+# Outcomes that end at a minimum; of the others no parameter is told.
+FITTED = (FitOutcome.CONVERGED, FitOutcome.STRUCTURE_LEFT)
+
+
+class Calibration(eqx.Module):
+    """A fitted scene, and how far to trust it.
+
+    Parameters that the data do not tell have NaN as value and uncertainty; the scene holds what the fit ended with. Where
+    what is left is not noise, all uncertainties are NaN: they would be those of a right model.
+    """
+
+    scene: Scene
+    names: tuple[str, ...] = eqx.field(static=True)
+    estimates: Float[np.ndarray, " k"]  # all of them, also those that are not identifiable
+    deviations: Float[np.ndarray, " k"]  # standard deviations, in the parameters' own units; infinite if not known
+    identified: Bool[np.ndarray, " k"]
+    correlation: Float[np.ndarray, "k k"]
+    singular_values: Float[
+        np.ndarray, " j"
+    ]  # of the Jacobian in units of noise per whole parameter; time offsets included
+    offsets: tuple[tuple[float, float] | None, ...]  # value and standard deviation, s; None where there is none
+    recordings: tuple[Recording, ...]
+    t: tuple[np.ndarray, ...]  # middle of the blocks, s after the recording's first sample
+    measured: tuple[np.ndarray, ...]  # block means, (B, k)
+    fitted: tuple[np.ndarray, ...]
+    noise: tuple[np.ndarray, ...]  # standard deviation of a block mean, by channel
+    left: WhatIsLeft  # of the recordings, beside their noise
+    evaluations: int
+    outcome: FitOutcome = eqx.field(static=True)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the optimiser arrived."""
+        return self.outcome in FITTED
+
+    @property
+    def misfit(self) -> float:
+        """Sum of squared residuals per degree of freedom, in units of a noise that the fit does not know; 1 for noise alone."""
+        return self.left.misfit
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters, NaN where they are not identifiable, and all of them where no fit was found."""
+        return self._by_name(self.estimates)
+
+    @property
+    def uncertainty(self) -> dict[str, float]:
+        """Their standard deviations, NaN where they are not identifiable or not known."""
+        return self._by_name(np.where(np.isfinite(self.deviations), self.deviations, np.nan))
+
+    @property
+    def identifiable(self) -> dict[str, bool]:
+        """Whether the data tell each parameter."""
+        return dict(zip(self.names, map(bool, self.identified), strict=True))
+
+    @property
+    def residuals(self) -> tuple[np.ndarray, ...]:
+        """Measured less fitted block means, by recording."""
+        return tuple(m - f for m, f in zip(self.measured, self.fitted, strict=True))
+
+    @property
+    def combinations(self) -> list[tuple[tuple[str, ...], float]]:
+        """Parameters that the data tell only in combination: groups of names, and the largest correlation of each group."""
+        return combinations(self.names, self.correlation) if self.converged else []
+
+    def value_text(self, name: str) -> str:
+        """A parameter with its uncertainty, or what stands in place of a number."""
+        if not self.identifiable[name]:
+            no_signal = self.outcome is FitOutcome.NO_SIGNAL
+            return "not identifiable" if self.converged or no_signal else "not told"
+        deviation = self.uncertainty[name]
+        return f"{self.values[name]:.6g} ± " + ("not known" if np.isnan(deviation) else f"{deviation:.2g}")
+
+    def _by_name(self, array):
+        return {
+            name: float(value) if identified else float("nan")
+            for name, value, identified in zip(self.names, array, self.identified, strict=True)
+        }
+
+    def __str__(self) -> str:
+        said = [f"{self.outcome}; misfit {self.misfit:.3g} per degree of freedom"]
+        if self.outcome in (FitOutcome.STRUCTURE_LEFT, FitOutcome.DOES_NOT_FIT):
+            said.append(f"  what is left: {self.left}")
+        said += [f"  {name:<12}{self.value_text(name)}" for name in self.names]
+        for group, correlation in self.combinations:
+            said.append(f"  {', '.join(group)}: told only in combination (correlation {correlation:.3f})")
+        for k, offset in enumerate(self.offsets):
+            if offset is not None:
+                error = f"{offset[1]:.2g}" if np.isfinite(offset[1]) else "not known"
+                said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {error} s")
+        return "\n".join(said)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Parameters with uncertainties, and data and fit of recording r over `t_r` and `channel_r`."""
+        dataset = xr.Dataset(
+            {
+                "value": ("parameter", np.array(list(self.values.values()))),
+                "uncertainty": ("parameter", np.array(list(self.uncertainty.values()))),
+                "identifiable": ("parameter", self.identified),
+                "estimate": ("parameter", self.estimates),
+                "correlation": (("parameter", "other"), self.correlation),
+                "singular_value": ("direction", self.singular_values),
+            },
+            coords={"parameter": list(self.names), "other": list(self.names)},
+        )
+        for k, recording in enumerate(self.recordings):
+            dims = (f"t_{k}", f"channel_{k}")
+            dataset[f"measured_{k}"] = (dims, self.measured[k])
+            dataset[f"fitted_{k}"] = (dims, self.fitted[k])
+            dataset = dataset.assign_coords(
+                {dims[0]: self.t[k], dims[1]: [str(channel) for channel in recording.channels]}
+            )
+            dataset[f"measured_{k}"].attrs["regime"] = recording.regime
+        dataset = labelled(dataset, self.scene)
+        dataset.attrs.update(outcome=str(self.outcome), misfit=self.misfit, what_is_left=str(self.left))
+        return dataset

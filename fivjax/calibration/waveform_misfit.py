@@ -1,0 +1,165 @@
+"""A small motion or the response to a kick beside a recording, block by block."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from ..io.recordings import Averaged, Channel, Recording
+from ..linear.linearisation import linear_sliding
+from ..model.scene import Scene, steady_sliding
+from ..simulation.trajectory import states_at
+from ..steppers.base import MOST_ADVANCES, AbstractStepper
+from .characteristic import characteristic_residual
+from .misfit import AbstractMisfit, Compared, finite, sliding_coordinates, window
+from .mode_poles import strongest_poles
+from .noise import noise_of_means
+
+# Poles that leave more of the signal's energy unexplained are not those of a small motion.
+LEAST_EXPLAINED = 0.7
+
+
+class SlidingMisfit(AbstractMisfit):
+    """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
+    found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+
+    edges: Float[Array, " B+1"]
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    poles: Complex[Array, " j"]
+    shapes: Complex[Array, "j k"]
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    projected: int = eqx.field(static=True)
+
+    def coarse(self, scene):
+        return characteristic_residual(scene.replace(**self.known), self.poles, self.shapes, self.channels)
+
+    def compared(self, scene, own, share):
+        weight = window(self.edges, share)[:, None] / self.sigma
+        waves, target = self._waves(scene), weight * self.means
+        q, r = jnp.linalg.qr((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
+        target = target.ravel()
+        amplitudes = jax.scipy.linalg.solve_triangular(r, q.T @ target)
+        return Compared(finite(target - q @ (q.T @ target)), waves @ amplitudes, jnp.zeros(0), None)
+
+    def _waves(self, scene) -> Float[Array, "B k m"]:
+        """Block means for each unit initial state, scaled alike."""
+        scene = scene.replace(**self.known)
+        matrix = linear_sliding(scene).matrix
+        m = matrix.shape[0] // 2
+        width = self.edges[1] - self.edges[0]
+        states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
+        keep = sliding_coordinates(scene)
+        columns = []
+        for quantity, coordinate in self.channels:
+            row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
+            columns.append((states[1:, row] - states[:-1, row]) / width)
+        waves = jnp.stack(columns, axis=1)
+        # Displacements and velocities differ by the frequency, which least squares need not see.
+        return waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
+
+
+class KickMisfit(AbstractMisfit):
+    """The response to the scene's own load, from steady sliding, through every contact event."""
+
+    edges: Float[Array, " B+1"]
+    means: Float[Array, "B k"]
+    sigma: Float[Array, " k"]
+    known: dict[str, Array]
+    poles: Complex[Array, " j"]
+    shapes: Complex[Array, "j k"]
+    method: AbstractStepper
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    # Whether no contact event is taken to happen: then matrix exponentials do, a hundred times as fast.
+    uneventful: bool = eqx.field(static=True)
+    projected: int = eqx.field(static=True, default=0)
+
+    def coarse(self, scene):
+        return characteristic_residual(scene.replace(**self.known), self.poles, self.shapes, self.channels)
+
+    def compared(self, scene, own, share):
+        weight = window(self.edges, share)[:, None] / self.sigma
+        model = jnp.diff(self.integrals(scene, self.edges + own), axis=0) / (self.edges[1] - self.edges[0])
+        return Compared(finite(weight * (self.means - model)).ravel(), model, jnp.zeros(0), None)
+
+    def integrals(self, scene: Scene, instants: Float[Array, " i"], eventful: bool = False) -> Float[Array, "i k"]:
+        """What the channels are rates of, velocities and displacements, at evenly spaced instants of the simulation (s)."""
+        respond = _sliding_throughout if self.uneventful and not eventful else _through_events
+        y = respond(scene.replace(**self.known), self.method, instants)
+        return _integrals(y, self.channels)
+
+
+def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """States at instants of the simulation (s): the response from steady sliding, which it was in before, too."""
+    q, _ = steady_sliding(scene, scene.load.force)
+    y0 = jnp.concatenate([q, jnp.zeros_like(q)])
+    instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
+    y, *_ = states_at(scene, method, y0, instants, MOST_ADVANCES, derivatives="forward")
+    return y[1:]
+
+
+def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+    """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
+    matrix, keep = linear_sliding(scene).matrix, sliding_coordinates(scene)
+    n = scene.structure.size
+    steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
+
+    def equilibrium(force):
+        q, _ = steady_sliding(scene, force)
+        return jnp.concatenate([q[jnp.array(keep)], jnp.zeros(len(keep))])
+
+    rest = equilibrium(scene.load.force)
+    begin, z = jnp.zeros(()), rest
+    found = jnp.broadcast_to(rest, (instants.shape[0], len(rest)))
+    jumps = scene.load.jumps
+    for k in range(jumps.shape[0]):
+        z = rest + jax.scipy.linalg.expm((jumps[k] - begin) * matrix) @ (z - rest)
+        begin = jumps[k]
+        until = jumps[k + 1] if k + 1 < jumps.shape[0] else jnp.inf
+        middle = begin + jnp.minimum(0.5 * (until - begin), 1.0)
+        rest = equilibrium(scene.load(middle))
+        moving = steps @ (jax.scipy.linalg.expm((instants[0] - begin) * matrix) @ (z - rest)) + rest
+        found = jnp.where((instants >= begin)[:, None], moving, found)
+    columns = jnp.array([*keep, *(n + i for i in keep)])
+    return jnp.zeros((instants.shape[0], 2 * n)).at[:, columns].set(found)
+
+
+def _integrals(y, channels: tuple[Channel, ...]):
+    n = y.shape[1] // 2
+    return y[:, jnp.array([coordinate + (n if quantity == "acceleration" else 0) for quantity, coordinate in channels])]
+
+
+def _powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
+    """I, step, step², …: by doubling, so that a long recording is a few products of many matrices."""
+    powers, next_one = jnp.eye(step.shape[0])[None], step
+    while powers.shape[0] < count:
+        powers = jnp.concatenate([powers, powers @ next_one])
+        next_one = next_one @ next_one
+    return powers[:count]
+
+
+def misfit_of_waveform(
+    recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene, uneventful: bool
+) -> AbstractMisfit:
+    """A recording of a small motion or of a kick, averaged over blocks, ready to be compared."""
+    known = {name: jnp.asarray(value) for name, value in recording.known.items()}
+    sigma = noise_of_means(recording, blocks)
+    width = blocks.edges[1] - blocks.edges[0]
+    # A kick's response is a small motion again, if at all, towards its end.
+    tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
+    found = strongest_poles(tail, width, scene.structure.size - 1)
+    good = found.explained > LEAST_EXPLAINED
+    values, shapes = (found.values, found.shapes) if good else (found.values[:0], found.shapes[:0])
+    common: dict = {
+        "edges": jnp.asarray(blocks.edges),
+        "means": jnp.asarray(blocks.means),
+        "sigma": jnp.asarray(sigma),
+        "known": known,
+        "poles": jnp.asarray(values),
+        "shapes": jnp.asarray(shapes),
+        "channels": recording.channels,
+    }
+    if recording.regime == "sliding":
+        return SlidingMisfit(**common, projected=2 * (scene.structure.size - 1))
+    return KickMisfit(**common, method=method, uneventful=uneventful)

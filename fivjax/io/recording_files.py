@@ -1,0 +1,234 @@
+"""Recordings from files: which formats are read, in which units, and what is refused with its line or variable named."""
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..foundation import arguments
+from .recordings import Recording, channel
+
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "acceleration": {
+        "m/s2": 1.0,
+        "m/s^2": 1.0,
+        "m/s²": 1.0,
+        "mm/s2": 1e-3,
+        "mm/s^2": 1e-3,
+        "mm/s²": 1e-3,
+        "g": 9.80665,
+    },
+    "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2},
+}
+
+
+def read_recording(
+    path: str | Path,
+    regime: str = "kick",
+    *,
+    columns: Mapping[str, str] | None = None,
+    time: str | None = None,
+    rate: float | None = None,
+    units: Mapping[str, str] | None = None,
+    full_scale: float = 1.0,
+    **about,
+) -> Recording:
+    """A recording from a file: `.csv`/`.txt`, `.npy`/`.npz`, `.wav` or `.mat`.
+
+        fj.read_recording("squeal.csv", "limit cycle", belt_speed=1.0)
+        fj.read_recording("squeal.wav", columns={"0": "acceleration 0"}, full_scale=500.0)
+
+    - CSV: commas, semicolons or tabs; one line of names, then numbers. A unit may follow a name in brackets: `t (ms)`.
+    - NumPy: arrays by name (`.npz`, or a structured `.npy`); columns of a plain array are named "0", "1", …
+    - WAV: tracks are named "0", "1", …; `full_scale` is what the largest sample means, in the channel's unit.
+    - MATLAB: vectors by name.
+
+    **Arguments:**
+
+    - `regime` and what else is passed on: see `Recording`.
+    - `columns`: which column is which channel; unless given, those are taken whose names say so (`channel`).
+    - `time`: the name of the time base ("t" or "time" unless given); or `rate`, the sampling rate in Hz. WAV has its own.
+    - `units`: by the file's names; they go before the file's own. Without either, SI.
+
+    **Raises:** `ValueError` naming the file with the line, or the variable, that cannot be used.
+    """
+    path = Path(path)
+    readers = {".csv": _csv, ".txt": _csv, ".npy": _numpy, ".npz": _numpy, ".wav": _wav, ".mat": _matlab}
+    if path.suffix.lower() not in readers:
+        raise ValueError(
+            f"File `{path}` must be one of {', '.join(readers)}, but ends in {path.suffix or 'nothing'!r}."
+        )
+    if not path.is_file():
+        raise ValueError(f"File `{path}` does not exist.")
+    arguments.real_number("full_scale", full_scale, above=0)
+    if rate is not None:
+        arguments.real_number("rate", rate, above=0)
+    found, own_units, own_rate = readers[path.suffix.lower()](path)
+    units = {**own_units, **(units or {})}
+    scale = full_scale if path.suffix.lower() == ".wav" else 1.0
+    if columns is None:
+        columns = {name: name for name in found if _is_channel(name)}
+        if not columns:
+            raise ValueError(
+                f"File `{path}` names no channel such as `acceleration 0`; it has: {', '.join(found)}. Say which is "
+                f"which with `columns`."
+            )
+    for name in columns:
+        _must_have(path, found, name)
+    signals = {}
+    for name, meaning in columns.items():
+        unit = _unit(path, name, channel(meaning).quantity, units)
+        signals[channel(meaning)] = scale * unit * _vector(path, name, found[name])
+    rate = own_rate if rate is None else rate
+    if rate is None:
+        time = next((name for name in found if name.lower() in ("t", "time")), None) if time is None else time
+        if time is None:
+            raise ValueError(f"File `{path}` has no column `t` or `time`; name it with `time`, or give `rate` in Hz.")
+        _must_have(path, found, time)
+        base = _unit(path, time, "time", units) * _vector(path, time, found[time])
+    else:
+        base = float(rate)
+    try:
+        return Recording(base, signals, regime, **about)
+    except ValueError as error:
+        raise ValueError(f"File `{path}`: {error}") from None
+
+
+def _csv(path: Path):
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"File `{path}` is not text: byte {error.start} is no UTF-8.") from None
+    rows = [
+        (number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(rows) < 2:
+        raise ValueError(f"File `{path}` must hold a line of names and lines of numbers, but has {len(rows)} lines.")
+    (first, head), *rows = rows
+    separator = next((s for s in (";", "\t", ",") if s in head), ",")
+    names, units = [], {}
+    for text in head.split(separator):
+        match = re.fullmatch(r"(.*?)\s*(?:[(\[](.*?)[)\]])?", text.strip().strip('"'))
+        name = match[1] if match else text
+        if _is_number(name):
+            raise ValueError(f"File `{path}`, line {first}: a line of names must come first, but it holds {name!r}.")
+        if name in names:
+            raise ValueError(f"File `{path}`, line {first}: the name `{name}` is there twice.")
+        names.append(name)
+        if match and match[2]:
+            units[name] = match[2]
+    table = np.empty((len(rows), len(names)))
+    for row, (number, line) in enumerate(rows):
+        entries = line.split(separator)
+        if len(entries) != len(names):
+            raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {len(entries)} found.")
+        for column, entry in enumerate(entries):
+            # A decimal comma is unmistakable where commas do not separate.
+            text = entry.strip().replace(",", ".") if separator != "," else entry.strip()
+            try:
+                table[row, column] = float(text)
+            except ValueError:
+                raise ValueError(
+                    f"File `{path}`, line {number}, column `{names[column]}`: {entry.strip()!r} is no number."
+                ) from None
+            if not math.isfinite(table[row, column]):
+                raise ValueError(
+                    f"File `{path}`, line {number}, column `{names[column]}`: must be finite, but is {entry.strip()}."
+                )
+    return dict(zip(names, table.T, strict=True)), units, None
+
+
+def _numpy(path: Path):
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            if loaded.dtype.names:
+                return {name: loaded[name] for name in loaded.dtype.names}, {}, None
+            if loaded.ndim not in (1, 2):
+                raise ValueError(f"it has shape {loaded.shape}, not (T,) or (T, k)")
+            table = loaded.reshape(len(loaded), -1)
+            return {str(k): table[:, k] for k in range(table.shape[1])}, {}, None
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}, {}, None
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"File `{path}` cannot be read as NumPy: {str(error).rstrip('.')}.") from None
+
+
+def _wav(path: Path):
+    from scipy.io import wavfile
+
+    try:
+        rate, samples = wavfile.read(path)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"File `{path}` cannot be read as WAV: {str(error).rstrip('.')}.") from None
+    # Unsigned samples (8 bit) rest at 128; 24 bits come in the upper part of 32.
+    if samples.dtype.kind == "u":
+        samples = (samples.astype(float) - 128.0) / 128.0
+    elif samples.dtype.kind == "i":
+        samples = samples.astype(float) / (np.iinfo(samples.dtype).max + 1.0)
+    table = samples.reshape(len(samples), -1)
+    return {str(k): table[:, k] for k in range(table.shape[1])}, {}, float(rate)
+
+
+def _matlab(path: Path):
+    import scipy.io
+
+    # The reader of MATLAB files has errors of its own kind beside these.
+    unreadable = (ValueError, TypeError, OSError, EOFError, scipy.io.matlab.MatReadError)
+    try:
+        loaded = scipy.io.loadmat(path, squeeze_me=True)
+    except NotImplementedError:  # version 7.3 is HDF5
+        import h5py
+
+        with h5py.File(path) as file:
+            loaded = {name: np.squeeze(item[()]) for name, item in file.items() if isinstance(item, h5py.Dataset)}
+    except unreadable as error:
+        raise ValueError(f"File `{path}` cannot be read as MATLAB: {str(error).rstrip('.')}.") from None
+    return {name: value for name, value in loaded.items() if not name.startswith("__")}, {}, None
+
+
+def _vector(path: Path, name: str, values) -> np.ndarray:
+    array = np.squeeze(np.asarray(values))
+    if array.dtype.kind not in "iuf" or array.ndim != 1:
+        raise ValueError(
+            f"File `{path}`, variable `{name}`: must be a vector of real numbers, but is {arguments.describe(array)}."
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise ValueError(f"File `{path}`, variable `{name}`: must be finite, but sample {bad[0]} is {array[bad[0]]}.")
+    return array.astype(np.float64)
+
+
+def _unit(path: Path, name: str, quantity: str, units: Mapping[str, str]) -> float:
+    unit = units.get(name)
+    if unit is None:
+        return 1.0
+    if unit.strip() not in UNITS[quantity]:
+        raise ValueError(
+            f"File `{path}`, variable `{name}`: {unit!r} is no unit of {quantity}; known are {', '.join(UNITS[quantity])}."
+        )
+    return UNITS[quantity][unit.strip()]
+
+
+def _must_have(path: Path, found: Mapping, name: str) -> None:
+    if name not in found:
+        raise ValueError(f"File `{path}` has no variable `{name}`; it has: {', '.join(found)}.")
+
+
+def _is_channel(name: str) -> bool:
+    try:
+        channel(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
