@@ -64,3 +64,8 @@ def times(scene) -> dict[str, float]:
     rises = np.flatnonzero((run.velocity[:-1, 0] < 0) & (run.velocity[1:, 0] >= 0) & (run.t[1:] > 2.0))
     whole = run.status[rises[0] : rises[-1]]
     return {"sticking": float(np.mean(whole == 0)), "detached": float(np.mean(whole == 2))}
+
+
+def scores(fit, scene):
+    """How many standard deviations each parameter is from the truth."""
+    return {n: abs(fit.values[n] - float(scene.parameters[n])) / fit.uncertainty[n] for n in fit.names}

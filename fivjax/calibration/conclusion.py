@@ -19,7 +19,7 @@ from .search import Search
 # A signal counts if a fit explains more than so much energy per fitted number, in units of the noise.
 SIGNIFICANT = 25.0
 # A model that leaves more than this share of the signal's energy does not fit.
-MOST_LEFT = 0.5
+MOST_LEFT = 0.1
 # Disturbances of a cycle that grow by more than this a period: it would not last.
 UNSTABLE = 1.001
 
@@ -110,7 +110,9 @@ def _left(search: Search, found: np.ndarray, means, models) -> WhatIsLeft:
     freedom = max(len(found) - len(search.best.x) - sum(m.projected for m in misfits), 1)
     # A limit cycle is compared by its first harmonics; its waveform keeps all the others.
     pairs = zip(misfits, means, models, strict=True)
-    waveforms = [(measured - model) / np.asarray(m.sigma) for m, measured, model in pairs if not isinstance(m, CycleMisfit)]
+    waveforms = [
+        (measured - model) / np.asarray(m.sigma) for m, measured, model in pairs if not isinstance(m, CycleMisfit)
+    ]
     stated = all(r.noise is not None for r in search.recordings)
     with np.errstate(invalid="ignore", over="ignore"):
         return what_is_left(float(found @ found), freedom, waveforms, stated)

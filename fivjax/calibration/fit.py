@@ -117,7 +117,11 @@ def calibrate(
             return not_tried(problem, recordings, blocks, FitOutcome.BEATS)
         if cycles:
             frequencies = [float(cycle.frequency) for cycle in problem.cycles]
-            guesses = near_frequencies(parameters, scene, frequencies, max(int(starts), SCREENED), float(spread), seed)
+            half = max(int(starts), SCREENED) // 2
+            # A limit cycle needs modes that come together, but its frequency may lie some way below theirs.
+            near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
+            around = latin_hypercube(parameters, scene, half, float(spread), seed)
+            guesses = np.concatenate([near, around[1:]])
         else:
             guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
         search = Search(problem, guesses, recordings)

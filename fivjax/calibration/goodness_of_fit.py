@@ -40,9 +40,7 @@ class WhatIsLeft(NamedTuple):
         return ", ".join(said)
 
 
-def what_is_left(
-    squares: float, freedom: int, waveforms: list[Float[np.ndarray, "B k"]], stated: bool
-) -> WhatIsLeft:
+def what_is_left(squares: float, freedom: int, waveforms: list[Float[np.ndarray, "B k"]], stated: bool) -> WhatIsLeft:
     """Sum of squared residuals with its degrees of freedom, and the waveforms of those recordings that are compared by one."""
     misfit = squares / freedom
     # The estimate's error is one of a standard deviation, so twice that of a square.

@@ -123,9 +123,7 @@ def _in_order(frequency, size, turned):
     return np.concatenate([[frequency, size], rest.real, rest.imag])
 
 
-def beating(
-    signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigma: Float[np.ndarray, " k"]
-) -> float:
+def beating(signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigma: Float[np.ndarray, " k"]) -> float:
     """How much a vibration beats: the size of what lies about its fundamental without being part of it, relative to that.
 
     Everything below one and a half times the `frequency` (Hz) that a constant and two harmonics leave, without the noise of

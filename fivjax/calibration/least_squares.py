@@ -79,6 +79,14 @@ def minimise(
         return best.jacobian
 
     freedom = max(best.residual.size - x0.size, 1)
+
+    def has_arrived(slack=1.0):
+        return _left(best) <= slack * tolerance * max(1.0, np.sqrt(best.cost / freedom))
+
+    def stop_on_arrival(_):
+        if has_arrived():
+            raise StopIteration
+
     found = least_squares(
         residual,
         np.zeros_like(x0),
@@ -89,10 +97,9 @@ def minimise(
         xtol=1e-12,
         gtol=None,
         max_nfev=most_evaluations,
+        callback=stop_on_arrival,
     )
-    scale = max(1.0, np.sqrt(best.cost / freedom))
-    arrived = found.status > 0 and _left(best) <= SLACK * tolerance * scale
-    return Minimum(x0 + found.x, best, bool(arrived), int(found.nfev))
+    return Minimum(x0 + stayed, best, bool(has_arrived(SLACK)), int(found.nfev))
 
 
 def _left(at: Evaluated) -> float:

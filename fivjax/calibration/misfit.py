@@ -57,11 +57,6 @@ class AbstractMisfit(eqx.Module):
         (s), a guess of the cycle."""
 
 
-def sliding_coordinates(scene: Scene) -> list[int]:
-    """All but the normal one."""
-    return [i for i in range(scene.structure.size) if i != scene.structure.normal]
-
-
 def sliding_frequencies(scene: Scene, recording: Recording) -> Float[np.ndarray, " m"]:
     """Of the sliding modes that vibrate, in Hz, under what is known of a run."""
     modes = np.linalg.eigvals(np.asarray(linear_sliding(scene.replace(**recording.known)).matrix))

@@ -61,6 +61,12 @@ class Problem(eqx.Module):
         """Those recordings that show a limit cycle."""
         return [m for m in self.misfits if isinstance(m, CycleMisfit)]
 
+    @property
+    def frequency_rows(self) -> list[int]:
+        """Which residuals are those of the frequencies of limit cycles, where all recordings are such."""
+        lengths = [m.measured.shape[0] + m.fractions.shape[0] for m in self.cycles]
+        return [sum(lengths[:k]) for k in range(len(lengths))]
+
     def coarse(self, u: np.ndarray, u0: np.ndarray) -> Evaluated:
         """Residuals that lead to the right period from afar, with a regularisation towards `u0`."""
         residual, jacobian = _coarse(self, jnp.asarray(u), jnp.asarray(u0))

@@ -23,7 +23,7 @@ class FitOutcome(enum.StrEnum):
         "are off is not known; correct or free what differs from the scene"
     )
     DOES_NOT_FIT = (
-        "the model does not fit: most of what was recorded is left, and it is not noise; check regime, channels and units, "
+        "the model does not fit: much of what was recorded is left, and it is not noise; check regime, channels and units, "
         "and correct or free what differs from the scene"
     )
     NOT_CONVERGED = "not converged: the last fit ran out of steps; start closer, free fewer parameters or set bounds"

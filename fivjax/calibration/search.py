@@ -1,9 +1,12 @@
 """The search for the best fit: from first guesses far off to the minimum, through windows that grow.
 
-1. Guesses are improved by coarse residuals, which know no phase; those of limit cycles are screened.
+1. Guesses are improved by coarse residuals, which know no phase.
 2. Unknown time offsets are scanned (`time_offsets`).
-3. The waveform is compared over windows that grow, and harmonics first roughly, then to the noise, from the best few.
+3. The waveform is compared over windows that grow, from the best few.
 4. The best one is tried again some periods earlier and later.
+
+Where all recordings are limit cycles, guesses that have one are first brought to the measured frequency. Then harmonics are
+compared, roughly and to the noise, from one guess after the other until what is left is noise.
 """
 
 from collections.abc import Iterator
@@ -14,12 +17,15 @@ from jaxtyping import Float
 
 from ..io.recordings import Recording
 from .cycle_closing import growth_of_disturbances
+from .goodness_of_fit import what_is_left
 from .least_squares import Minimum, minimise
 from .problem import About, Problem
 from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_aside
 
 # Guesses that go on from the coarse residuals to the waveform.
 KEPT = 4
+# Guesses of a limit cycle that are fitted, if none before explains the recording; and steps to bring one to its frequency.
+MOST_IN_TURN, FREQUENCY_STEPS = 12, 2
 WINDOWS = (0.15, 0.4, 1.0)
 # Where a fit stops: what is left along what the data tell, in standard deviations. Rounding of nearly parallel modes leaves
 # a thousandth.
@@ -43,29 +49,59 @@ class Search:
 
     def __init__(self, problem: Problem, guesses: np.ndarray, recordings: tuple[Recording, ...]):
         self.problem, self.guesses, self.recordings = problem, guesses, recordings
-        # Limit cycles have no window that grows: their harmonics are compared first roughly, then to the noise.
         self.cycles_only = len(problem.cycles) == len(problem.misfits)
-        self.windows = (WINDOWS[0], WINDOWS[-1]) if self.cycles_only else WINDOWS
-        self.count = len(self.windows) + 3
+        self.count = 2 if self.cycles_only else len(WINDOWS) + 3
         self.evaluations = 0
 
     def run(self) -> Iterator[str]:
         """Yields the name of each stage before it begins."""
         yield "guesses"
-        candidates = self._screened() if self.cycles_only else self._improved()
+        if self.cycles_only:
+            candidates = self._at_measured_frequency()
+            yield "harmonics"
+            self._fitted_in_turn(candidates)
+            return
+        candidates = self._improved()
         yield "time offsets"
         candidates = self._with_offsets(candidates)
-        for share in self.windows:
+        for share in WINDOWS:
             yield f"waveform, {100 * share:.0f} %"
             candidates = self._fitted(candidates, share)
         yield "whole periods"
         self._other_periods()
 
-    def _screened(self) -> list[Candidate]:
-        """The guesses that come closest to the limit cycles. Far off, a scene may have none, and no derivative leads there."""
-        found = [self.problem.compared(x, x, self.windows[0], None) for x in self.guesses]
-        order = np.argsort([at.cost for at in found], kind="stable")[:KEPT]
-        return [Candidate(self.guesses[k], found[k].about if np.isfinite(found[k].cost) else None) for k in order]
+    def _at_measured_frequency(self) -> list[Candidate]:
+        """The guesses that come closest to the limit cycles, brought to their frequency by the least change of parameters.
+
+        Far off, a scene may have no limit cycle, and no derivative leads there.
+        """
+        found: list[tuple[float, Candidate]] = []
+        for guess in self.guesses:
+            x, about = guess, None
+            for _ in range(1 + FREQUENCY_STEPS):
+                at = self.problem.compared(x, guess, WINDOWS[0], about)
+                self.evaluations += 1
+                if not np.isfinite(at.cost):
+                    break
+                found.append((at.cost, Candidate(x, at.about)))
+                rows = self.problem.frequency_rows
+                step = -np.linalg.lstsq(at.jacobian[rows], at.residual[rows], rcond=1e-2)[0]
+                x, about = x + np.clip(step, -0.5, 0.5), at.about
+        found.sort(key=lambda one: one[0])
+        kept = _distinct([one.x for _, one in found])[:MOST_IN_TURN]
+        # Without any cycle the scene's own parameters end the fit, with a name.
+        return [one for _, one in found if any(one.x is x for x in kept)] or [Candidate(self.guesses[0], None)]
+
+    def _fitted_in_turn(self, candidates: list[Candidate]) -> None:
+        """Fits from one candidate after the other until what is left is noise."""
+        for k, candidate in enumerate(candidates):
+            rough = self.fit_from(candidate, WINDOWS[0], EARLY_TOLERANCE)
+            found = self.fit_from(Candidate(rough.x, rough.at.about))
+            if k == 0 or found.at.cost < self.best.at.cost:
+                self.best = found
+            squares, freedom = found.at.cost, max(found.at.residual.size - 2 * found.x.size, 1)
+            if found.arrived and not what_is_left(squares, freedom, [], stated=False).larger:
+                break
 
     def _improved(self) -> list[Candidate]:
         found = []
@@ -116,7 +152,11 @@ class Search:
         """The minimum that one candidate leads to."""
         x0 = candidate.x
         found = minimise(
-            lambda x, about: self.problem.compared(x, x0, share, about), x0, candidate.about, tolerance, MOST_EVALUATIONS
+            lambda x, about: self.problem.compared(x, x0, share, about),
+            x0,
+            candidate.about,
+            tolerance,
+            MOST_EVALUATIONS,
         )
         self.evaluations += found.evaluations
         return found

@@ -39,7 +39,9 @@ def best_offsets(
     return np.minimum(step * best, high - low) / OFFSET_UNIT
 
 
-def periods_aside(problem: Problem, k: int, bounds: tuple[float, float], x: np.ndarray) -> tuple[list[np.ndarray], float]:
+def periods_aside(
+    problem: Problem, k: int, bounds: tuple[float, float], x: np.ndarray
+) -> tuple[list[np.ndarray], float]:
     """The point `x` with the offset of recording k moved by whole periods, where the bounds allow, and half a period.
 
     A vibration is much like itself a period on.

@@ -3,15 +3,17 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import sliding_coordinates
 from ..simulation.trajectory import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from .characteristic import characteristic_residual
-from .misfit import AbstractMisfit, Compared, finite, sliding_coordinates, window
+from .misfit import AbstractMisfit, Compared, finite, window
 from .mode_poles import strongest_poles
 from .noise import noise_of_means
 
@@ -50,7 +52,7 @@ class SlidingMisfit(AbstractMisfit):
         m = matrix.shape[0] // 2
         width = self.edges[1] - self.edges[0]
         states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
-        keep = sliding_coordinates(scene)
+        keep = sliding_coordinates(scene.structure.size, scene.structure.normal).tolist()
         columns = []
         for quantity, coordinate in self.channels:
             row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
@@ -101,7 +103,10 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
 
 def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
     """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
-    matrix, keep = linear_sliding(scene).matrix, sliding_coordinates(scene)
+    matrix, keep = (
+        linear_sliding(scene).matrix,
+        sliding_coordinates(scene.structure.size, scene.structure.normal).tolist(),
+    )
     n = scene.structure.size
     steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
 
@@ -149,8 +154,11 @@ def misfit_of_waveform(
     # A kick's response is a small motion again, if at all, towards its end.
     tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
     found = strongest_poles(tail, width, scene.structure.size - 1)
-    good = found.explained > LEAST_EXPLAINED
-    values, shapes = (found.values, found.shapes) if good else (found.values[:0], found.shapes[:0])
+    # As many places as there may be poles, so that every recording of this length shares what is compiled.
+    values = np.full(scene.structure.size - 1, np.nan, complex)
+    shapes = np.full((len(values), len(recording.channels)), np.nan, complex)
+    if found.explained > LEAST_EXPLAINED:
+        values[: len(found.values)], shapes[: len(found.values)] = found.values, found.shapes
     common: dict = {
         "edges": jnp.asarray(blocks.edges),
         "means": jnp.asarray(blocks.means),

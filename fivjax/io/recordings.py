@@ -50,7 +50,8 @@ class Recording(eqx.Module):
     - `offset`: for a kick, the instant of the simulation (s after its start) at which the recording's first sample lies,
       as one number if known, else as the range to look in: (0, 0.5) unless given. A recording that begins before the
       simulation has a negative offset.
-    - `noise`: standard deviation of one sample by channel, estimated from what the fit leaves unless given.
+    - `noise`: standard deviation of one sample, by channel or one number for all. Unless given, it is estimated from where no
+      signal is, as white noise.
     - `sticking`, `detached`: for a limit cycle, the measured fractions of time in these statuses, as pairs of the value
       and its standard deviation.
     - `known`: parameters of the scene that were different in this run, by name: `belt_speed=1.0, force=50.0`.
@@ -76,7 +77,7 @@ class Recording(eqx.Module):
         regime: str = "kick",
         *,
         offset=None,
-        noise: Mapping | None = None,
+        noise: Mapping | float | None = None,
         sticking: tuple[float, float] | None = None,
         detached: tuple[float, float] | None = None,
         **known,
@@ -106,15 +107,7 @@ class Recording(eqx.Module):
                 f"special. Leave it out."
             )
         self.offset = _offset((0.0, 0.5) if offset is None else offset)
-        by_name: dict = {}
-        if noise is not None:
-            for name, value in noise.items():
-                arguments.real_number(f"noise[{name!r}]", value, above=0)
-            missing = [str(c) for c in by_channel if c not in {channel(name) for name in noise}]
-            if missing:
-                raise ValueError(f"Argument `noise` must name every channel, but {missing[0]} is missing.")
-            by_name = {channel(name): float(value) for name, value in noise.items()}
-        self.noise = None if noise is None else np.array([by_name[c] for c in by_channel])
+        self.noise = None if noise is None else _noise(noise, self.channels)
         self.sticking, self.detached = _fraction("sticking", sticking, regime), _fraction("detached", detached, regime)
         for name, value in known.items():
             arguments.real_number(name, value)
@@ -195,6 +188,19 @@ def _instants(t, count: int) -> np.ndarray:
             f"average. Interpolate the signals, or cut the recording at the gap."
         )
     return array
+
+
+def _noise(noise, channels: tuple[Channel, ...]) -> Float[np.ndarray, " k"]:
+    if not isinstance(noise, Mapping):
+        arguments.real_number("noise", noise, above=0)
+        return np.full(len(channels), float(noise))
+    for name, value in noise.items():
+        arguments.real_number(f"noise[{name!r}]", value, above=0)
+    by_channel = {channel(name): float(value) for name, value in noise.items()}
+    missing = [str(one) for one in channels if one not in by_channel]
+    if missing:
+        raise ValueError(f"Argument `noise` must name every channel, but {missing[0]} is missing.")
+    return np.array([by_channel[one] for one in channels])
 
 
 def _offset(offset) -> tuple[float, float]:
