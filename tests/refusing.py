@@ -12,7 +12,7 @@ ENGINES = (
     "fivjax.maps.bistability.run_to_verdict",
     "fivjax.maps.threshold.run_to_verdict",
     "fivjax.simulation.trajectory._simulate",
-    "fivjax.calibration.fit.misfit",
+    "fivjax.calibration.fit.misfit_of_waveform",
     "fivjax.maps.tradeoff_study._end_state",
     "fivjax.simulation.differentiation._differentiated",
 )

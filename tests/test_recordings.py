@@ -1,5 +1,7 @@
 """Recordings and the files they come from: read in SI units, and refused with the line or the variable named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.io
@@ -25,7 +27,7 @@ def table(head, rows, separator=","):
 
 
 def test_csv_with_units(tmp_path):
-    """Were a unit passed over, amplitudes would be wrong by its factor and nothing would say so."""
+    """A unit that is passed over is rejected: amplitudes would be wrong by its factor."""
     path = csv(tmp_path, table("t (ms),acceleration 0 (g),v1 [mm/s],note", zip(1e3 * T, A, V, T, strict=True)))
     found = fj.read_recording(path, "limit cycle", belt_speed=1.0)
     assert found.channels == (Channel("acceleration", 0), Channel("velocity", 1))
@@ -38,6 +40,19 @@ def test_csv_with_units(tmp_path):
 def test_csv_with_semicolons_and_decimal_commas(tmp_path):
     text = table("time;a0", zip(T, A, strict=True), ";").replace(".", ",")
     np.testing.assert_allclose(fj.read_recording(csv(tmp_path, "# from the rig\n" + text)).values[:, 0], A, atol=1e-9)
+
+
+def test_the_sample_recording_is_read():
+    """The file that README and notebook fit: 0.8 s at 2 kHz of two accelerations, units in its names."""
+    found = fj.read_recording(Path(__file__).parents[1] / "notebooks" / "decay.csv", "kick")
+    assert found.channels == (Channel("acceleration", 0), Channel("acceleration", 1))
+    assert found.rate == pytest.approx(2000) and found.duration == pytest.approx(0.8, rel=1e-3)
+    assert len((Path(__file__).parents[1] / "notebooks" / "decay.csv").read_text()) < 50_000
+
+
+def test_noise_by_channel_or_one_for_all():
+    assert fj.Recording(T, {"a0": A, "v1": V}, noise=0.2).noise.tolist() == [0.2, 0.2]
+    assert fj.Recording(T, {"a0": A, "v1": V}, noise={"v1": 0.1, "a0": 0.3}).noise.tolist() == [0.3, 0.1]
 
 
 def test_columns_by_name(tmp_path):
@@ -96,7 +111,7 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("text", "fragments"), BAD_FILES, ids=[fragments[0] for _, fragments in BAD_FILES])
 def test_bad_csv(tmp_path, text, fragments):
-    """Were one read, a fit would run on numbers that are not what was measured."""
+    """Each is refused with its line: a fit would run on numbers that were not measured."""
     with pytest.raises(ValueError, match=r"run\.csv") as refusal:
         fj.read_recording(csv(tmp_path, text))
     for fragment in fragments:
