@@ -1,5 +1,7 @@
 """How large the rounding of guards and rates is, and which of them are zero exactly."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -7,6 +9,35 @@ from .forces import State, by_status, degrees_of_freedom
 from .guard import cone_margins
 from .mechanics import Mechanics
 from .mode import Contact, Status
+
+# A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
+# If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
+SHARES = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
+# Or if it is this many roundings of the terms that it is a sum of.
+ROUNDINGS = 64
+# Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
+RESTING = {"float64": 1e-7, "float32": 1e-4}
+
+
+def largest_rounding(sizes: Array) -> Array:
+    """What rounding may leave of sums whose largest terms have these sizes (see `magnitudes`)."""
+    return ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes
+
+
+def zero_at_start(
+    c: Sequence[Array] | Array, size: Array, rounding: Sequence[Array] | Array, exact: Bool[Array, "..."]
+) -> list[Bool[Array, "..."]]:
+    """Whether the first, the first two and the first three Taylor coefficients of guards are zero but for rounding.
+
+    `size` is that of all coefficients together, `rounding` what the first three may be rounded by; of a guard whose start is
+    `exact`, little is not nothing.
+    """
+    zero, found = jnp.ones_like(size, bool), []
+    for k, share in enumerate(SHARES[size.dtype.name]):
+        relative = jnp.where(exact, 0.0, size * share) if k == 0 else size * share
+        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(relative, rounding[k]))
+        found.append(zero)
+    return found
 
 
 def exactly_zero(contact: Contact) -> Bool[Array, "2"]:

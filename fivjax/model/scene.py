@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
+from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
 from .friction import AbstractFriction
@@ -135,8 +136,9 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
     """
     if is_known(scene.belt_speed) and float(scene.belt_speed) == 0:
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
-    q, normal_force = steady_sliding(scene, scene.load.force)
+    q, normal_force = _compiled_steady_sliding(scene, scene.load.force)
     if is_known(q):
+        q, normal_force = np.asarray(q), np.asarray(normal_force)
         if not np.all(np.isfinite(q)):
             raise ValueError(
                 "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
@@ -167,6 +169,9 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     return q, normal_force
 
 
+_compiled_steady_sliding = compiled(steady_sliding)
+
+
 @returning_numpy
 def painleve_friction(structure: Structure) -> Float[Array, ""]:
     r"""The friction beyond which the contact problem has no unique solution, $G_{nn} / |G_{nt}|$, without unit.
@@ -174,6 +179,11 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
     For the belt oscillator this is $(m_2 + m_1 \cos^2θ)/(m_1 \sinθ \cosθ)$: 108.49 at θ = 0.01. Infinite where the
     mass matrix does not couple the two contact coordinates.
     """
+    return _painleve_friction(structure)
+
+
+@compiled
+def _painleve_friction(structure: Structure):
     columns = jnp.eye(structure.size)[:, jnp.array([structure.tangential, structure.normal])]
     compliance = columns.T @ jnp.linalg.solve(structure.mass, columns)
     coupling = jnp.abs(compliance[0, 1])

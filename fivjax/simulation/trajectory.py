@@ -166,8 +166,9 @@ def simulate(
     # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled.
     if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
         derivatives, count = "forward", _compiled_rows(rows + 1)
-    instants = jnp.arange(count)
-    saved = jnp.where(instants < rows, jnp.minimum(dt_save * instants, t1), t1)
+    # With NumPy, and not one small compiled program for each operation.
+    instants = np.arange(count)
+    saved = real(np.where(instants < rows, np.minimum(float(dt_save) * instants, float(t1)), float(t1)))
     found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
     # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
@@ -189,10 +190,11 @@ def _compiled_rows(count: int) -> int:
 
 def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int) -> Array | np.int8:
     """How the rows end: an `Ending`. Under a transformation, where no one can look, other failures are not finite."""
-    finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
-    if not is_known(finite):
+    if not is_known(rows["velocity"]):
+        finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
         failure = jnp.where(jnp.any(grown), Ending.UNBOUNDED, Ending.NOT_FINITE)
         return jnp.where(jnp.all(finite), Ending.FINISHED, failure).astype(jnp.int8)
+    finite = np.all(np.isfinite(rows["velocity"]), axis=-1)
     if np.all(finite):
         return np.int8(Ending.FINISHED)
     if np.any(grown):
@@ -340,8 +342,8 @@ def start_state(scene: Scene, y0) -> State:
     if y0 is None:
         # The first refuses where there is none, which nobody can tell inside a compiled function.
         known = is_known(scene.belt_speed)
-        q = jnp.asarray(sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0])
-        return jnp.concatenate([q, jnp.zeros_like(q)])
+        q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
+        return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
     is_pair = isinstance(y0, tuple | list) and len(y0) == 2
     parts = tuple(y0) if is_pair else (y0,)
     for part in parts:

@@ -5,7 +5,6 @@ trusted, where a guard is used up first, and the state there. The physics of `co
 friction, so the same functions map Taylor coefficients to Taylor coefficients.
 """
 
-import itertools
 import math
 from typing import ClassVar
 
@@ -19,19 +18,14 @@ from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
+from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
+from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
 from .section import Resolution
 
-# A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
-# If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
-ROUNDING = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
-# Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
-RESTING = {"float64": 1e-7, "float32": 1e-4}
-# Or if it is this many roundings of the terms that it is a sum of.
-ROUNDINGS = 64
 MOST_ROOT_STEPS = 60
 
 
@@ -123,7 +117,7 @@ class EventExact(AbstractStepper):
         fires = fires & (safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps))
         x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
         ended = fires[:2]
-        reached, _ = _value_and_slope(states, x * reach)
+        reached, _ = value_and_slope(states, x * reach)
         if at_section:
             reached = jnp.where((jnp.arange(2 * n) == n + tangential) & fires[2], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
@@ -140,8 +134,8 @@ class EventExact(AbstractStepper):
         states, _ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
         times = 0.5 * (points + 1.0) * h
-        inside, _ = _value_and_slope([state[None] for state in states], times[:, None] / unit)
-        end, _ = _value_and_slope(states, h / unit)
+        inside, _ = value_and_slope([state[None] for state in states], times[:, None] / unit)
+        end, _ = value_and_slope(states, h / unit)
         return Within(inside, 0.5 * h * weights, times, end)
 
     def series(
@@ -203,13 +197,12 @@ def _rounding(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, unit: Float[Array, ""]
 ) -> list[Float[Array, "2"]]:
     """What rounding leaves of the first three coefficients of the guards where they are zero."""
-    eps = jnp.finfo(y.dtype).eps
     mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
     sizes, found = jnp.abs(y), []
     for k in range(3):
         own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
         guards, rates = physics.magnitudes(own, contact, force, sizes)
-        found.append(ROUNDINGS * eps * guards)
+        found.append(largest_rounding(guards))
         sizes = rates * (unit / (k + 1))
     return found
 
@@ -253,12 +246,10 @@ def _march_to_roots(
     """
     eps = jnp.finfo(c[0].dtype).eps
     size = sum(jnp.abs(ck) for ck in c)
-    shares = ROUNDING[c[0].dtype.name]
-    shares = shares if exact is None else (jnp.where(exact, 0.0, shares[0]), *shares[1:])
-    rounding = [jnp.zeros_like(size)] * 3 if rounding is None else rounding
-    zero = [jnp.abs(ck) <= jnp.maximum(size * share, r) for ck, share, r in zip(c, shares, rounding, strict=False)]
     none = jnp.zeros_like(size)
-    for starts_at_zero in reversed(_running_and(zero)):
+    rounding = [none] * 3 if rounding is None else rounding
+    exact = jnp.zeros_like(size, bool) if exact is None else exact
+    for starts_at_zero in reversed(zero_at_start(c, size, rounding, exact)):
         c = [jnp.where(starts_at_zero, following, own) for own, following in zip(c, [*c[1:], none], strict=True)]
     falling = [jnp.maximum(-ck, 0.0) for ck in c]
     bound_2 = sum(k * (k - 1) * fk for k, fk in enumerate(falling) if k > 1)
@@ -277,7 +268,7 @@ def _march_to_roots(
 
     def march(carry):
         x, step, count = carry
-        value, slope, bend = _value_slope_bend(c, x)
+        value, slope, bend = value_slope_and_bend(c, x)
         value = jnp.maximum(value, 0.0)
         root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
         # Two forms of one root, each free of cancellation where it is used.
@@ -297,19 +288,6 @@ def _ratio(above, below, otherwise):
     return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), otherwise)
 
 
-def _value_slope_bend(c: list, x):
-    value, slope, half_bend = c[-1], jnp.zeros_like(c[-1]), jnp.zeros_like(c[-1])
-    for ck in reversed(c[:-1]):
-        half_bend = half_bend * x + slope
-        slope = slope * x + value
-        value = value * x + ck
-    return value, slope, 2 * half_bend
-
-
-def _running_and(conditions):
-    return list(itertools.accumulate(conditions, jnp.logical_and))
-
-
 def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
     """The root with the derivatives of an implicit function.
 
@@ -319,21 +297,12 @@ def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Flo
     # An index of 64 bits could not be lowered in a program that computes with 32.
     chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
     for _ in range(2):
-        values, slopes = _value_and_slope(scaled, x)
+        values, slopes = value_and_slope(scaled, x)
         value = jnp.sum(jnp.where(chosen, values, 0.0))
         slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
         correction = value / jnp.where(slope == 0, 1.0, slope)
         x = x - (correction - jax.lax.stop_gradient(correction))
     return x
-
-
-def _value_and_slope(c: list, x):
-    """A polynomial and its derivative, by Horner's rule; what is not used of them costs nothing once compiled."""
-    value, slope = c[-1], jnp.zeros_like(c[-1])
-    for ck in reversed(c[:-1]):
-        slope = slope * x + value
-        value = value * x + ck
-    return value, slope
 
 
 class _Restepped(AbstractLocalInterpolation):

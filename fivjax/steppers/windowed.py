@@ -23,9 +23,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
+from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation.compiling import computed_once
+from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from .base import Advance
-from .event_exact import ROUNDING, ROUNDINGS
 from .section import Rise
 
 # Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
@@ -34,8 +35,6 @@ INTERVALS = 16
 TURN = 0.6
 # Order of the Taylor series within an interval: TURN^16 / 16! is below rounding.
 ORDER = 15
-# Rebounds shorter than this share of an interval are at rest.
-RESTING = 1e-7
 MOST_ROOT_STEPS = 60
 # Terms of the series in the steps of Newton's method that nearly all roots are found with: few while it is still far off.
 ROOT_STEPS = (5, 5, ORDER)
@@ -143,7 +142,7 @@ def _advance(
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
     def over_lanes(reached, contact, load, fires):
         state = physics.on_constraint(mechanics, contact, reached)
-        return physics.transition(mechanics, contact, load, state, fires, RESTING * prepared.interval)
+        return physics.transition(mechanics, contact, load, state, fires, RESTING[state.dtype.name] * prepared.interval)
 
     like = none, contact, no_state, Rise(none > 0, no_state), no_state
     peak, next_contact, y_next, rise, end = computed_once(follow, like)
@@ -201,7 +200,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
     # A cubic with the values and slopes of both ends is off by at most a 384th of the fourth derivative; twice that is
     # what the derivative may grow to between samples.
     uncubic = jnp.max(jnp.abs(coefficients[4] @ samples), axis=0) * (2 * math.factorial(4) / 384)
-    rounding = [ROUNDINGS * jnp.finfo(sizes.dtype).eps * terms, uncubic]
+    rounding = [largest_rounding(terms), uncubic]
 
     def table(parts: list[Float[Array, "*k 4 x c"]]) -> Float[Array, "r c"]:
         flat = [jnp.moveaxis(part, -3, 0).reshape(4, -1, 2 * n + 2) for part in parts]
@@ -379,7 +378,7 @@ class _Series(eqx.Module):
 
     def state(self, x: Float[Array, " l"]) -> Float[Array, "2n l"]:
         """Displacements, and velocities in m per interval."""
-        return jnp.concatenate(_value_and_slope(self.parts[2], x))
+        return jnp.concatenate(value_and_slope(self.parts[2], x))
 
 
 def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
@@ -423,12 +422,8 @@ def _start(
 ) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
     """How many coefficients at the start are zero but for rounding, and the first that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
-    shares = ROUNDING[c.dtype.name]
-    zero = jnp.ones_like(size, bool)
     zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
-    for k in range(3):
-        share = jnp.where(exact, 0.0, size * shares[k]) if k == 0 else size * shares[k]
-        zero = zero & (jnp.abs(c[k]) <= jnp.maximum(share, limits[k]))
+    for k, zero in enumerate(zero_at_start(c, size, limits, exact)):
         zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
     return zeros, lead
 
@@ -451,13 +446,13 @@ def _dipped(series: _Series, brackets: _Bracket) -> _Bracket:
         c = series.parts[0]
 
         def nearer(_, x):
-            _, slope, bend = _value_slope_and_bend(c, x)
+            _, slope, bend = value_slope_and_bend(c, x)
             return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
 
         # Newton's method: within an interval a slope is all but a straight line. It sets out from what the loop carries:
         # what depends on nothing else, XLA takes out of the loop and computes every time.
         lowest = jax.lax.fori_loop(0, 6, nearer, bracket.guess)
-        below = bracket.dips & (_value_and_slope(c, lowest)[0] <= 0)
+        below = bracket.dips & (value_and_slope(c, lowest)[0] <= 0)
         return _Bracket(
             guess=jnp.where(below, 0.5 * lowest, bracket.guess),
             zeros=bracket.zeros,
@@ -503,7 +498,7 @@ def _approached(c: Float[Array, "k 2 l"], brackets: _Bracket) -> Float[Array, "2
 
 def _newton(c: Float[Array, "k *x l"], zeros: Int[Array, "*x l"], x: Float[Array, "*x l"]):
     """After one step of Newton's method: where, value and slope before it, and whether it was so short that it is the last."""
-    value, slope = _value_and_slope(c, x)
+    value, slope = value_and_slope(c, x)
     # Without the roots at zero, which are divided out of value and slope alike.
     slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
     nearer = x - value / jnp.where(slope == 0, 1.0, slope)
@@ -534,20 +529,3 @@ def _bisected(
     begin = jnp.zeros_like(x), brackets.end, x, slope, open_, jnp.zeros((), jnp.int32)
     _, _, root, slope, *_ = jax.lax.while_loop(going, step, begin)
     return root, slope
-
-
-def _value_slope_and_bend(c: Float[Array, "k *x l"], x: Array) -> tuple[Array, Array, Array]:
-    value, slope, half_bend = c[-1], jnp.zeros_like(c[-1]), jnp.zeros_like(c[-1])
-    for k in reversed(range(c.shape[0] - 1)):
-        half_bend = half_bend * x + slope
-        slope = slope * x + value
-        value = value * x + c[k]
-    return value, slope, 2 * half_bend
-
-
-def _value_and_slope(c: Float[Array, "k *x l"], x: Array) -> tuple[Array, Array]:
-    value, slope = c[-1], jnp.zeros_like(c[-1])
-    for k in reversed(range(c.shape[0] - 1)):
-        slope = slope * x + value
-        value = value * x + c[k]
-    return value, slope

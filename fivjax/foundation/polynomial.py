@@ -1,0 +1,28 @@
+"""Polynomials by Horner's rule, from their coefficients in rising order: a list, or an array's first axis."""
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+def value_and_slope(c: Sequence[Array] | Array, x: Array) -> tuple[Array, Array]:
+    """A polynomial and its first derivative; what is not used of them costs nothing once compiled."""
+    value, slope = _with_derivatives(c, x, 1)
+    return value, slope
+
+
+def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, Array, Array]:
+    """A polynomial and its first two derivatives."""
+    value, slope, bend = _with_derivatives(c, x, 2)
+    return value, slope, bend
+
+
+def _with_derivatives(c: Sequence[Array] | Array, x: Array, count: int) -> list[Array]:
+    found = [c[-1]] + [jnp.zeros_like(c[-1])] * count  # Taylor coefficients at x
+    for k in reversed(range(len(c) - 1)):
+        for j in reversed(range(1, count + 1)):
+            found[j] = found[j] * x + found[j - 1]
+        found[0] = found[0] * x + c[k]
+    return found[:2] + [math.factorial(j) * found[j] for j in range(2, count + 1)]
