@@ -132,3 +132,12 @@ def test_what_a_start_loads(code):
     loaded = set(ran.stdout.rpartition("loaded ")[2].split())
     assert "fivjax" in loaded
     assert not loaded & HEAVY
+
+
+@pytest.mark.parametrize("room", ["model", "contact", "steppers", "linear", "simulation", "cycles", "verdicts"])
+def test_rooms_of_computing_load_nothing_to_draw_or_store_with(room):
+    """What computes must not wait for what draws, stores or reads files."""
+    names = [name for name in import_floors.modules() if import_floors.room(name) == room]
+    code = "import sys, importlib\n" + "".join(f"importlib.import_module({name!r})\n" for name in names)
+    ran = subprocess.run([sys.executable, "-c", code + "print(*sys.modules)"], capture_output=True, text=True, check=True)
+    assert not set(ran.stdout.split()) & HEAVY

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from tqdm.auto import tqdm
 
-from ..foundation.interrupts import noted
+from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
@@ -83,7 +83,7 @@ def run_to_verdict(
             bar.set_description(label, refresh=False)
         bar.update(count)
         new += count
-        if signals:
+        if requested:
             raise KeyboardInterrupt
         if keep is not None and new > 0 and time.monotonic() - kept >= KEEP_EVERY:
             keep(verdicts)
@@ -108,7 +108,7 @@ def run_to_verdict(
         many=total >= MANY,
         pool=ThreadPoolExecutor(max_workers=workers()),
     )
-    with noted() as signals, bar, batch.pool:
+    with stop_requests() as requested, bar, batch.pool:
         try:
             for start in range(0, total, portion):
                 chosen = order[start : start + portion]

@@ -6,12 +6,11 @@ energies and durations are those of the instant itself. The same is done for con
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array, Float
 
 from ..contact import Contact, Mechanics, State
@@ -26,6 +25,9 @@ from . import energy as accounts
 from .energy import Books, Energy, Ledger
 from .trajectory import Trajectory
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 
 class _Instant(NamedTuple):
     """Where a trajectory stands, and what its ledger says there."""
@@ -37,7 +39,7 @@ class _Instant(NamedTuple):
 
 
 @in_double_precision
-def energy_per_cycle(run: Trajectory) -> xr.Dataset:
+def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
     """The ledger of each whole cycle of a trajectory: what Figs. 13, 15 and 16 draw in black.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
@@ -75,11 +77,13 @@ def energy_per_cycle(run: Trajectory) -> xr.Dataset:
         "cycle_start": ("cycle", found.t[:count]),
         "cycle_end": ("cycle", found.t[1 : count + 1]),
     }
+    import xarray as xr
+
     return labelled(xr.Dataset(over | at, coords), run.scene)
 
 
 @in_double_precision
-def energy_per_event(run: Trajectory) -> xr.Dataset:
+def energy_per_event(run: Trajectory) -> "xr.Dataset":
     """The ledger of each contact event of a trajectory: when, from which status to which, and what an impact cost.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
@@ -101,6 +105,8 @@ def energy_per_event(run: Trajectory) -> xr.Dataset:
         "mechanical_energy": _mechanical(run.scene, found),
     }
     coords = {"event": np.arange(len(found.t)), "event_time": ("event", found.t)}
+    import xarray as xr
+
     return labelled(xr.Dataset({name: ("event", x) for name, x in variables.items()}, coords), run.scene)
 
 

@@ -2,12 +2,12 @@
 
 import json
 import math
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
@@ -30,6 +30,9 @@ from . import energy as accounts
 from .ending import ENDING, GROWTH, Ending
 from .energy import Books, Energy, Ledger
 from .spans import MODES, Begin, go_on
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Rows that a trajectory may have: some 20 GB of them.
 MOST_ROWS = 10**8
@@ -70,7 +73,7 @@ class Trajectory(eqx.Module):
         return self.displacement[:, self.scene.structure.normal]
 
     @classmethod
-    def from_dataset(cls, dataset: xr.Dataset) -> "Trajectory":
+    def from_dataset(cls, dataset: "xr.Dataset") -> "Trajectory":
         """A trajectory from its dataset, such as `fj.open("run.nc")`; its energy ledger stays behind.
 
         **Raises:** `ValueError` for a dataset without a scene in its attributes.
@@ -81,8 +84,10 @@ class Trajectory(eqx.Module):
         outcome = np.int8(Ending[dataset.attrs["outcome"].upper()])
         return cls(**{name: dataset[name].values for name in rows}, scene=scene, outcome=outcome, settings=settings)
 
-    def to_dataset(self) -> xr.Dataset:
+    def to_dataset(self) -> "xr.Dataset":
         """The trajectory with names, units and the scene it came from."""
+        import xarray as xr
+
         along = ("t", "coordinate")
         dataset = xr.Dataset(
             {

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM in a long run: noted where they arrive, acted on where the run's books are in order.
+"""Ctrl-C and SIGTERM in a long run: noted when they arrive, obeyed where nothing is left half done.
 
 Python raises `KeyboardInterrupt` between any two instructions: in the middle of a record, or inside a destructor, where
 it is swallowed and the run goes on.
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def noted() -> Iterator[list[int]]:
+def stop_requests() -> Iterator[list[int]]:
     """Within, the first signal is only added to the list that this gives; who asks a second time is obeyed at once.
 
     At the end the signals mean what they meant before, and a SIGTERM that was noted is sent again.
