@@ -133,6 +133,7 @@ def test_sensitivities_against_differences_of_the_scipy_route():
     assert "k1" in repr(result)
 
 
+@pytest.mark.slow
 def test_many_limits_and_their_gradients_in_one_batch():
     def limit(k1):
         return cea.critical_friction(belt(k1=k1))
@@ -150,6 +151,7 @@ def test_many_limits_and_their_gradients_in_one_batch():
     np.testing.assert_allclose(slopes[2:-2][smooth], differences[smooth], rtol=1e-6, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_forward_derivatives_up_to_the_second():
     def along(function):
         return lambda k1: jax.jvp(function, (k1,), (1.0,))[1]
@@ -170,15 +172,13 @@ def test_gradients_in_a_process_without_double_precision():
         import fivjax as fj
         from fivjax import cea
         structure = fj.belt_oscillator()
-        gradient = jax.grad(cea.critical_friction)(structure.as_matrices())
+        gradient = jax.jit(jax.grad(cea.critical_friction))(structure.as_matrices())
         assert gradient.stiffness.dtype == np.float64 and gradient.mass.dtype == np.float64
         by_name = -4.6249593467e-05
         row = np.array([np.cos(0.01), 0.0, -np.sin(0.01)])
         assert abs(row @ np.asarray(gradient.stiffness) @ row - by_name) < 1e-9 * abs(by_name)
         by_parameter = jax.grad(cea.critical_friction)(structure).parameters["k1"]
         assert abs(float(by_parameter) - by_name) < 1e-9 * abs(by_name)
-        limit = lambda k1: cea.critical_friction(structure.replace(k1=k1))
-        assert abs(jax.jit(jax.grad(limit))(100e3) - by_name) < 1e-6 * abs(by_name)
         rate = jax.grad(lambda mu: cea.growth_rate(structure, mu))(0.3)
         assert abs(rate - 38.567295) < 1e-4
         assert isinstance(cea.critical_friction(structure), np.float64)
@@ -274,6 +274,11 @@ def test_section_3_2_is_unstable_by_its_slope():
     scene = fj.Scene(belt(), fj.ExponentialDecay(0.2, 0.1, 0.5), belt_speed=0.5)
     assert cea.friction_slope(scene) < cea.critical_slope(scene) < 0
     assert cea.growth_rate(scene) > 0
+
+
+@pytest.mark.slow
+def test_critical_slope_is_differentiable():
+    scene = fj.Scene(belt(), fj.ExponentialDecay(0.2, 0.1, 0.5), belt_speed=0.5)
     with jax.enable_x64(True):
         # Differentiable in the whole scene; by load the slope goes as 1/N, and N as the load.
         gradient = jax.grad(cea.critical_slope)(scene)
@@ -423,7 +428,9 @@ def random_structure(seed, n, proportional):
     return fj.Structure(mass, damping, stiffness, np.ones(n), 0, n - 1)
 
 
-@pytest.mark.parametrize(("seed", "n"), [(0, 2), (1, 3), (2, 3), (3, 6), (4, 12), (5, 12)])
+@pytest.mark.parametrize(
+    ("seed", "n"), [(0, 2), (1, 3), (2, 3), pytest.param(3, 6, marks=pytest.mark.slow), (4, 12), (5, 12)]
+)
 def test_random_structures(seed, n):
     structure = random_structure(seed, n, proportional=seed % 2 == 0)
     limit = cea.stability_limit(structure)
