@@ -21,7 +21,7 @@ from fivjax.calibration.parameters import FreeParameters
 from fivjax.calibration.problem import Problem
 from fivjax.calibration.result import FitOutcome
 from fivjax.io.recordings import averaged
-from fivjax.plot.calibration import calibration
+from fivjax.plot import calibration
 
 
 @pytest.fixture(scope="module")

@@ -27,14 +27,10 @@ FLOORS = (
 LONGEST, MEDIAN = 400, 150
 # Modules that are too long and are being divided; the list may only shrink.
 STILL_TOO_LONG = {
-    "fivjax.paper.figures",
     "fivjax.steppers.windowed",
 }
 # Functions that still have the name of their module; the list may only shrink.
-STILL_NAMED_ALIKE = {
-    "fivjax.paper.report",
-    "fivjax.plot.calibration",
-}
+STILL_NAMED_ALIKE: set[str] = set()
 # What takes time to load and is not wanted by everyone.
 HEAVY = {"matplotlib", "h5py", "scipy.io", "optax", "pandas", "xarray", "IPython", "ipywidgets"}
 

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from .. import plot
 from ..calibration.result import Calibration
 from ..foundation import arguments
 from ..linear.cea import Sensitivity
-from ..plot import calibration as plot_calibration
 from ..plot import energy as plot_energy
 from ..plot import linear as plot_linear
-from ..plot import results as plot
 from ..simulation.ending import Ending
 from ..simulation.trajectory import Trajectory
 
@@ -41,7 +40,7 @@ def show(result, **options) -> Figure:
     if isinstance(result, Sensitivity):
         return plot_linear.sensitivity(result.dataset, **options)
     if isinstance(result, Calibration):
-        return plot_calibration.calibration(result, **options)
+        return plot.calibration(result, **options)
     if isinstance(result, xr.Dataset) and "fivjax" in result.attrs:
         _refuse_more_axes(result)
         for is_one, draw in _PICTURES:

@@ -4,9 +4,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from .. import plot
 from ..model.scene import Scene
-from ..plot import results as plot
-from ..plot.results import VERMILION
+from ..plot.style import VERMILION
 from ..verdicts.verdict import Verdict
 from .panels import png
 

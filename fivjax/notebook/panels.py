@@ -10,7 +10,8 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
 from ..contact import Status
-from ..plot.results import BLACK, BLUE, GREEN, STATUS_NAMES, VERMILION
+from ..plot import STATUS_NAMES
+from ..plot.style import BLACK, BLUE, GREEN, VERMILION
 from ..simulation.trajectory import Trajectory
 
 # The least that a panel's height or width stands for, as a share of the load over the mass, the belt's speed, the

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
-from ..plot._style import BLACK, BLUE, GREEN, ORANGE, VERMILION, legend_above, new_figure
 from ..plot.contact_status import shade_status
+from ..plot.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, legend_above, new_figure
 from ..simulation.trajectory import Trajectory
 
 Window = tuple[float, float]

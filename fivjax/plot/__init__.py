@@ -1,11 +1,11 @@
 """Pictures of results. Every function takes results, returns a matplotlib `Figure`, and computes nothing."""
 
-from . import calibration as calibration
 from . import energy as energy
 from . import linear as linear
 from .contact_status import STATUS_COLOURS as STATUS_COLOURS
 from .contact_status import STATUS_NAMES as STATUS_NAMES
 from .contact_status import shade_status as shade_status
+from .fits import calibration as calibration
 from .maps import SLIDING_SHADE as SLIDING_SHADE
 from .maps import bistability as bistability
 from .responses import comparison as comparison

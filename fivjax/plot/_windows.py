@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from ..simulation.energy import Energy
 from ..simulation.trajectory import Trajectory
-from ._style import BLUE, GREEN, ORANGE, PURPLE, check_run
 from .contact_status import shade_status
+from .style import BLUE, GREEN, ORANGE, PURPLE, check_run
 
 Window = tuple[float, float]
 
@@ -50,11 +50,11 @@ def styles(runs: Mapping) -> list:
 def align_zeros(*pair: Axes) -> None:
     """Put the zeros of two vertical axes at one height, so that signs can be read off both."""
     limits = [axes.get_ylim() for axes in pair]
-    spans = [max(abs(low), abs(high)) for low, high in limits]
-    below = max(max(-low, 0.0) / span for (low, _), span in zip(limits, spans, strict=True))
-    above = max(max(high, 0.0) / span for (_, high), span in zip(limits, spans, strict=True))
-    for axes, span in zip(pair, spans, strict=True):
-        axes.set_ylim(-1.05 * below * span, 1.05 * above * span)
+    sizes = [max(abs(low), abs(high)) for low, high in limits]
+    below = max(max(-low, 0.0) / size for (low, _), size in zip(limits, sizes, strict=True))
+    above = max(max(high, 0.0) / size for (_, high), size in zip(limits, sizes, strict=True))
+    for axes, size in zip(pair, sizes, strict=True):
+        axes.set_ylim(-1.05 * below * size, 1.05 * above * size)
 
 
 def legend_between(axes: Axes, entries: list) -> None:

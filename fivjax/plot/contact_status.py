@@ -7,7 +7,7 @@ from matplotlib.patches import Patch
 from ..contact import Status
 from ..model.load import Pulse
 from ..simulation.trajectory import Trajectory
-from ._style import ORANGE, SKY, VERMILION
+from .style import ORANGE, SKY, VERMILION
 
 STATUS_COLOURS = {Status.STICK: ORANGE, Status.DETACH: SKY}
 STATUS_NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}

@@ -9,7 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..simulation.trajectory import Trajectory
-from ._style import (
+from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
+from .contact_status import STATUS_NAMES
+from .style import (
     BLACK,
     BLUE,
     GREEN,
@@ -20,8 +22,6 @@ from ._style import (
     legend_above,
     new_figure,
 )
-from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
-from .contact_status import STATUS_NAMES
 
 PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy gained"}
 

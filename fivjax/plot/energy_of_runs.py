@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..simulation.trajectory import Trajectory
-from ._style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_runs, legend_above, new_figure
 from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
+from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_runs, legend_above, new_figure
 
 
 def mechanical_power(run: Trajectory, windows: Sequence[Window], *, figure: Figure | None = None) -> Figure:

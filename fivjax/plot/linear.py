@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ._style import (
+from .style import (
     BLACK,
     BLUE,
     COLOURS,

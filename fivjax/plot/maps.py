@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from ..foundation.quantities import QUANTITIES
 from ..verdicts.verdict import Verdict
-from ._style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, new_figure, with_unit
+from .style import BLACK, VERMILION, axis_label, cell_edges, check_dataset, new_figure, with_unit
 from .thresholds import draw_threshold
 
 SLIDING_SHADE = "#f2f2f2"

@@ -9,7 +9,8 @@ from matplotlib.lines import Line2D
 from ..foundation import arguments
 from ..foundation.quantities import QUANTITIES
 from ..simulation.trajectory import Trajectory
-from ._style import (
+from .contact_status import mark_kick, shade_status
+from .style import (
     BLACK,
     BLUE,
     GREEN,
@@ -23,7 +24,6 @@ from ._style import (
     new_figure,
     with_unit,
 )
-from .contact_status import mark_kick, shade_status
 
 
 def response(

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ._style import BLUE, VERMILION, axis_label, check_dataset, new_figure
+from .style import BLUE, VERMILION, axis_label, check_dataset, new_figure
 
 
 def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:

@@ -5,7 +5,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ._style import BLUE, check_dataset, new_figure
+from .style import BLUE, check_dataset, new_figure
 
 # One for each method, filled for double precision.
 MARKERS = "os^Dv<>pPX*hd"

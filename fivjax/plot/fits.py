@@ -4,9 +4,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibration.result import Calibration
-from ..io.datasets import QUANTITIES
+from ..foundation.quantities import QUANTITIES
+from .style import BLACK, SKY, VERMILION, new_figure
 
-MEASURED, FITTED, LEFT = "#56B4E9", "#000000", "#D55E00"
+MEASURED, FITTED, LEFT = SKY, BLACK, VERMILION
 UNITS = {"acceleration": "m/s²", "velocity": "m/s"}
 # A fit is looked at in its details and as a whole: so many blocks of the first, all of the second.
 DETAIL = 160
@@ -18,7 +19,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
     A limit cycle is fitted by its first harmonics: these are drawn, and what is left is also all that lies above them.
     """
     rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
-    figure = figure or Figure(figsize=(9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows)), layout="constrained")
+    figure = new_figure(figure, 9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows))
     axes = np.atleast_2d(figure.subplots(len(rows), 2, width_ratios=(3, 2)))
     for (k, c), (detail, whole) in zip(rows, axes, strict=True):
         t, measured, fitted = fit.t[k], fit.measured[k][:, c], fit.fitted[k][:, c]

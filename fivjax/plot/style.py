@@ -52,19 +52,11 @@ def variable_label(variable: xr.DataArray) -> str:
     return with_unit(str(long_name), variable.attrs.get("units", "1"))
 
 
-def coordinate_name(structure: Structure, index: int) -> str:
-    """The name of a coordinate, such as x2, or its number where the structure has no names."""
-    names = getattr(structure, "coordinates", None)
-    return str(names[index]) if names else f"coordinate {index}"
-
-
 def coordinate_label(structure: Structure, index: int) -> str:
     """The name of a coordinate with what it is to the contact: "tangential x2", "normal y2", "y1"."""
-    name = coordinate_name(structure, index)
+    name = structure.coordinates[index]
     role = {structure.tangential: "tangential", structure.normal: "normal"}.get(index)
-    if role is None:
-        return name
-    return f"{role} {name}" if getattr(structure, "coordinates", None) else role
+    return name if role is None else f"{role} {name}"
 
 
 def cell_edges(values: np.ndarray) -> np.ndarray:
