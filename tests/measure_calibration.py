@@ -22,7 +22,7 @@ def draws(name: str, count: int, total: int, starts: int = 4) -> None:
     scene, accelerations, regime = case(name)
     names = FREE[count]
     fractions = times(scene) if regime == "limit cycle" else {}
-    inside, told, outcomes, scores, costs = 0, np.zeros(len(names), int), Counter(), [], []
+    inside, identifiable, outcomes, deviations_off, costs = 0, np.zeros(len(names), int), Counter(), [], []
     for draw in tqdm(range(total), desc=f"{name}, {count} parameters", disable=None):
         share = 0.01 + 0.04 * draw / max(total - 1, 1)
         begin = time.process_time()
@@ -39,19 +39,19 @@ def draws(name: str, count: int, total: int, starts: int = 4) -> None:
         costs.append(time.process_time() - begin)
         truth = np.array([float(scene.parameters[n]) for n in names])
         score = np.abs(fit.estimates - truth) / fit.deviations
-        told += fit.identified
+        identifiable += fit.identified
         outcomes[fit.outcome.name.lower()] += 1
         inside += bool(np.all(score[fit.identified] <= 3))
-        scores.append(np.where(fit.identified, score, np.nan))
+        deviations_off.append(np.where(fit.identified, score, np.nan))
         if not (np.all(score[fit.identified] <= 3) and fit.converged):
             print(f"   draw {draw}: {fit.outcome.name.lower()}, misfit {fit.misfit:.3g}, scores {np.round(score, 1)}")
     # Over the draws in which a parameter was identifiable.
-    spread = np.sqrt(np.nansum(np.square(scores), axis=0) / np.maximum(told, 1))
+    spread = np.sqrt(np.nansum(np.square(deviations_off), axis=0) / np.maximum(identifiable, 1))
     print(
         f"{name}, {count} parameters: all identifiable ones within three standard deviations in {inside} of {total} draws; "
         f"{dict(outcomes)}; {costs[0]:.0f} s of processor time for the first, {np.median(costs):.1f} s for others (median)"
     )
-    for n, t, s in zip(names, told, spread, strict=True):
+    for n, t, s in zip(names, identifiable, spread, strict=True):
         print(f"   {n:<6} identifiable in {t} draws; error {s:.2f} standard deviations (root mean square)")
     sys.stdout.flush()
 

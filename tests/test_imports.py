@@ -135,5 +135,15 @@ def test_rooms_of_computing_load_nothing_to_draw_or_store_with(room):
     """What computes must not wait for what draws, stores or reads files."""
     names = [name for name in import_floors.modules() if import_floors.room(name) == room]
     code = "import sys, importlib\n" + "".join(f"importlib.import_module({name!r})\n" for name in names)
-    ran = subprocess.run([sys.executable, "-c", code + "print(*sys.modules)"], capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", code + "print(*sys.modules)"], capture_output=True, text=True, check=True
+    )
     assert not set(ran.stdout.split()) & HEAVY
+
+
+def test_what_notebooks_show_stands_where_it_is_looked_for():
+    """A class that moved is rejected: IPython finds it by name, and would show it as plain text without a word."""
+    from fivjax.notebook.registration import SHOWN_BY
+
+    for module, name in SHOWN_BY:
+        assert getattr(importlib.import_module(module), name).__module__ == module

@@ -12,7 +12,7 @@ import sys
 SHOWN_BY = {
     ("fivjax.simulation.trajectory", "Trajectory"): "trajectory_summary",
     ("fivjax.linear.sensitivities", "Sensitivity"): "with_picture",
-    ("fivjax.calibration.fit", "Calibration"): "with_picture",
+    ("fivjax.calibration.result", "Calibration"): "with_picture",
 }
 
 
