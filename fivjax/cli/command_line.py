@@ -12,6 +12,7 @@ import tyro
 import fivjax as fj
 
 from .analysis_commands import Calibrate, Cea
+from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
 from .simulate_command import Simulate
@@ -21,6 +22,7 @@ COMMANDS = {
     "map": Map,
     "simulate": Simulate,
     "cea": Cea,
+    "cycle": Cycle,
     "calibrate": Calibrate,
     "tradeoff": Tradeoff,
     "reproduce": Reproduce,

@@ -72,6 +72,14 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
     if best is None or not best[0] <= CLOSED:
         return None
     closure, point, found, jacobian = best
+    # Once around may be less than what was asked for.
+    for fewer in (count for count in range(1, crossings) if crossings % count == 0):
+        sooner, derived = _returned(scene, stepper, point, fewer)
+        y = np.asarray(point.y)
+        missed = np.linalg.norm(weights * (np.asarray(sooner.point.y) - y)) / np.linalg.norm(weights * y)
+        if missed <= CLOSED and _same_mode(sooner.point, point):
+            found, jacobian, closure, crossings = sooner, derived, missed, fewer
+            break
     return Closed(point, crossings, float(found.time), jacobian, float(closure), int(found.segments), int(found.events))
 
 

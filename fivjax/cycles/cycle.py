@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Contact
+from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.load import ConstantLoad
 from ..model.scene import Scene
@@ -58,12 +59,33 @@ class LimitCycle(eqx.Module):
         values = section_multipliers(self.return_jacobian)
         return int(np.sum(np.abs(values) > 1.0))
 
-    def trajectory(self, points: int = 1000, energy: bool = False) -> Trajectory:
-        """One period as a trajectory of `points` + 1 rows, the first and the last on the section.
+    def trajectory(self, points: int = 1000, *, periods: int = 1, energy: bool = False) -> Trajectory:
+        """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section.
 
         **Raises:** `ValueError` for a number of points that is not positive.
         """
-        return simulate(self.scene, t1=self.period, dt_save=self.period / points, y0=self.state, energy=energy)
+        arguments.whole_number("points", points, minimum=1)
+        arguments.whole_number("periods", periods, minimum=1)
+        end = periods * self.period
+        return simulate(self.scene, t1=end, dt_save=end / points, y0=self.state, energy=energy)
+
+    def to_dataset(self):
+        """One period with names, units and the scene it came from; multipliers and points of the section beside it."""
+        dataset = self.trajectory().to_dataset()
+        return dataset.assign(
+            multiplier_real=("multiplier", self.multipliers.real),
+            multiplier_imaginary=("multiplier", self.multipliers.imag),
+            section_point=(("point", "state"), np.asarray(self.points)),
+            word_status=("phase", [int(phase.status) for phase in self.word]),
+            word_duration=("phase", [phase.duration for phase in self.word]),
+        ).assign_attrs(
+            kind=self.kind,
+            period=self.period,
+            amplitude=self.amplitude,
+            stable=int(self.stable),
+            residual=self.residual,
+            crossings=self.crossings,
+        )
 
     @property
     def energy(self) -> dict[str, float]:

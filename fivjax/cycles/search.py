@@ -17,7 +17,7 @@ from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
 from .closing import close
-from .cycle import LimitCycle, limit_cycle_of, point_of, under_final_load
+from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
 from .torus import on_torus, torus_of
 
@@ -261,10 +261,11 @@ def _state_of(scene: Scene, start) -> np.ndarray:
 
 def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
     """A point of the section to begin at, and the numbers of crossings a period to try."""
-    if isinstance(start, LimitCycle):
-        return point_of(start), [start.crossings]
     status = None
-    if isinstance(start, tuple | list) and len(start) == 2:
+    if isinstance(start, LimitCycle):
+        # Its own point need not be one of this scene's section: there an impact may fall on the other side of it.
+        start, status = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation, start.contact.status
+    elif isinstance(start, tuple | list) and len(start) == 2:
         start, status = start
     rest = np.asarray(sliding_state(scene, scene.load.final))
     y = jnp.asarray(_state_of(scene, start) - rest)

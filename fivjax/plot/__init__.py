@@ -5,6 +5,7 @@ from . import linear as linear
 from .contact_status import STATUS_COLOURS as STATUS_COLOURS
 from .contact_status import STATUS_NAMES as STATUS_NAMES
 from .contact_status import shade_status as shade_status
+from .cycles import cycle as cycle
 from .fits import calibration as calibration
 from .maps import SLIDING_SHADE as SLIDING_SHADE
 from .maps import bistability as bistability

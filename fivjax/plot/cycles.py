@@ -1,0 +1,96 @@
+"""A limit cycle: phase plane with its contact modes, multipliers beside the unit circle, points of the section."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ..contact import Status
+from ..cycles.cycle import LimitCycle
+from ..foundation import arguments
+from .style import BLACK, BLUE, ORANGE, SKY, VERMILION, legend_above, new_figure
+
+ROWS = 2000
+COLOURS = {Status.STICK: ORANGE, Status.SLIDE: BLUE, Status.DETACH: SKY}
+NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}
+
+
+def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figure | None = None) -> Figure:
+    """A limit cycle in the phase plane, coloured by contact mode, and its Floquet multipliers beside the unit circle.
+
+    Of a torus the points of the section stand beside it instead of the multipliers. `others` (the saddle cycle, say) are drawn
+    dashed into the same plane.
+
+    **Raises:** `TypeError` for anything but a `LimitCycle`.
+    """
+    for one in (cycle, *others):
+        arguments.instance("cycle", one, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
+    figure = new_figure(figure, 9.6, 4.6)
+    plane, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    _phase_plane(plane, cycle)
+    handles = [Line2D([], [], color=COLOURS[status], label=NAMES[status]) for status in _statuses(cycle)]
+    for other in others:
+        run = other.trajectory(ROWS)
+        x, v = _tangential(run)
+        plane.plot(1e3 * x, v, color=BLACK, ls="--", lw=0.9)
+        label = "another cycle" if other.stable else "saddle cycle"
+        handles.append(Line2D([], [], color=BLACK, ls="--", label=f"{label}, {other.amplitude:.4g} m/s"))
+    plane.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
+    legend_above(plane, handles, columns=3)
+    if cycle.kind == "torus":
+        _section(right, cycle)
+    else:
+        _multipliers(right, cycle)
+    return figure
+
+
+def _statuses(cycle: LimitCycle) -> list[Status]:
+    return sorted({phase.status for phase in cycle.word})
+
+
+def _tangential(run) -> tuple[np.ndarray, np.ndarray]:
+    tangential = run.scene.structure.tangential
+    return np.asarray(run.displacement)[:, tangential], np.asarray(run.velocity)[:, tangential]
+
+
+def _phase_plane(axes: Axes, cycle: LimitCycle) -> None:
+    # Of a torus, some beats.
+    periods = 1 if cycle.kind == "periodic" else 40
+    run = cycle.trajectory(ROWS, periods=periods)
+    x, v = _tangential(run)
+    status = np.asarray(run.status)
+    for mode in _statuses(cycle):
+        here = status == mode
+        # A row belongs to the line before and after it.
+        shown = here | np.append(False, here[:-1])
+        axes.plot(1e3 * np.where(shown, x, np.nan), np.where(shown, v, np.nan), color=COLOURS[mode], lw=1.3)
+    belt = float(cycle.scene.belt_speed)
+    low, high = axes.get_ylim()
+    if low < belt < high:
+        axes.axhline(belt, color=BLACK, lw=0.6, ls=":")
+
+
+def _multipliers(axes: Axes, cycle: LimitCycle) -> None:
+    angle = np.linspace(0.0, 2 * np.pi, 361)
+    axes.plot(np.cos(angle), np.sin(angle), color=BLACK, lw=0.8)
+    inside = np.abs(cycle.multipliers) <= 1 + 1e-9
+    kinds = ((inside, BLUE, "inside the unit circle, or 1"), (~inside, VERMILION, "outside"))
+    for chosen, colour, name in kinds:
+        if np.any(chosen):
+            values = cycle.multipliers[chosen]
+            axes.plot(values.real, values.imag, "o", color=colour, ms=6, label=f"{name} the unit circle")
+    axes.set(xlabel="Floquet multiplier, real part", ylabel="imaginary part", aspect="equal")
+    legend_above(axes, axes.get_legend_handles_labels()[0], columns=2)
+
+
+def _section(axes: Axes, cycle: LimitCycle) -> None:
+    n = cycle.scene.structure.size
+    tangential, normal = cycle.scene.structure.tangential, cycle.scene.structure.normal
+    others = [k for k in range(n) if k not in (tangential, normal)]
+    second = others[0] if others else normal
+    name = cycle.scene.structure.coordinates[second]
+    first = cycle.scene.structure.coordinates[tangential]
+    axes.plot(1e3 * cycle.points[:, tangential], cycle.points[:, n + second], ".", color=BLUE, ms=2)
+    axes.set(xlabel=f"{first} on the section, from equilibrium (mm)", ylabel=f"velocity of {name} (m/s)")
