@@ -8,6 +8,8 @@ points, not as a Fourier series.
 
 A torus is accepted when
 
+- its points wind around the curve many times, and do not drift: early and late ones have the same mean, to a small share of
+  the curve's extent, as the averages of a motion on a torus have and those of a slow transient have not;
 - its curve is smooth in the order of the phases: neighbours lie close together, but for few jumps;
 - the largest Lyapunov exponent of the return map is zero, to what so many returns can tell: not positive (chaos), and the
   second is negative: deviations from the curve contract;
@@ -41,8 +43,12 @@ EXPONENT_RETURNS = 384
 ZERO = 0.01
 # Neighbours on the curve are farther apart than this share of its size at jumps only, and of jumps there are few.
 JUMP, MOST_JUMPS = 0.05, 12
-# The tube's radius, relative to the size of the points, and how many starts in it are followed.
-TUBE = 0.02
+# The points wind around the curve at least so often, and the means of the first and the last third of them differ by less than
+# this share of their extent.
+LEAST_TURNS = 20
+DRIFT = 0.05
+# The tube's radius, relative to the size of the points, or to the extent of the curve if that is small; starts in it.
+TUBE, TUBE_OF_EXTENT = 0.02, 0.2
 TUBE_STARTS = 64
 # They have to be back, for the last returns of a look, within so many looks of `POINTS` returns.
 HOME, TUBE_LOOKS = 16, 4
@@ -116,6 +122,8 @@ def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k 2n"]) -> Curve | N
     weighted = weights * returns
     size = np.mean(np.linalg.norm(weighted, axis=-1))
     rotation = _rotation(weighted)
+    if abs(rotation) * len(returns) < LEAST_TURNS or _drifts(weighted):
+        return None
     order = np.argsort(np.mod(rotation * np.arange(len(returns)), 1.0), kind="stable")
     path = weighted[order]
     steps = np.linalg.norm(np.diff(np.concatenate([path, path[:1]]), axis=0), axis=-1) / size
@@ -126,6 +134,26 @@ def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k 2n"]) -> Curve | N
     middle = 0.5 * (path[:-2:2] + path[2::2])[: len(path[1:-1:2])]
     residual = np.median(np.linalg.norm(middle - path[1:-1:2][: len(middle)], axis=-1)) / size
     return Curve(returns[order], float(rotation), jumps, float(residual))
+
+
+def _extent(weighted: Float[np.ndarray, "k 2n"]) -> float:
+    """How far points lie from their middle, in the root mean square."""
+    return float(np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1))))
+
+
+def _drifts(weighted: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether the points move on in the mean: on a torus they go round and round."""
+    third = len(weighted) // 3
+    x = (np.arange(third) + 0.5) / third
+    bump = np.exp(-1.0 / (x * (1 - x)))[:, None]
+    early, late = (np.sum(bump * part, axis=0) / np.sum(bump) for part in (weighted[:third], weighted[-third:]))
+    return bool(np.linalg.norm(late - early) > DRIFT * _extent(weighted))
+
+
+def tube_radius(weighted: Float[np.ndarray, "k 2n"]) -> float:
+    """The radius of the tube about a curve through these points."""
+    size = float(np.mean(np.linalg.norm(weighted, axis=-1)))
+    return min(TUBE * size, TUBE_OF_EXTENT * _extent(weighted))
 
 
 def _rotation(weighted: Float[np.ndarray, "k 2n"]) -> float:
@@ -175,7 +203,7 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
     """Whether starts in the tube about the curve come back into half of it, and stay while they are followed."""
     weights = np.asarray(scene.structure.weights)
     weighted = weights * curve.points
-    size = np.mean(np.linalg.norm(weighted, axis=-1))
+    radius = tube_radius(weighted)
     structure = scene.structure
     velocity, gap = structure.size + structure.tangential, structure.normal
     random = np.random.default_rng(0)
@@ -186,7 +214,7 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
         away = random.normal(size=states.shape)
         away[:, velocity] = 0.0
         away[~open_, gap] = away[~open_, structure.size + gap] = 0.0
-        away *= TUBE * size / np.linalg.norm(away, axis=-1, keepdims=True)
+        away *= radius / np.linalg.norm(away, axis=-1, keepdims=True)
         starts = states + away / weights
         starts[:, gap] = np.maximum(starts[:, gap], 0.0)
         status = np.where(open_, Status.DETACH, Status.SLIDE)
@@ -198,7 +226,7 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
             if not np.all(np.isfinite(ends)):
                 return False
             apart = np.min(np.linalg.norm(ends[:, :, None] - weighted, axis=-1), axis=-1)
-            home = bool(np.max(apart) < 0.5 * TUBE * size)
+            home = bool(np.max(apart) < 0.5 * radius)
             if home:
                 break
             now = jax.tree.map(lambda leaf: leaf[:, -1], found.point)
@@ -210,6 +238,5 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
 def on_torus(scene: Scene, torus: LimitCycle, points: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether the last of these points (weighted deviations) lie in the torus' tube."""
     weighted = np.asarray(scene.structure.weights) * torus.points
-    size = np.mean(np.linalg.norm(weighted, axis=-1))
     apart = np.min(np.linalg.norm(points[-HOME:, None] - weighted, axis=-1), axis=-1)
-    return bool(np.max(apart) < TUBE * size)
+    return bool(np.max(apart) < tube_radius(weighted))
