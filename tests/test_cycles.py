@@ -139,6 +139,16 @@ def test_starts_of_the_wrong_kind_are_refused(start, fragment):
 
 
 @pytest.mark.slow
+def test_the_paper_s_cycle_loses_its_stability_in_a_neimark_sacker_bifurcation():
+    """A complex pair leaves the unit circle between 1.6 and 3 m/s: below that speed it is inside, above outside."""
+    before = fj.limit_cycle(paper(1.8))
+    at, beyond = (fj.limit_cycle(paper(speed), start=before) for speed in (1.8378941586942, 1.85))
+    pair = at.multipliers[np.abs(at.multipliers.imag) > 0.1]
+    np.testing.assert_allclose(np.abs(pair), 1.0, atol=1e-9)
+    assert before.stable and not beyond.stable and beyond.unstable_directions == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("belt_speed", [1.2, 1.4, 1.6, 1.8])
 def test_benchmark_a_against_another_kind_of_solver(belt_speed):
     """The unstable cycle of pure sliding and the stick-slip cycle, against DOP853 with its variational equation."""

@@ -12,7 +12,8 @@ import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
 from fivjax.maps.progress import next_step_end
 from fivjax.model.scene import steady_sliding
-from fivjax.steppers.windowed import Windowed, propagators
+from fivjax.steppers.propagation import propagators
+from fivjax.steppers.windowed import Windowed
 
 
 @eqx.filter_jit

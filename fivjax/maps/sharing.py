@@ -19,8 +19,9 @@ from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
+from ..steppers.propagation import MATRIX_ROWS
 from ..steppers.section import Resolution
-from ..steppers.windowed import MATRIX_ROWS, Windowed
+from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
 from ..verdicts.ensemble import Attractor
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes

@@ -233,6 +233,7 @@ class Structure(eqx.Module):
         return len(self.coordinates)
 
     @property
+    @in_double_precision
     def weights(self) -> Float[Array, " 2n"]:
         """What makes the squares of displacements and velocities comparable energies: the square roots of the diagonals."""
         matrices = self.matrices

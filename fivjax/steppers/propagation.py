@@ -1,0 +1,147 @@
+"""The matrices that carry a scene's motion through a window of time, in each of its contact modes; constant friction."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, Status
+from ..contact.rounding import largest_rounding
+
+# Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
+INTERVALS = 16
+# The fastest vibration turns by this much between two samples, rad: guards look like cubics there.
+TURN = 0.6
+# Order of the Taylor series within an interval: TURN^16 / 16! is below rounding.
+ORDER = 15
+# Rows of all matrices of a scene per coordinate, about; for those who have to know how much memory they take.
+MATRIX_ROWS = 4 * (INTERVALS + ORDER)
+
+
+class Propagators(eqx.Module):
+    """The matrices of one scene. Their columns are those of `stacked`: the four ways to be in contact, side by side."""
+
+    mechanics: Mechanics
+    interval: Float[Array, ""]  # between two samples, s
+    window: Float[Array, "r c"]  # see `Window`
+    series: Float[Array, "q c"]  # see `Series`
+    sizes: Float[Array, "8 c"]  # rounding of the guards' first three coefficients, and how far they are from cubics
+
+
+def propagators(mechanics: Mechanics) -> Propagators:
+    """The matrices for one scene with constant friction."""
+    n = mechanics.free_load.shape[0]
+    ways = _ways(mechanics.free_load.dtype)
+    generators, guards = jax.vmap(lambda way: _affine(mechanics, way))(ways)
+    interval = TURN / jnp.max(jax.vmap(_spectral_radius)(generators))
+    identity = jnp.broadcast_to(jnp.eye(2 * n + 2, dtype=generators.dtype), generators.shape)
+
+    def next_power(power, k):
+        power = power @ generators * (interval / k)
+        return power, power
+
+    orders = jnp.arange(1.0, ORDER + 2, dtype=generators.dtype)
+    _, powers = jax.lax.scan(next_power, identity, orders)
+    powers = jnp.concatenate([identity[None], powers])
+    step = jnp.sum(powers, axis=0)
+    _, samples = jax.lax.scan(lambda sample, _: (step @ sample, step @ sample), identity, length=INTERVALS)
+    samples = jnp.concatenate([identity[None], samples])
+
+    coefficients = guards @ powers[: ORDER + 1]  # [order, way, guard, column]
+    hulls = jnp.einsum("jk,kwgc->jwgc", _bernstein(ORDER), coefficients)[1:]
+    values, slopes = guards @ samples, coefficients[1] @ samples
+    control = jnp.stack([values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3])
+    window = [coefficients[:4], hulls, control, samples[:, :, : 2 * n]]
+    series = [coefficients, jnp.sum(coefficients, axis=0), powers[:, :, :n]]
+
+    sizes, rates = jax.vmap(lambda way: _magnitudes(mechanics, way))(ways)
+    terms = jnp.stack([sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)])
+    # A cubic with the values and slopes of both ends is off by at most a 384th of the fourth derivative; twice that is
+    # what the derivative may grow to between samples.
+    uncubic = jnp.max(jnp.abs(coefficients[4] @ samples), axis=0) * (2 * math.factorial(4) / 384)
+    rounding = [largest_rounding(terms), uncubic]
+
+    def table(parts: list[Float[Array, "*k 4 x c"]]) -> Float[Array, "r c"]:
+        flat = [jnp.moveaxis(part, -3, 0).reshape(4, -1, 2 * n + 2) for part in parts]
+        rows = jnp.concatenate(flat, axis=1)
+        closed, everything = _columns(n, mechanics.normal)
+        return jnp.concatenate([*(rows[way][:, closed] for way in range(3)), rows[3][:, everything]], axis=1)
+
+    return Propagators(mechanics, interval, table(window), table(series), table(rounding))
+
+
+def _bernstein(order: int) -> np.ndarray:
+    """From a polynomial's coefficients to its control points on [0, 1]: it lies in their convex hull."""
+    return np.array([[math.comb(j, k) / math.comb(order, k) for k in range(order + 1)] for j in range(order + 1)])
+
+
+def _ways(dtype) -> Contact:
+    """Sticking, sliding in either direction, detached."""
+    status = jnp.array([Status.STICK, Status.SLIDE, Status.SLIDE, Status.DETACH], jnp.int32)
+    return Contact(status, jnp.array([1.0, 1.0, -1.0, 1.0], dtype))
+
+
+def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
+    """What of (state, load, 1) is not zero: in contact, when there is neither gap nor gap rate, and detached."""
+    everything = np.arange(2 * n + 2)
+    return everything[(everything != normal) & (everything != n + normal)], everything
+
+
+def stacked(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"]
+) -> Float[Array, "c l"]:
+    """(state, load, 1) in the columns of the way the contact is in, zero in the others."""
+    n, normal = y.shape[0] // 2, mechanics.normal
+    rest = jnp.stack([load, jnp.ones_like(load)])
+    closed = jnp.concatenate([y[:normal], y[normal + 1 : n + normal], y[n + normal + 1 :], rest])
+    sliding = contact.status == Status.SLIDE
+    ways = [contact.status == Status.STICK, sliding & (contact.direction > 0), sliding & (contact.direction < 0)]
+    columns = [jnp.where(way, closed, 0.0) for way in ways]
+    return jnp.concatenate([*columns, jnp.where(contact.status == Status.DETACH, jnp.concatenate([y, rest]), 0.0)])
+
+
+def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"], Float[Array, "2 m"]]:
+    """Rates and guards in one way of contact, as matrices on (state, load, 1)."""
+    n = mechanics.free_load.shape[0]
+
+    def rates_and_guards(v):
+        y, load = v[: 2 * n], v[2 * n]
+        rates = physics.acceleration(mechanics, contact, load, y)
+        return jnp.concatenate([v[n : 2 * n], rates, physics.guards(mechanics, contact, load, y)])
+
+    zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
+    matrix = jnp.concatenate([jax.jacfwd(rates_and_guards)(zero), rates_and_guards(zero)[:, None]], axis=1)
+    unchanging = jnp.zeros((2, 2 * n + 2), zero.dtype)
+    return jnp.concatenate([matrix[: 2 * n], unchanging]), matrix[2 * n :]
+
+
+def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2 m"], Float[Array, "m m"]]:
+    """`contact.magnitudes` as matrices on the sizes of (state, load, 1): of the guards, and of the rates."""
+    n = mechanics.free_load.shape[0]
+
+    def sizes(v):
+        guards, rates = physics.magnitudes(mechanics, contact, v[2 * n], v[: 2 * n])
+        return jnp.concatenate([guards, rates])
+
+    zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
+    # The load is a size like the others: the slope of its own size at zero is one.
+    matrix = jnp.concatenate([jax.jacfwd(sizes)(zero.at[2 * n].set(1.0)), sizes(zero)[:, None]], axis=1)
+    unchanging = jnp.zeros((2, 2 * n + 2), zero.dtype)
+    return matrix[:2], jnp.concatenate([matrix[2:], unchanging])
+
+
+def _spectral_radius(matrix: Float[Array, "m m"]) -> Float[Array, ""]:
+    """By Gelfand's formula, the 64th root of the size of the 64th power: a little too large, never too small."""
+
+    def squared(carry, _):
+        log_size, matrix = carry
+        size = jnp.max(jnp.abs(matrix))
+        size = jnp.where(size > 0, size, 1.0)
+        return (2 * (log_size + jnp.log(size)), (matrix / size) @ (matrix / size)), None
+
+    (log_size, matrix), _ = jax.lax.scan(squared, (jnp.zeros((), matrix.dtype), matrix), length=6)
+    return jnp.exp((log_size + jnp.log(jnp.linalg.norm(matrix) + jnp.finfo(matrix.dtype).tiny)) / 64)

@@ -1,0 +1,167 @@
+"""A window of the future of trajectories side by side, and the Taylor series within one of its intervals."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..contact.rounding import zero_at_start
+from ..foundation.polynomial import value_and_slope
+from .propagation import INTERVALS, ORDER
+
+
+class Window(eqx.Module):
+    """The future of trajectories side by side, at the ends of the intervals and between them."""
+
+    rows: Float[Array, "r l"]
+    sizes: Float[Array, "8 l"]
+    exact: Bool[Array, "2 l"]  # see `contact.exactly_zero`
+    n: int = eqx.field(static=True)
+    tangential: int = eqx.field(static=True)
+
+    @property
+    def parts(self) -> list[Array]:
+        """First coefficients of the guards at the start; control points of their series there; their control points as
+        cubics in each interval; samples of the state.
+        """
+        return _parts(self.rows, (4, 2), (ORDER, 2), (3, INTERVALS, 2), (INTERVALS + 1, 2 * self.n))
+
+    @property
+    def speed(self) -> Float[Array, "i l"]:
+        """Samples of the tangential velocity."""
+        return self.parts[-1][:, self.n + self.tangential]
+
+    def safe_intervals(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
+        """How many intervals from the start on are certain to hold no event and no end of the step (`steps` intervals
+        off): a polynomial stays positive where its control points are.
+        """
+        start, hull, control, _ = self.parts
+        limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
+        safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, lane]
+        # In the first interval a guard may start at zero, because its status has just begun.
+        zeros, lead = _start(start, limits, self.exact)
+        first_safe = (lead > 0) & (least(hull[2:]) > 0)
+        first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
+        index = jnp.arange(INTERVALS)[:, None]
+        safe = safe[:, 0] & safe[:, 1] | (index == 0)
+        first = least(jnp.where(safe, INTERVALS, index).astype(jnp.int32))
+        first = jnp.where(first_safe[0] & first_safe[1], first, 0)
+        return jnp.minimum(first, jnp.floor(steps).astype(jnp.int32))
+
+    def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "2n l"]:
+        """The state where an interval begins."""
+        samples = self.parts[-1]
+        return jnp.where(interval == INTERVALS, samples[INTERVALS], chosen(samples[:INTERVALS], interval))
+
+    def rise(self, interval: Int[Array, " l"]) -> tuple[Bool[Array, " l"], tuple[Array, Array]]:
+        """Whether the tangential velocity rises through zero before the beginning of an interval, and the samples of the
+        state around the last time.
+        """
+        samples, speed, index = self.parts[-1], self.speed, jnp.arange(INTERVALS)[:, None]
+        rises = (speed[:-1] < 0) & (speed[1:] >= 0) & (index < interval)
+        last = -least(jnp.where(rises, -index, 1).astype(jnp.int32))
+        return last >= 0, (chosen(samples[:-1], last), chosen(samples[1:], last))
+
+    def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
+        """The largest tangential speed up to the beginning of an interval."""
+        speed = jnp.abs(self.speed)
+        return -least(jnp.where(jnp.arange(INTERVALS + 1)[:, None] <= interval, -speed, 0.0))
+
+
+class Bracket(eqx.Module):
+    """What is known of the first roots of the guards in [0, 1] from their starts and ends."""
+
+    guess: Float[Array, "2 l"]  # at the root; at the lowest point of one that perhaps dips; else 1
+    zeros: Int[Array, "2 l"]  # roots at the very start, not meant
+    end: Float[Array, "2 l"]  # where it is no longer positive, if it crosses
+    crosses: Bool[Array, "2 l"]
+    spent: Bool[Array, "2 l"]  # negative from the start
+    dips: Bool[Array, "2 l"]  # positive at both ends, perhaps not in between
+
+
+class Series(eqx.Module):
+    """Taylor series of trajectories side by side from the beginning of an interval, in units of the interval."""
+
+    rows: Float[Array, "q l"]
+    sizes: Float[Array, "8 l"]
+    exact: Bool[Array, "2 l"]  # see `contact.exactly_zero`
+    n: int = eqx.field(static=True)
+
+    @property
+    def parts(self) -> list[Array]:
+        """Coefficients of the guards; their values at the end of the interval; coefficients of the displacements."""
+        return _parts(self.rows, (ORDER + 1, 2), (2,), (ORDER + 2, self.n))
+
+    def brackets(self, inside: Bool[Array, " l"]) -> "Bracket":
+        """Of each guard; at the end of the window, not `inside` an interval, there is nothing to look for."""
+        c, end, _ = self.parts
+        zeros, lead = _start(c, self.sizes[:6].reshape(3, 2, -1), self.exact)
+        spent = inside & (lead < 0)
+        crosses = inside & (lead >= 0) & (end <= 0)
+        slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
+        bend = end - lead - slope
+        guess = parabola_root(lead, slope, bend)
+        bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
+        # With allowance for what is not parabolic.
+        dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
+        dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
+        guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
+        return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+
+    def without_zeros(self, zeros: Int[Array, "2 l"]) -> Float[Array, "k 2 l"]:
+        """The guards, their coefficients that are zero but for rounding exactly so."""
+        c = self.parts[0]
+        return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
+
+    def state(self, x: Float[Array, " l"]) -> Float[Array, "2n l"]:
+        """Displacements, and velocities in m per interval."""
+        return jnp.concatenate(value_and_slope(self.parts[2], x))
+
+
+def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
+    """Rows cut into pieces of these shapes, trajectories last."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    return [
+        rows[end - math.prod(shape) : end].reshape(*shape, -1) for shape, end in zip(shapes, ends.tolist(), strict=True)
+    ]
+
+
+def parabola_root(lead: Array, slope: Array, bend: Array) -> Array:
+    """Where lead + slope x + bend x² first falls to zero, if it does; in the form that does not cancel."""
+    root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
+    rises = slope > 0
+    half = 0.5 * jnp.where(rises, slope + root, root - slope)
+    below = jnp.where(rises, bend, half)
+    return jnp.where(rises, -half, lead) / jnp.where(below == 0, 1.0, below)
+
+
+def chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array, "*x l"]:
+    """Of as many rows as a window has intervals the one with this index in each lane."""
+    size = INTERVALS
+    while size > 1:
+        size //= 2
+        rows = jnp.where((index & size) > 0, rows[size:], rows[:size])
+    return rows[0]
+
+
+def least(rows: Array) -> Array:
+    """The least along the first axis, by halves: XLA turns that, unlike a reduction, into plain arithmetic on trajectories."""
+    while rows.shape[0] > 1:
+        half = rows.shape[0] // 2
+        rest = rows[2 * half :]
+        rows = jnp.minimum(rows[:half], rows[half : 2 * half])
+        rows = jnp.concatenate([jnp.minimum(rows[:1], rest), rows[1:]]) if rest.shape[0] else rows
+    return rows[0]
+
+
+def _start(
+    c: Float[Array, "k g l"], limits: Float[Array, "3 g l"], exact: Bool[Array, "g l"]
+) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
+    """How many coefficients at the start are zero but for rounding, and the first that is not."""
+    size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
+    zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
+    for k, zero in enumerate(zero_at_start(c, size, limits, exact)):
+        zeros, lead = zeros + zero, jnp.where(zero, c[k + 1], lead)
+    return zeros, lead

@@ -1,0 +1,106 @@
+"""The first root of the guards within an interval: bracketed, then polished by Newton's method."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..foundation.compiling import computed_once
+from ..foundation.polynomial import value_and_slope, value_slope_and_bend
+from .propagation import ORDER
+from .window import Bracket, Series
+
+MOST_ROOT_STEPS = 60
+# Terms of the series in the steps of Newton's method that nearly all roots are found with: few while it is still far off.
+ROOT_STEPS = (5, 5, ORDER)
+
+
+def dipped(series: Series, brackets: Bracket) -> Bracket:
+    """The brackets of polynomials that seemed to dip below zero, decided at their lowest points; seldom run at all."""
+
+    def decided(bracket: Bracket) -> Bracket:
+        c = series.parts[0]
+
+        def nearer(_, x):
+            _, slope, bend = value_slope_and_bend(c, x)
+            return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
+
+        # Newton's method: within an interval a slope is all but a straight line. It sets out from what the loop carries:
+        # what depends on nothing else, XLA takes out of the loop and computes every time.
+        lowest = jax.lax.fori_loop(0, 6, nearer, bracket.guess)
+        below = bracket.dips & (value_and_slope(c, lowest)[0] <= 0)
+        return Bracket(
+            guess=jnp.where(below, 0.5 * lowest, bracket.guess),
+            zeros=bracket.zeros,
+            end=jnp.where(below, lowest, bracket.end),
+            crosses=bracket.crosses | below,
+            spent=bracket.spent,
+            dips=jnp.zeros_like(bracket.dips),
+        )
+
+    return jax.lax.while_loop(lambda bracket: jnp.any(bracket.dips), decided, brackets)
+
+
+def first_root(
+    series: Series, brackets: Bracket, end: Float[Array, " l"]
+) -> tuple[Float[Array, " l"], Bool[Array, "2 l"]]:
+    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the guards end it there."""
+    crosses, spent = brackets.crosses, brackets.spent
+    c = series.without_zeros(brackets.zeros)
+    # A few steps for all at once cost less than a loop that goes on until the last lane is done.
+    near = computed_once(lambda: _approached(c, brackets), brackets.guess)
+    root, _, slope, settled = _newton(c, brackets.zeros, near)
+    # In a bracket, the function falls through its root; a dip ends where it is lowest.
+    settled = settled & (slope < 0) & (root > 0) & (root <= brackets.end)
+    root, slope = _bisected(c, brackets, root, slope, crosses & ~settled)
+    root = jnp.where(crosses, root, jnp.inf)
+    first = jnp.minimum(root[0], root[1])
+    # Roots that differ by rounding are the same: the two guards of an open gap always are.
+    same = 8 * jnp.finfo(end.dtype).eps * sum(jnp.abs(c[k]) for k in range(4))
+    fires = crosses & ((root == first) | ((root - first) * jnp.abs(slope) <= same))
+    any_spent = spent[0] | spent[1]
+    first, fires = jnp.where(any_spent, 0.0, first), jnp.where(any_spent, spent, fires)
+    fires = fires & (first <= end)
+    return jnp.where(fires[0] | fires[1], first, end), fires
+
+
+def _approached(c: Float[Array, "k 2 l"], brackets: Bracket) -> Float[Array, "2 l"]:
+    """The first roots in their brackets to half of all digits and more, where Newton's method goes the common way."""
+    x = jnp.minimum(brackets.guess, brackets.end)
+    for order in ROOT_STEPS:
+        x = jnp.clip(_newton(c[: order + 1], brackets.zeros, x)[0], 0.0, brackets.end)
+    return x
+
+
+def _newton(c: Float[Array, "k *x l"], zeros: Int[Array, "*x l"], x: Float[Array, "*x l"]):
+    """After one step of Newton's method: where, value and slope before it, and whether it was so short that it is the last."""
+    value, slope = value_and_slope(c, x)
+    # Without the roots at zero, which are divided out of value and slope alike.
+    slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
+    nearer = x - value / jnp.where(slope == 0, 1.0, slope)
+    # The next error is the square of this one.
+    return nearer, value, slope, (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
+
+
+def _bisected(
+    c: Float[Array, "k *x l"], brackets: Bracket, root: Float[Array, "*x l"], slope, open_: Bool[Array, "*x l"]
+) -> tuple[Float[Array, "*x l"], Float[Array, "*x l"]]:
+    """Roots and the slopes there, those of `open_` polynomials found anew: by Newton's method in their brackets, bisecting
+    where it leaves them. Seldom run at all.
+    """
+
+    def going(carry):
+        *_, open_, count = carry
+        return jnp.any(open_) & (count < MOST_ROOT_STEPS)
+
+    def step(carry):
+        low, high, x, slope, open_, count = carry
+        nearer, value, slope_at, done = _newton(c, brackets.zeros, x)
+        low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
+        nearer = jnp.where(done | ((nearer > low) & (nearer < high)), nearer, 0.5 * (low + high))
+        x, slope = jnp.where(open_, jnp.clip(nearer, 0.0, 1.0), x), jnp.where(open_, slope_at, slope)
+        return low, high, x, slope, open_ & ~done, count + 1
+
+    x = jnp.where(open_, jnp.minimum(brackets.guess, brackets.end), root)
+    begin = jnp.zeros_like(x), brackets.end, x, slope, open_, jnp.zeros((), jnp.int32)
+    _, _, root, slope, *_ = jax.lax.while_loop(going, step, begin)
+    return root, slope
