@@ -25,7 +25,9 @@ from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_
 # Guesses that go on from the coarse residuals to the waveform.
 KEPT = 4
 # Guesses of a limit cycle that are fitted, if none before explains the recording; and steps to bring one to its frequency.
-MOST_IN_TURN, FREQUENCY_STEPS = 12, 2
+MOST_IN_TURN, FREQUENCY_STEPS = 16, 2
+# Guesses this close in every parameter, as a share of it, lead to the same minimum.
+ALIKE, ALIKE_CYCLES = 0.01, 0.05
 WINDOWS = (0.15, 0.4, 1.0)
 # Where a fit stops: what is left along what the data tell, in standard deviations. Rounding of nearly parallel modes leaves
 # a thousandth.
@@ -88,7 +90,7 @@ class Search:
                 step = -np.linalg.lstsq(at.jacobian[rows], at.residual[rows], rcond=1e-2)[0]
                 x, about = x + np.clip(step, -0.5, 0.5), at.about
         found.sort(key=lambda one: one[0])
-        kept = _distinct([one.x for _, one in found])[:MOST_IN_TURN]
+        kept = _distinct([one.x for _, one in found], ALIKE_CYCLES)[:MOST_IN_TURN]
         # Without any cycle the scene's own parameters end the fit, with a name.
         return [one for _, one in found if any(one.x is x for x in kept)] or [Candidate(self.guesses[0], None)]
 
@@ -170,10 +172,10 @@ class Search:
         return max((growth_of_disturbances(np.asarray(system), where) for system in systems), default=0.0)
 
 
-def _distinct(points: list[np.ndarray]) -> list[np.ndarray]:
+def _distinct(points: list[np.ndarray], alike: float = ALIKE) -> list[np.ndarray]:
     """Without those that repeat one before them."""
     kept = []
     for point in points:
-        if not any(np.allclose(point, other, atol=1e-2) for other in kept):
+        if not any(np.allclose(point, other, rtol=0, atol=alike) for other in kept):
             kept.append(point)
     return kept
