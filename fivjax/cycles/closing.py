@@ -62,7 +62,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
             continue
         if not usable:
             return None
-        best, since = (closure, point, found, jacobian), 0
+        best, since = (float(closure), point, found, jacobian), 0
         if closure <= EXACT:
             break
         step = _newton_step(jacobian, gap)

@@ -61,7 +61,7 @@ class Scene(eqx.Module):
         arguments.real_number("restitution", restitution, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
         # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
-        friction, load = jax.tree.map(real_if_real, (friction, load))
+        friction, load = jax.tree.map(real_if_real, friction), jax.tree.map(real_if_real, load)
         friction.check()
         load.check()
         self.structure = structure
@@ -138,8 +138,8 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
     q, normal_force = _compiled_steady_sliding(scene, scene.load.force)
     if is_known(q):
-        q, normal_force = np.asarray(q), np.asarray(normal_force)
-        if not np.all(np.isfinite(q)):
+        normal_force = np.asarray(normal_force)
+        if not np.all(np.isfinite(np.asarray(q))):
             raise ValueError(
                 "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
                 "the friction or the springs, or give `y0` to start elsewhere."

@@ -130,7 +130,7 @@ class Structure(eqx.Module):
             check_matrix(name, matrix, definite=name == "mass")
         if is_known(load_direction):
             arguments.numeric_array("load_direction", load_direction)
-        given = Matrices(*map(real, matrices.values()), real(load_direction))
+        given = Matrices(real(mass), real(damping), real(stiffness), real(load_direction))
         n = given.mass.shape[0]
         check_shapes(n, damping=given.damping, stiffness=given.stiffness)
         if given.load_direction.shape != (n,):
@@ -179,11 +179,11 @@ class Structure(eqx.Module):
         """
         for name, value in parameters.items():
             arguments.real_number(name, value)
-        parameters = {name: real(value) for name, value in parameters.items()}
-        unknown = [name for name in dampers if name not in parameters]
+        numbers = {name: real(value) for name, value in parameters.items()}
+        unknown = [name for name in dampers if name not in numbers]
         if unknown:
             raise ValueError(f"Argument `dampers` must name parameters, but has {unknown[0]!r}.")
-        source = FromParameters(parameters, tuple(parameters), matrices_of, tuple(dampers), builder)
+        source = FromParameters(numbers, tuple(numbers), matrices_of, tuple(dampers), builder)
         checked = cls(*source.matrices, tangential, normal, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
 

@@ -7,7 +7,7 @@ tells to a total.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,13 +29,13 @@ class Segment(NamedTuple):
     after: Advance
 
 
-class Followed(NamedTuple):
+class Followed(NamedTuple, Generic[Total]):
     """Where `follow` has come to."""
 
     y: State
     contact: Contact
     left: Float[Array, ""]  # of the asked-for time, s; zero where it was reached
-    total: object
+    total: Total
     enough: Bool[Array, ""]  # whether the segments allowed were enough
 
 
@@ -59,7 +59,7 @@ def follow(
     at_section: bool = False,
     most: int = MOST_ADVANCES,
     kind: str = "bounded",
-) -> Followed:
+) -> Followed[Total]:
     """A trajectory under a constant load, segment by segment, for a time `h` (s).
 
     `observe` adds each segment to `total`; `until` may end the motion early, after the segment that makes it true.
