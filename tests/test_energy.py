@@ -507,7 +507,7 @@ def test_rows_that_were_not_reached_have_no_ledger(squeal):
     """Where the motion has no number, its ledger has none; tables leave out what lies beyond."""
     q = fj.sliding_equilibrium(squeal.scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys.modules["fivjax.simulate"], "MOST_ADVANCES", 8)
+        patch.setattr(sys.modules["fivjax.simulation.trajectory"], "MOST_ADVANCES", 8)
         cut = fj.simulate(squeal.scene, 12.0, 0.1, y0=(1.02 * q, 0 * q), energy=True)
     assert np.all(np.isnan(cut.energy.residual[1:])) and np.all(np.isnan(cut.energy.work.load[1:]))
     assert fj.energy_per_cycle(cut).sizes["cycle"] == 0

@@ -27,7 +27,7 @@ def gap(mechanics: Mechanics, y: State) -> Float[Array, ""]:
 def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
     """Accelerations without contact forces, or with those at `mechanics.rest`, in m/s²."""
     n = degrees_of_freedom(y)
-    # Sums over columns rather than matrix products: in a batch these become one fused loop over lanes.
+    # Sums over columns rather than matrix products: in a batch these become one fused loop over trajectories.
     acceleration = mechanics.free_load * load
     position, displacement = mechanics.free_position, y[:n]
     if mechanics.springs is not None and mechanics.from_springs is not None:

@@ -351,5 +351,5 @@ def along_rows(
 
 
 def _form(matrix: Float[Array, "n n"], x: Float[Array, " n"]) -> Float[Array, ""]:
-    # A sum rather than two matrix products: in a batch this becomes one fused loop over lanes.
+    # A sum rather than two matrix products: in a batch this becomes one fused loop over trajectories.
     return jnp.sum(matrix * (x[:, None] * x[None, :]))

@@ -139,13 +139,13 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
     finite = np.isfinite(rows.y).all(axis=1)
     rising = np.diff(counted) * finite[1:]
     chosen = np.flatnonzero(rising)
-    # One of few shapes, so that not every trajectory compiles anew; surplus lanes repeat the first row and are dropped.
+    # One of few shapes, so that not every trajectory compiles anew; surplus rows repeat the first row and are dropped.
     most = power_of_4(max(int(rising.max(initial=1)), 4))
-    lanes = power_of_4(max(len(chosen), 4096 // most, 64))
-    padded = np.concatenate([chosen, np.zeros(lanes - len(chosen), int)])
+    padded_rows = power_of_4(max(len(chosen), 4096 // most, 64))
+    padded = np.concatenate([chosen, np.zeros(padded_rows - len(chosen), int)])
     starts = jax.tree.map(lambda leaf: leaf[padded], rows)
     found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
-    wanted = np.zeros((lanes, most), bool)
+    wanted = np.zeros((padded_rows, most), bool)
     wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
 

@@ -29,7 +29,7 @@ from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .ending import ENDING, GROWTH, Ending
 from .energy import Books, Energy, Ledger
-from .spans import MODES, Begin, go_on
+from .stretches import MODES, Begin, go_on
 
 if TYPE_CHECKING:
     import xarray as xr

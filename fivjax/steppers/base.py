@@ -88,7 +88,7 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
     # No advance is longer, in s.
     dt: eqx.AbstractVar[float]
-    # Advances between two looks at whether a lane's verdict is known: a few periods of vibration.
+    # Advances between two looks at whether a trajectory's verdict is known: a few periods of vibration.
     round: eqx.AbstractClassVar[int]
     # Whether it finds out itself how far an advance may reach; if not, `dt` is its step, and decides its error.
     chooses_its_steps: ClassVar[bool] = True

@@ -39,7 +39,7 @@ class Window(eqx.Module):
         """
         start, hull, control, _ = self.parts
         limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
-        safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, lane]
+        safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, trajectory]
         # In the first interval a guard may start at zero, because its status has just begun.
         zeros, lead = _start(start, limits, self.exact)
         first_safe = (lead > 0) & (least(hull[2:]) > 0)
@@ -138,7 +138,7 @@ def parabola_root(lead: Array, slope: Array, bend: Array) -> Array:
 
 
 def chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array, "*x l"]:
-    """Of as many rows as a window has intervals the one with this index in each lane."""
+    """Of as many rows as a window has intervals the one with this index in each trajectory."""
     size = INTERVALS
     while size > 1:
         size //= 2

@@ -46,7 +46,7 @@ def first_root(
     """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the guards end it there."""
     crosses, spent = brackets.crosses, brackets.spent
     c = series.without_zeros(brackets.zeros)
-    # A few steps for all at once cost less than a loop that goes on until the last lane is done.
+    # A few steps for all at once cost less than a loop that goes on until the last trajectory is done.
     near = computed_once(lambda: _approached(c, brackets), brackets.guess)
     root, _, slope, settled = _newton(c, brackets.zeros, near)
     # In a bracket, the function falls through its root; a dip ends where it is lowest.

@@ -59,8 +59,8 @@ class Windowed(eqx.Module):
 
 @jax.custom_batching.custom_vmap
 def _advance_one(prepared: Propagators, contact: Contact, load, y: State, h) -> Advance:
-    lane = jax.tree.map(lambda leaf: leaf[..., None], (contact, load, y, h))
-    return jax.tree.map(lambda leaf: leaf[..., 0], _advance(prepared, *lane))
+    alone = jax.tree.map(lambda leaf: leaf[..., None], (contact, load, y, h))
+    return jax.tree.map(lambda leaf: leaf[..., 0], _advance(prepared, *alone))
 
 
 @_advance_one.def_vmap

@@ -1,12 +1,12 @@
 r"""From one saved instant to the next, and the derivative of that.
 
-A span is as many advances as it takes; how many is known only when they are made. Forward derivatives run along with
+A stretch is as many advances as it takes; how many is known only when they are made. Forward derivatives run along with
 them. For reverse ones there are two ways:
 
 - JAX's own, through a loop of bounded length, which works in both modes and pays for every advance that might have been;
-- "reverse": a span maps a few dozen numbers (state, mechanics, load, time) to a few. Its whole Jacobian is found in
+- "reverse": a stretch maps a few dozen numbers (state, mechanics, load, time) to a few. Its whole Jacobian is found in
   forward mode when the backward pass comes to it. That costs about as much however many parameters a scene has, keeps
-  nothing but the span's start, and repeats the forward derivatives to the last digits.
+  nothing but the stretch's start, and repeats the forward derivatives to the last digits.
 """
 
 import equinox as eqx
@@ -25,7 +25,7 @@ MODES = ("both", "forward", "reverse")
 
 
 class Begin(eqx.Module):
-    """All that a span depends on."""
+    """All that a stretch depends on."""
 
     mechanics: Mechanics
     contact: Contact
@@ -87,6 +87,6 @@ def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, jax.dtypes.float0), counts)
         return unravel(cotangent @ jax.jacfwd(flat_end)(flat)), zeros
 
-    span = jax.custom_vjp(end)
-    span.defvjp(lambda numbers, counts: (end(numbers, counts), (numbers, counts)), backward)
-    return span(numbers, counts)
+    stretch = jax.custom_vjp(end)
+    stretch.defvjp(lambda numbers, counts: (end(numbers, counts), (numbers, counts)), backward)
+    return stretch(numbers, counts)
