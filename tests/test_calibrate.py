@@ -174,7 +174,7 @@ def closed():
 def test_a_closed_cycle_is_the_one_that_a_run_settles_on(closed):
     """Its frequency and lines as in a run, its fractions of time as counted there, its slopes as those of differences."""
     _, mine, found, step = closed(1.0)
-    residual, jacobian = [at.residual for at in found], found[0].jacobian[:, 0]
+    residual, jacobian = np.stack([at.residual for at in found]), found[0].jacobian[:, 0]
     with jax.enable_x64(True):
         lines = np.linalg.solve(np.asarray(mine.whitening), residual[0, : len(mine.measured)])
         frequency, size = np.asarray(mine.measured)[:2]
@@ -192,7 +192,7 @@ def test_a_closed_cycle_is_the_one_that_a_run_settles_on(closed):
 def test_disturbances_of_a_closed_cycle_die_out_as_its_multipliers_say(closed, belt_speed):
     """Against two runs, one from a state beside the cycle."""
     scene, _, found, _ = closed(belt_speed)
-    cycle = found[0].about.cycles[0]
+    cycle = jax.tree.map(np.asarray, found[0].about.cycles[0])
     growth = growth_of_disturbances(np.asarray(found[0].about.systems[0]), 3)
     assert all(np.isfinite(at.residual).all() for at in found)
     assert growth < UNSTABLE

@@ -83,6 +83,9 @@ def minimise(
     def has_arrived(slack=1.0):
         return _left(best) <= slack * tolerance * max(1.0, np.sqrt(best.cost / freedom))
 
+    if has_arrived():
+        return Minimum(x0, best, True, 1)
+
     def stop_on_arrival(_):
         if has_arrived():
             raise StopIteration
