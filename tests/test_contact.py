@@ -1,4 +1,4 @@
-"""The one physics: Eqs. 3, 5 and 6 by hand, forces on their constraints, what follows an event, and impacts."""
+"""Contact mechanics: Eqs. 3, 5 and 6 by hand, forces and constraints, transitions at events, and impacts."""
 
 import math
 
@@ -120,7 +120,7 @@ def random_scene(rng, n, *, law="coulomb", restitution=0.0, impact_law="coulomb"
 
 
 def compliance(scene):
-    """G of the contact, [[G_tt, G_tn], [G_tn, G_nn]], without `contact`."""
+    """G of the contact, [[G_tt, G_tn], [G_tn, G_nn]], computed without the functions under test."""
     inverse = np.linalg.inv(np.asarray(scene.structure.mass))
     pair = [scene.structure.tangential, scene.structure.normal]
     return inverse[np.ix_(pair, pair)]
@@ -153,8 +153,7 @@ def at_an_event(rng, scene, kind):
 @pytest.mark.parametrize("slip", [-1.7, 0.9], ids=["belt ahead", "mass ahead"])
 @pytest.mark.parametrize("seed", range(3))
 def test_sliding_is_eq_3(seed, slip):
-    """Were the projection not Eq. 3, with every μ of the other sign where the mass outruns the belt, no instability
-    would be where the paper has it."""
+    """Sliding obeys Eq. 3, and μ changes sign where the mass outruns the belt; the instability rests on it."""
     p = oscillator_parameters(seed)
     structure = fj.belt_oscillator(**p)
     law = fj.ExponentialDecay(0.35, 0.2, 0.5)
@@ -185,7 +184,7 @@ def test_sliding_is_eq_3(seed, slip):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sticking_is_eq_6(seed):
-    """Were it not Eq. 6, or the mass not carried along exactly, sticking phases would drift off the belt."""
+    """Sticking obeys Eq. 6, and the mass moves exactly with the belt, so that a sticking phase does not drift."""
     p = oscillator_parameters(10 + seed)
     scene = fj.Scene(fj.belt_oscillator(**p), fj.Coulomb(0.3), 2.0, fj.ConstantLoad(70.0))
     rng = np.random.default_rng(seed)
@@ -201,7 +200,7 @@ def test_sticking_is_eq_6(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_detachment_is_eq_5(seed):
-    """Were contact forces left over in the air, the mass would not fly as Eq. 4 says."""
+    """A detached mass moves by Eq. 5: no contact force acts on it."""
     p = oscillator_parameters(20 + seed)
     scene = fj.Scene(fj.belt_oscillator(**p), fj.Coulomb(0.3), 2.0, fj.ConstantLoad(70.0))
     rng = np.random.default_rng(seed)
@@ -231,7 +230,7 @@ def test_detachment_is_eq_5(seed):
 @pytest.mark.parametrize("law", ["coulomb", "decay"])
 @pytest.mark.parametrize("n", [2, 5])
 def test_contact_forces_close_the_balance(n, law):
-    """Were M a + C v + K q not f F + e_t T + e_n N, forces and motion would belong to two different models."""
+    """Motion and contact forces belong together: M a + C v + K q = f F + e_t T + e_n N in every status."""
     rng = np.random.default_rng(n)
     for _ in range(12):
         scene = random_scene(rng, n, law=law)
@@ -266,7 +265,7 @@ def test_contact_forces_close_the_balance(n, law):
 
 @pytest.mark.parametrize("n", [2, 5])
 def test_friction_opposes_slip_within_the_cone(n):
-    """Were friction to push along the slip, or hold more than it can, it would be a motor."""
+    """Friction opposes slip and never exceeds μ N; otherwise it would drive the motion."""
     rng = np.random.default_rng(40 + n)
     seen = dict.fromkeys(Status, 0)
     for k in range(120):
@@ -294,7 +293,7 @@ def test_friction_opposes_slip_within_the_cone(n):
 
 
 def test_forces_follow_the_direction_of_slip():
-    """Were σ fixed, a mass that outruns the belt would be pulled along further."""
+    """The sign of friction follows the slip: a mass that outruns the belt is braked, a slower one is dragged along."""
     scene = belt_block(fj.Coulomb(0.3), belt_speed=1.0)
     for slip, friction in ((-0.5, 3.0), (0.5, -3.0)):
         y = [0.0, 0.0, 1.0 + slip, 0.0]
@@ -326,7 +325,7 @@ BLOCK = fj.Coulomb(0.3, 0.5)  # under 10 N: sticks up to 5 N, slides with 3 N
     ],
 )
 def test_status_from_forces(y, load, expected):
-    """Were one of these states taken for another kind, the run would start, or go on after an event, in the wrong one."""
+    """The forces decide whether a state sticks, slides (and which way) or is detached, at every start and event."""
     kind, direction = status(belt_block(BLOCK), load, y)
     assert kind == expected[0]
     if expected[1] is not None:
@@ -334,13 +333,13 @@ def test_status_from_forces(y, load, expected):
 
 
 def test_a_status_that_has_ended_does_not_go_on():
-    """Were sticking chosen again at the edge of its cone, a stepper would stand still at that instant."""
+    """Sticking that has just ended is not chosen again, or time would stand still at the edge of the friction cone."""
     kind, direction = status(belt_block(BLOCK), 10.0, [1.2, 0.0, 1.0, 0.0], may_stick=False)
     assert (kind, direction) == (Status.SLIDE, 1.0)
 
 
 def test_guards_are_the_distances_to_the_end():
-    """Were a guard another quantity, or of the other sign, its status would end at another instant, or at once."""
+    """A guard is the margin left to its status, and changes sign at the instant where the status ends."""
     scene = belt_block(BLOCK)
     stick = motion(scene, Status.STICK, 1.0, 10.0, [1.2, 0.0, 1.0, 0.0])[2]
     np.testing.assert_allclose(stick, [5.0 - 4.8, 5.0 + 4.8], rtol=ROUNDING, atol=10 * ROUNDING)
@@ -358,7 +357,7 @@ def test_guards_are_the_distances_to_the_end():
 
 @pytest.mark.parametrize("n", [2, 5])
 def test_nothing_changes_where_no_guard_has_ended(n):
-    """Were a state touched without an event, a trajectory would depend on how often it is looked at."""
+    """Without an event, status and state stay as they are, however often they are looked at."""
     rng = np.random.default_rng(60 + n)
     for _ in range(20):
         scene = random_scene(rng, n, restitution=float(rng.uniform()))
@@ -371,7 +370,7 @@ def test_nothing_changes_where_no_guard_has_ended(n):
 
 
 def test_sticking_ends_into_slip_the_way_it_is_pushed():
-    """Were the direction wrong, the mass would be pushed on by friction and stick again at the same instant."""
+    """When sticking ends, the mass slips the way the forces push it; the other way, it would stick again at once."""
     scene = belt_block(BLOCK)
     for x, ended, direction in ((1.25, [True, False], 1.0), (-1.25, [False, True], -1.0)):
         y = [x, 0.0, 1.0, 0.0]
@@ -381,7 +380,7 @@ def test_sticking_ends_into_slip_the_way_it_is_pushed():
 
 
 def test_slip_that_runs_out_sticks_exactly():
-    """Were the rest of the slip kept, the mass would creep on a belt that it sticks to."""
+    """A mass that sticks has exactly the belt's velocity: a slip left over from rounding would let it creep."""
     kind, _, after = transition(belt_block(BLOCK), Status.SLIDE, 1.0, 10.0, [0.7, 0.0, 1 + 1e-9, 0.0], [False, True])
     assert kind == Status.STICK
     np.testing.assert_array_equal(after, [0.7, 0.0, 1.0, 0.0])
@@ -389,14 +388,14 @@ def test_slip_that_runs_out_sticks_exactly():
 
 @pytest.mark.parametrize(("x", "direction"), [(-2.0, -1.0), (2.0, 1.0)])
 def test_slip_that_cannot_be_held_goes_on(x, direction):
-    """Were sticking taken although the spring pulls harder than friction holds, |T| would exceed μ_s N."""
+    """Where the spring pulls harder than μ_s N holds, zero slip does not lead to sticking: the mass slides on."""
     kind, sigma, after = transition(belt_block(BLOCK), Status.SLIDE, 1.0, 10.0, [x, 0.0, 1.0, 0.0], [False, True])
     assert (kind, sigma) == (Status.SLIDE, direction)
     assert after[2] == 1.0
 
 
 def test_lift_off_keeps_the_motion():
-    """Were lift-off to change a velocity, it would be an impact."""
+    """Lift-off changes no displacement and no velocity: it is not an impact."""
     y = [0.3, 0.0, 0.4, 0.0]
     kind, _, after = transition(belt_block(BLOCK), Status.SLIDE, 1.0, -1e-9, y, [True, False])
     assert kind == Status.DETACH
@@ -404,7 +403,7 @@ def test_lift_off_keeps_the_motion():
 
 
 def test_touchdown_without_restitution_rests_on_the_belt():
-    """Were gap or gap rate not exactly zero afterwards, the mass would be below the belt or leave it again."""
+    """After an inelastic touchdown gap and gap rate are exactly zero: the mass neither sinks in nor leaves again."""
     kind, sigma, after = transition(belt_block(BLOCK), Status.DETACH, 1.0, 10.0, [0.0, -1e-12, 0.0, -0.5], [True, True])
     assert (kind, sigma) == (Status.SLIDE, 1.0)
     assert after[1] == 0.0
@@ -414,14 +413,14 @@ def test_touchdown_without_restitution_rests_on_the_belt():
 
 
 def test_touchdown_of_a_slow_slip_sticks():
-    """Were the impulse that ends slip not taken, the mass would be kicked beyond the belt's speed."""
+    """An impact that can end the slip does just that: friction does not drag the mass past the belt's velocity."""
     kind, _, after = transition(belt_block(BLOCK), Status.DETACH, 1.0, 10.0, [0.0, 0.0, 0.9, -0.5], [True, True])
     assert kind == Status.STICK
     np.testing.assert_array_equal(after, [0.0, 0.0, 1.0, 0.0])
 
 
 def test_rebounds_come_to_rest_at_the_resolution_only():
-    """Were a long rebound cut, bouncing would end too soon; were a short one kept, it would never end."""
+    """A rebound shorter than the resolution ends in contact, or bouncing would never end; a longer one is kept."""
     scene = belt_block(BLOCK, restitution=0.5)  # falls with 10 m/s²: a rebound at 0.25 m/s lasts 0.05 s
     y = [0.0, 0.0, 0.4, -0.5]
     kind, _, after = transition(scene, Status.DETACH, 1.0, 10.0, y, [True, True], resolution=0.049)
@@ -432,8 +431,7 @@ def test_rebounds_come_to_rest_at_the_resolution_only():
 
 @pytest.mark.parametrize("n", [2, 5])
 def test_every_transition_ends_on_the_constraint_of_a_consistent_status(n):
-    """Were the state off its constraint, or the status one that the forces refuse, the next step would repair it
-    with a jump."""
+    """After every event the state meets the constraint of its new status exactly, and the forces agree with it."""
     rng = np.random.default_rng(80 + n)
     for k in range(40):
         scene = random_scene(rng, n, restitution=0.0 if k % 2 else 0.6)
@@ -455,7 +453,7 @@ def test_every_transition_ends_on_the_constraint_of_a_consistent_status(n):
 
 @eqx.filter_jit
 def _about_rest(scene, contact, load, y, ended):
-    """The same questions of the same state, as a deviation from steady sliding; displacements come back as totals."""
+    """The same quantities, computed from deviations from steady sliding; the state comes back as a total."""
     q, normal_force = steady_sliding(scene, scene.load.force)
     mechanics = Mechanics(scene).about(Rest(scene, scene.load.force, normal_force), scene.structure)
     rest = jnp.concatenate([q, jnp.zeros_like(q)])
@@ -473,7 +471,7 @@ def _about_rest(scene, contact, load, y, ended):
 
 @pytest.mark.parametrize("law", ["coulomb", "falling"])
 def test_measured_from_a_rest_the_physics_is_the_same(law):
-    """Accelerations, forces, guards and what follows an event: totals and deviations differ by rounding only."""
+    """From totals or from deviations, accelerations, forces, guards and transitions agree to rounding."""
     rng, n = np.random.default_rng(17), 3
     for k in range(60):
         scene = random_scene(rng, n, law=law, restitution=0.4)
@@ -494,7 +492,7 @@ def test_measured_from_a_rest_the_physics_is_the_same(law):
 
 
 def test_at_rest_nothing_is_left_but_exact_zeros():
-    """Where nothing deviates nothing accelerates, and the friction cone is met on its edge: no rounding to be taken for either."""
+    """At the equilibrium the acceleration and the margin to the friction cone are exactly zero, without rounding."""
     scene = fj.Scene(fj.belt_oscillator(k2=1e10, m2=1e-6, c1=0.0, c2=0.0), fj.Coulomb(0.3), 1e-6, fj.ConstantLoad(1e9))
     with jax.enable_x64(True):
         _, normal_force = steady_sliding(scene, scene.load.force)
@@ -509,7 +507,7 @@ def test_at_rest_nothing_is_left_but_exact_zeros():
 
 
 def impacts(n, seed, count, **options):
-    """Random scenes with states about to hit the belt, and what the impact makes of them, in contact quantities."""
+    """Random states about to hit the belt, before and after the impact: slip, and the change of momentum."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
         scene = random_scene(rng, n, **options)
@@ -534,7 +532,7 @@ def contact_work(scene, y, after, change, before_slip, after_slip):
 @pytest.mark.parametrize("impact_law", ["coulomb", "frictionless"])
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_impulses_act_at_the_contact_only(n, impact_law):
-    """Were momentum changed elsewhere, a force would act that no one exerts."""
+    """An impact changes momentum along the contact coordinates only: no impulse acts anywhere else."""
     for scene, _, after, change, _, _ in impacts(n, 1, 15, restitution=0.4, impact_law=impact_law):
         elsewhere = np.delete(change, [scene.structure.tangential, scene.structure.normal])
         # Rounding of M times velocities of order one.
@@ -547,7 +545,7 @@ def test_impulses_act_at_the_contact_only(n, impact_law):
 @pytest.mark.parametrize("impact_law", ["coulomb", "frictionless", "reset"])
 @pytest.mark.parametrize("restitution", [0.0, 0.35, 1.0])
 def test_the_gap_reopens_with_newtons_restitution(impact_law, restitution):
-    """Were the rebound another one, the restitution asked for would not be the one that acts."""
+    """The gap reopens at the restitution times the approach velocity, under every impact law."""
     for scene, y, after, *_ in impacts(3, 2, 8, restitution=restitution, impact_law=impact_law):
         index = 3 + scene.structure.normal
         # One subtraction of numbers of the same size, exact for the inelastic case.
@@ -555,7 +553,7 @@ def test_the_gap_reopens_with_newtons_restitution(impact_law, restitution):
 
 
 def test_reset_changes_one_number_only():
-    """Were another velocity changed, this law would not be the naive one that it stands for."""
+    """The law "reset" changes the gap rate and nothing else: it stands for the naive treatment of an impact."""
     for scene, y, after, *_ in impacts(3, 3, 5, restitution=0.2, impact_law="reset"):
         others = np.arange(6) != 3 + scene.structure.normal
         np.testing.assert_array_equal(after[others], y[others])
@@ -564,8 +562,7 @@ def test_reset_changes_one_number_only():
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("law", ["coulomb", "decay"])
 def test_coulomb_impulses_lie_in_the_cone(law, restitution):
-    """Were the tangential impulse larger than friction can give, or did it push along what slip is left, it would not be
-    friction."""
+    """The tangential impulse is at most μ times the normal one and opposes the slip that is left, as friction does."""
     stuck = slipping = 0
     for case in impacts(3, 4, 60, law=law, restitution=restitution, friction_share=0.8):
         scene, _, _, change, before_slip, after_slip = case
@@ -585,7 +582,7 @@ def test_coulomb_impulses_lie_in_the_cone(law, restitution):
 
 @pytest.mark.parametrize("n", [2, 5])
 def test_inelastic_impacts_lose_energy(n):
-    """Were energy gained, a lane could squeal for ever on what its impacts give it."""
+    """An inelastic impact always loses energy, or impacts alone could keep a vibration alive."""
     for case in impacts(n, 5, 40, friction_share=0.9):
         work, scale = contact_work(*case)
         assert work < -ROUNDING * scale
@@ -593,7 +590,7 @@ def test_inelastic_impacts_lose_energy(n):
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.9, 1.0])
 def test_impacts_without_friction_lose_what_restitution_says(restitution):
-    """Were more or less lost, restitution would not be Newton's: the loss is (1 − e²)/2 of the approach energy."""
+    """Without friction an impact loses (1 − e²)/2 of the approach energy, by Newton's law of restitution."""
     for case in impacts(3, 6, 15, restitution=restitution, impact_law="frictionless"):
         scene, y = case[:2]
         work, _ = contact_work(*case)
@@ -605,7 +602,7 @@ def test_impacts_without_friction_lose_what_restitution_says(restitution):
 
 @pytest.mark.parametrize("restitution", [0.25, 0.5, 0.9, 1.0])
 def test_rebounds_with_friction_lose_energy_where_it_opposes_the_slip(restitution):
-    """Were energy gained although friction brakes all the time, the impulses would be wrong."""
+    """A rebound gains no energy if its friction opposes the slip before the impact."""
     braked = 0
     for case in impacts(3, 7, 40, restitution=restitution, friction_share=0.7):
         scene, _, _, change, before_slip, _ = case
@@ -618,7 +615,7 @@ def test_rebounds_with_friction_lose_energy_where_it_opposes_the_slip(restitutio
 
 @pytest.mark.xfail(strict=True, reason="Newton's restitution with a Coulomb impulse creates energy (Kane's paradox)")
 def test_rebounds_never_gain_energy():
-    """Were energy gained, restitution above zero could keep a strongly coupled structure bouncing by itself."""
+    """An impact should not gain energy; this rebound does, because its normal impulse reverses the slip."""
     g = np.array([[6.972, 2.988], [2.988, 1.344]])  # the normal impulse turns the slip round
     structure = fj.Structure(np.linalg.inv(g), np.zeros((2, 2)), np.eye(2), [0, -1], tangential=0, normal=1)
     scene = fj.Scene(structure, fj.Coulomb(0.4), 1.0, fj.ConstantLoad(1.0), restitution=0.5)
@@ -630,7 +627,7 @@ def test_rebounds_never_gain_energy():
 
 
 def test_impact_of_the_papers_oscillator_by_hand():
-    """Were the impulse not that of two hand-written equations, re-contact on the limit cycle would be another event."""
+    """The impact of the paper's oscillator, as on its limit cycle, agrees with two equations written by hand."""
     scene = fj.Scene(fj.belt_oscillator(theta=0.3), fj.Coulomb(0.25), 2.0, fj.ConstantLoad(100.0))
     y = np.array([1e-4, -1e-3, 0.0, 0.5, 0.2, -0.1])
     after = impact(scene, y)

@@ -33,21 +33,21 @@ def paper_scene_with(friction=None, load=None, belt_speed=3.0, **options):
 @pytest.mark.parametrize("coefficients", [(0.2, 0.1, 0.5), (0.6, 0.0, 20.0), (0.3, 0.3, 1.0), (0.4, 0.1, 0.0)])
 @pytest.mark.parametrize("slip_speed", [0.0, 1e-3, 0.5, 3.0, 100.0])
 def test_exponential_decay_is_eq_1(coefficients, slip_speed):
-    """Were the law another one, the falling-friction results of the paper would not come out."""
+    """The falling friction law is Eq. 1 of the paper, at rest and at any slip speed."""
     with jax.enable_x64(True):
         mu = float(fj.ExponentialDecay(*coefficients)(jnp.asarray(slip_speed)))
     assert mu == pytest.approx(eq1(*coefficients, slip_speed), rel=ROUNDING)
 
 
 def test_exponential_decay_defaults_to_the_papers_decay():
-    """Were the default not 0.5 s/m, two coefficients alone would not give the paper's law."""
+    """The decay is the paper's 0.5 s/m by default: two coefficients are enough to give its law."""
     law = fj.ExponentialDecay(mu_static=0.2, mu_dynamic=0.1)
     assert float(law.decay) == 0.5
     assert float(law.static) == 0.2
 
 
 def test_coulomb_is_constant_and_knows_its_static_coefficient():
-    """Were sticking limited by the sliding coefficient when a larger one is given, there would be no stick-slip."""
+    """Sliding friction is constant; sticking is limited by the static coefficient, as stick–slip requires."""
     with jax.enable_x64(True):
         speeds = jnp.linspace(0.0, 50.0, 7)
         assert {float(fj.Coulomb(0.23)(speed)) for speed in speeds} == {0.23}
@@ -66,7 +66,7 @@ def test_coulomb_is_constant_and_knows_its_static_coefficient():
     ],
 )
 def test_variation_bounds_both_derivatives(law):
-    """Were a derivative larger than its bound anywhere above the slip speed, a proof of sliding would rest on nothing."""
+    """`variation` bounds slope and curvature of the law above a slip speed: the proof of sliding rests on it."""
     with jax.enable_x64(True):
         law = law()
         speeds = jnp.linspace(0.0, 12.0, 241)
@@ -80,7 +80,7 @@ def test_variation_bounds_both_derivatives(law):
     allowance = 1 + ROUNDING, 1e-15 * float(law.static) * 30.0**2
     assert np.all(slope_above <= slope_bound * allowance[0] + allowance[1])
     assert np.all(bend_above <= bend_bound * allowance[0] + allowance[1])
-    # A bound twice too large would still be one, but proofs would come late, and an infinite one would prove nothing.
+    # The bounds are at most twice too large: a looser one would delay a proof, an infinite one would prove nothing.
     assert np.all(slope_bound <= 2 * slope_above + allowance[1])
     assert np.all(bend_bound <= 2 * bend_above + allowance[1])
 
@@ -93,7 +93,7 @@ def test_variation_bounds_both_derivatives(law):
     ],
 )
 def test_friction_refuses_a_static_coefficient_below_the_sliding_one(make, names, values):
-    """Were it accepted, a contact would slip and stick again at the same instant without end."""
+    """Static friction below sliding friction is refused: a contact would alternate between both at one instant."""
     with pytest.raises(ValueError, match="must be at least") as refusal:
         make()
     message = str(refusal.value)
@@ -103,7 +103,7 @@ def test_friction_refuses_a_static_coefficient_below_the_sliding_one(make, names
 
 
 def test_equal_coefficients_are_in_order():
-    """Were equality refused, falling friction could not be switched off continuously."""
+    """Equal coefficients are allowed: falling friction can be reduced continuously to none."""
     assert float(fj.ExponentialDecay(0.2, 0.2).mu_dynamic) == 0.2
     assert float(fj.Coulomb(0.2, 0.2).static) == 0.2
 
@@ -128,7 +128,7 @@ BAD_NUMBERS = [(-0.1, "non-negative", "-0.1"), (math.nan, "finite", "nan"), (mat
     ],
 )
 def test_laws_and_loads_refuse_values_out_of_range(kind, name, value, rule, shown):
-    """Were one accepted, friction would drive, time would run backwards, or NaN would spread without a name."""
+    """Negative, infinite and NaN values are refused: negative friction, for one, would drive the motion."""
     good = {
         "Coulomb": dict(mu=0.2),
         "ExponentialDecay": dict(mu_static=0.2, mu_dynamic=0.1, decay=0.5),
@@ -141,7 +141,7 @@ def test_laws_and_loads_refuse_values_out_of_range(kind, name, value, rule, show
 
 @pytest.mark.parametrize("value", ["0.2", None, [0.2, 0.3], 0.2j])
 def test_friction_refuses_what_is_no_number(value):
-    """Were it accepted, the failure would come out of JAX and name no argument."""
+    """What is no single real number is refused by the name of its argument, not somewhere inside JAX."""
     with pytest.raises((TypeError, ValueError), match=r"^Argument `mu` must be "):
         fj.Coulomb(value)
 
@@ -150,7 +150,7 @@ def test_friction_refuses_what_is_no_number(value):
 
 
 def test_pulse_is_eq_14():
-    """Were the load not p·F0 for the time of the kick and F0 otherwise, p would mean something else than the paper's."""
+    """The load is p F0 during the kick and F0 otherwise, as in Eq. 14."""
     pulse = fj.Pulse(force=100.0, p=1.3, duration=0.1, start=0.5)
     inside, outside = 130.0, 100.0
     with jax.enable_x64(True):
@@ -169,19 +169,19 @@ def test_pulse_is_eq_14():
 
 
 def test_pulse_defaults_are_the_papers():
-    """Were a default another one, "the paper's kick" would be another kick."""
+    """A pulse without arguments is the paper's kick."""
     pulse = fj.Pulse()
     assert [float(x) for x in (pulse.force, pulse.p, pulse.duration, pulse.start)] == [100.0, 1.2, 0.1, 0.0]
 
 
 def test_a_kick_may_also_relieve():
-    """Were p below 1 refused, a drop of the load could not be studied."""
+    """A kick may also relieve the contact: p below 1, down to 0, is allowed."""
     with jax.enable_x64(True):
         assert float(fj.Pulse(p=0.0)(jnp.asarray(0.05))) == 0.0
 
 
 def test_constant_load_never_changes():
-    """Were there a jump, steps would be cut for nothing; were the value another one, nothing would be right."""
+    """A constant load has one value at all times and no jumps, so that no step has to end at one."""
     load = fj.ConstantLoad(250.0)
     with jax.enable_x64(True):
         assert load.jumps.shape == (0,)
@@ -190,7 +190,7 @@ def test_constant_load_never_changes():
 
 
 def test_values_keep_double_precision_outside_x64():
-    """Were a value rounded to single precision, μ = 0.227 would be another μ, closer to or farther from the limit."""
+    """Parameters keep double precision: rounded, μ = 0.227 would lie at another distance from the stability limit."""
     assert not jax.config.jax_enable_x64
     scene = paper_scene_with(fj.Coulomb(0.227), fj.Pulse(p=1.19))
     assert float(scene.parameters["mu"]) == 0.227
@@ -201,7 +201,7 @@ def test_values_keep_double_precision_outside_x64():
 
 
 def test_scene_refuses_parts_of_the_wrong_kind():
-    """Were a bare number taken for a law or a load, its attributes would be missed somewhere deep inside."""
+    """A number or an array in place of a structure, a law or a load is refused by name, not missed deep inside."""
     structure, friction = fj.belt_oscillator(), fj.Coulomb(0.2)
     for arguments, name, shown in (
         ((np.eye(3), friction), "structure", "array of float64 with shape (3, 3)"),
@@ -233,27 +233,27 @@ def test_scene_refuses_parts_of_the_wrong_kind():
     ],
 )
 def test_scene_refuses_values_out_of_range(options, message):
-    """Were one accepted, impacts would create energy, or a typing error would pick a law in silence."""
+    """Restitution above 1, which creates energy, and misspelt impact laws are refused."""
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         paper_scene_with(**options)
 
 
 @pytest.mark.parametrize("restitution", [0, 0.0, 1, 1.0])
 def test_both_ends_of_restitution_are_allowed(restitution):
-    """Were a bound exclusive, the elastic or the inelastic limit could not be studied."""
+    """Restitution may be 0 or 1: the inelastic and the elastic limit can be studied."""
     assert float(paper_scene_with(restitution=restitution).restitution) == restitution
 
 
 @pytest.mark.parametrize("law", ["coulomb", "frictionless", "reset"])
 def test_impact_laws_are_kept_by_replace(law):
-    """Were the law lost when a parameter changes, a map would be drawn with another law than its scene's."""
+    """`replace` keeps the impact law, so that a whole map has the law of its scene."""
     scene = paper_scene_with(impact_law=law)
     assert scene.impact_law == law
     assert scene.replace(mu=0.1).impact_law == law
 
 
 def test_replace_reaches_every_part_and_nothing_else():
-    """Were a value lost, a map would repeat one lane; were another one touched, it would show another scene."""
+    """`replace` changes the named parameters, of whichever part of the scene, and no other."""
     scene = paper_scene_with(fj.Coulomb(0.2, 0.25), fj.Pulse(), restitution=0.1)
     changes = dict(mu=0.21, mu_static=0.3, p=1.5, start=0.2, belt_speed=-2.0, restitution=0.4, k2=99e3, theta=0.02)
     before = {name: float(value) for name, value in scene.parameters.items()}
@@ -263,14 +263,14 @@ def test_replace_reaches_every_part_and_nothing_else():
 
 
 def test_replace_rebuilds_the_matrices():
-    """Were only the parameter changed, an axis k2 of a map would have no effect."""
+    """Replacing k2 changes the stiffness matrix too; otherwise k2 would have no effect as an axis of a map."""
     stiffness = np.asarray(paper_scene_with().replace(k2=99e3).structure.stiffness)
     np.testing.assert_array_equal(stiffness, np.asarray(fj.belt_oscillator(k2=99e3).stiffness))
 
 
 @pytest.mark.parametrize("name", ["k3", "mu_static", "impact_law", "load"])
 def test_replace_refuses_unknown_names(name):
-    """Were an unknown name ignored, nothing would change and nobody would know."""
+    """A name that the scene lacks is refused, with those that it has: ignored, it would change nothing unnoticed."""
     with pytest.raises(ValueError, match=rf"no parameter `{name}`; it has: belt_speed, c1, .*theta\.$") as refusal:
         paper_scene_with().replace(**{name: 0.3})
     assert sentence(str(refusal.value))
@@ -287,14 +287,14 @@ def test_replace_refuses_unknown_names(name):
     ],
 )
 def test_replace_refuses_what_the_part_refuses(changes, fragments):
-    """Were checks left out here, the axes of a map could bring in what a scene would refuse."""
+    """`replace` refuses every value that the part itself refuses, so that no axis of a map lets one in."""
     with pytest.raises(ValueError, match=re.escape(fragments[0])) as refusal:
         paper_scene_with(fj.Coulomb(0.2, 0.25)).replace(**changes)
     assert all(fragment in str(refusal.value) for fragment in fragments)
 
 
 def test_parameters_of_a_matrix_structure_are_those_of_the_other_parts():
-    """Were names of another structure offered, replacing them would fail or, worse, replace the structure."""
+    """With a structure given as matrices, a scene has only the parameters of friction, load, belt and impact."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
     scene = fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad())
     assert set(scene.parameters) == {"mu", "force", "belt_speed", "restitution"}
@@ -318,7 +318,7 @@ def eq3(mu, m1, m2, c1, c2, k1, k2, theta):
 @pytest.mark.parametrize("belt_speed", [3.0, -0.7])
 @pytest.mark.parametrize("theta", [0.01, 0.4, -0.3])
 def test_sliding_equilibrium_solves_eq_3(belt_speed, theta):
-    """Were K r = F of Eq. 3 not met, every run would start with a kick of its own."""
+    """The sliding equilibrium solves Eq. 3 at rest; a run started elsewhere would vibrate without a kick."""
     parameters = dict(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=130e3, theta=theta)
     law = fj.ExponentialDecay(0.2, 0.1, 0.5)
     load = fj.Pulse(force=80.0, p=3.0)
@@ -332,7 +332,7 @@ def test_sliding_equilibrium_solves_eq_3(belt_speed, theta):
 
 
 def test_sliding_equilibrium_of_a_large_structure_balances_forces():
-    """Were the projection right for three coordinates only, general structures would start out of balance."""
+    """Forces balance at the sliding equilibrium of a structure with any number of coordinates."""
     rng = np.random.default_rng(3)
     n, tangential, normal, mu, force = 7, 4, 1, 0.3, 12.0
     root = rng.normal(size=(n, n))
@@ -352,14 +352,14 @@ def test_sliding_equilibrium_of_a_large_structure_balances_forces():
 
 
 def test_no_equilibrium_on_a_belt_at_rest():
-    """Were one returned, it would be one of many, and the direction of friction made up."""
+    """A belt at rest is refused: it has many equilibria, and no direction of friction."""
     with pytest.raises(ValueError, match=r"`belt_speed` must not be zero.*`y0`") as refusal:
         fj.sliding_equilibrium(paper_scene_with(belt_speed=0.0))
     assert sentence(str(refusal.value))
 
 
 def test_no_equilibrium_where_the_belt_would_have_to_pull():
-    """Were one returned, the run would start with a negative normal force."""
+    """An equilibrium with a negative normal force is refused: the belt cannot pull."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
     with pytest.raises(ValueError, match=r"the belt would have to pull with 5 N") as refusal:
         fj.sliding_equilibrium(fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(5.0)))
@@ -367,7 +367,7 @@ def test_no_equilibrium_where_the_belt_would_have_to_pull():
 
 
 def test_no_equilibrium_where_nothing_holds_against_friction():
-    """Were one returned, it would be infinite."""
+    """Where no spring holds against friction there is no equilibrium, and none is given."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.diag([0.0, 1.0]), [0.0, -1.0], tangential=0, normal=1)
     with pytest.raises(ValueError, match=r"sliding stiffness matrix is singular") as refusal:
         fj.sliding_equilibrium(fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.ConstantLoad(5.0)))
@@ -376,7 +376,7 @@ def test_no_equilibrium_where_nothing_holds_against_friction():
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_no_equilibrium_where_a_motion_is_free_but_for_rounding(seed):
-    """Were one returned, it would be 1e16 m away and every number after it meaningless."""
+    """A stiffness matrix that is singular to rounding is refused: its equilibrium would lie 1e16 m away."""
     springs = np.random.default_rng(seed).normal(size=(2, 4))  # two springs for three coordinates that can move
     structure = fj.Structure(np.eye(4), np.eye(4), springs.T @ springs, [0.3, -0.2, -1.0, -1.0], tangential=0, normal=3)
     with pytest.raises(ValueError, match="sliding stiffness matrix is singular"):
@@ -388,7 +388,7 @@ def test_no_equilibrium_where_a_motion_is_free_but_for_rounding(seed):
 
 @pytest.mark.parametrize(("theta", "printed", "digits"), [(0.01, 108.49, 2), (0.5, 2.03, 2), (0.8, 1.14, 2)])
 def test_painleve_friction_of_the_belt_oscillator(theta, printed, digits):
-    """Were the limit another one, runs would be refused that have a solution, or run where there is none."""
+    """The Painlevé limit is exact: above it contact forces are not unique, below it no run may be refused."""
     limit = fj.painleve_friction(fj.belt_oscillator(theta=theta))
     assert round(limit, digits) == printed
     m1, m2, s, c = 0.53, 0.045, math.sin(theta), math.cos(theta)
@@ -396,11 +396,11 @@ def test_painleve_friction_of_the_belt_oscillator(theta, printed, digits):
 
 
 def test_painleve_friction_is_the_same_for_the_mirrored_belt():
-    """Were the sign of the inclination to matter, the direction in which the paradox occurs would be taken for safe."""
+    """The Painlevé limit is the same for θ and −θ: in either case one direction of slip meets the paradox."""
     up, down = (fj.painleve_friction(fj.belt_oscillator(theta=theta)) for theta in (0.5, -0.5))
     assert up == pytest.approx(down, rel=1e-12)
 
 
 def test_painleve_friction_is_infinite_without_coupling():
-    """Were it finite, uncoupled structures would be refused at large friction."""
+    """Without inertial coupling of normal and tangential motion there is no Painlevé limit."""
     assert fj.painleve_friction(fj.belt_oscillator(theta=0.0)) == math.inf

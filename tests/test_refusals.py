@@ -22,7 +22,7 @@ from fivjax.io import files
 
 @pytest.fixture(autouse=True)
 def no_engine(monkeypatch):
-    """A check that is made after compiling lets a typing error cost a minute: it is rejected."""
+    """Makes it an error to reach an engine: bad input is refused before a minute of compiling, not after it."""
     without_engines(monkeypatch)
 
 
@@ -32,7 +32,7 @@ def constant_scene():
 
 
 def test_the_engine_is_reached_by_good_input(paper_scene, tmp_path):
-    """Were the stand-ins in the wrong place, every other test here would pass whatever is checked and when."""
+    """Good input reaches the stand-ins for the engines; if it did not, the tests below would prove nothing."""
     for call in (
         lambda: fj.simulate(paper_scene, 0.1, 1e-3),
         lambda: fj.bistability_map(paper_scene, mu=[0.1, 0.2]),
@@ -45,7 +45,7 @@ def test_the_engine_is_reached_by_good_input(paper_scene, tmp_path):
 
 
 def test_refusals_take_no_time(paper_scene):
-    """Were something compiled first, this would take seconds. The first call pays for NumPy's and JAX's own warm-up."""
+    """Bad input is refused at once, before anything compiles; the first call pays for the warm-up of NumPy and JAX."""
 
     def refuse():
         with pytest.raises(ValueError, match="increasing"):
@@ -56,7 +56,7 @@ def test_refusals_take_no_time(paper_scene):
     refuse()
     start = time.perf_counter()
     refuse()
-    # Compiling a stepper takes several seconds on this machine, a check microseconds.
+    # Compiling a stepper takes several seconds, a check microseconds.
     assert time.perf_counter() - start < 0.5
 
 
@@ -83,7 +83,7 @@ BOTH = [fj.bistability_map, fj.critical_perturbation]
 @pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
 @pytest.mark.parametrize(("values", "error", "fragments"), AXES, ids=[str(axis[0]) for axis in AXES])
 def test_bad_axes(paper_scene, function, values, error, fragments):
-    """Were one accepted, a map would be empty, have rows twice, or hold lanes that mean nothing."""
+    """An axis that is empty, not increasing, not finite or not numeric is refused: its map would mean nothing."""
     with refused(error, "`mu`", *fragments):
         function(paper_scene, mu=values)
 
@@ -91,7 +91,7 @@ def test_bad_axes(paper_scene, function, values, error, fragments):
 @pytest.mark.parametrize("function", BOTH, ids=lambda f: f.__name__)
 @pytest.mark.parametrize("name", ["mu_crit", "t_maxx", "impact_law", "mu_static"])
 def test_unknown_axes(paper_scene, function, name):
-    """Were an unknown name swallowed, a misspelt option would change nothing and nobody would know."""
+    """An unknown name is refused: ignored, a misspelt option would change nothing unnoticed."""
     with refused(ValueError, f"`{name}`", "belt_speed", "theta"):
         function(paper_scene, **{name: [0.1, 0.2]})
 
@@ -107,20 +107,20 @@ def test_unknown_axes(paper_scene, function, name):
     ],
 )
 def test_axis_values_that_the_scene_refuses(paper_scene, function, axis, fragments):
-    """Were only the form of an axis checked, lanes outside the model would come back with a verdict."""
+    """Every value of an axis must be one that the scene accepts: a verdict outside the model means nothing."""
     with refused(ValueError, *fragments):
         function(paper_scene, **axis)
 
 
 def test_axes_that_cross_each_other():
-    """Were only one end checked, part of a map would stick less firmly than it slides."""
+    """Axes are refused if at any point of the map static friction falls below sliding friction."""
     scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.3, 0.1), 3.0, fj.Pulse())
     with refused(ValueError, "`mu_static`", "`mu_dynamic`", "0.1", "0.2"):
         fj.bistability_map(scene, mu_static=[0.1, 0.3], mu_dynamic=[0.05, 0.2])
 
 
 def test_a_p_axis_needs_a_pulse(constant_scene):
-    """Were p ignored for a constant load, all rows of the map would be the same."""
+    """An axis p is refused for a constant load, which has no kick: all rows of the map would be the same."""
     with refused(ValueError, "`p`", "Pulse"):
         fj.bistability_map(constant_scene, p=[1.0, 1.5])
     with refused(TypeError, "`scene.load`", "Pulse", "ConstantLoad"):
@@ -128,13 +128,13 @@ def test_a_p_axis_needs_a_pulse(constant_scene):
 
 
 def test_a_map_needs_an_axis(paper_scene):
-    """Were none needed, the result would have no dimension and the user no hint what to give."""
+    """A map without an axis is refused, with the names of the parameters that can be one."""
     with refused(ValueError, "at least one axis", "mu", "belt_speed"):
         fj.bistability_map(paper_scene)
 
 
 def test_p_is_not_an_axis_where_it_is_sought(paper_scene):
-    """Were p accepted, it would be overwritten."""
+    """`p` is refused as an axis where the critical p is sought: the search sets it."""
     with refused(ValueError, "`p`", "`p_range`"):
         fj.critical_perturbation(paper_scene, p=[1.0, 2.0])
 
@@ -159,7 +159,7 @@ def test_p_is_not_an_axis_where_it_is_sought(paper_scene):
     ],
 )
 def test_bad_options(paper_scene, function, options, error, fragments):
-    """Were one accepted, the run would stop at once, never, or in the middle of the first step."""
+    """Durations and memory must be positive and finite, and a method one of this package: others cannot run a map."""
     with refused(error, *fragments):
         function(paper_scene, mu=[0.1, 0.2], **options)
 
@@ -176,7 +176,7 @@ def test_bad_options(paper_scene, function, options, error, fragments):
     ],
 )
 def test_bad_options_of_a_long_map(paper_scene, options, error, fragments):
-    """Were one accepted, a map would do nothing, or lose at its end what it was to keep."""
+    """A map with no steps, or with nowhere to keep its checkpoints, is refused before it starts."""
     with refused(error, *fragments):
         fj.bistability_map(paper_scene, mu=[0.1, 0.2], **options)
 
@@ -184,7 +184,7 @@ def test_bad_options_of_a_long_map(paper_scene, options, error, fragments):
 @pytest.mark.parametrize("function", [*BOTH, fj.simulate], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("scene", [None, "scene", fj.belt_oscillator()], ids=["None", "str", "Structure"])
 def test_what_is_no_scene(function, scene):
-    """Were anything taken for a scene, the first missing attribute would be the message."""
+    """What is no scene is refused as such, not by an attribute that it lacks."""
     with refused(TypeError, "`scene`", "a Scene"):
         function(scene)
 
@@ -208,7 +208,7 @@ def test_what_is_no_scene(function, scene):
     ],
 )  # fmt: skip
 def test_bad_search_ranges(paper_scene, options, error, fragments):
-    """Were one accepted, the search would scan nothing, or for ever."""
+    """A search for the critical p needs a range that goes up and positive steps: else it would be empty or endless."""
     with refused(error, *fragments):
         fj.critical_perturbation(paper_scene, **options)
 
@@ -241,13 +241,13 @@ def test_bad_search_ranges(paper_scene, options, error, fragments):
     ],
 )  # fmt: skip
 def test_bad_methods(make, error, fragments):
-    """Were one accepted, a run would not step, step for ever, or step with a method that this one cannot be built on."""
+    """Orders, tolerances, steps and solvers that a method cannot work with are refused: a run might never end."""
     with refused(error, *fragments):
         make()
 
 
 def test_an_order_counted_by_numpy_is_a_whole_number():
-    """Were it refused, the sentence would say that 12 is no whole number."""
+    """A NumPy integer is a whole number and accepted as an order."""
     assert fj.EventExact(order=np.int64(12)).order(None) == 12
 
 
@@ -270,7 +270,7 @@ def test_an_order_counted_by_numpy_is_a_whole_number():
     ],
 )
 def test_bad_times(paper_scene, name, value, error, fragments):
-    """Were one accepted, there would be no rows, or rows without end."""
+    """The end and the saving interval must be positive, finite numbers, or there are no rows or endlessly many."""
     with refused(error, f"`{name}`", *fragments):
         fj.simulate(paper_scene, **{name: value})
 
@@ -304,20 +304,20 @@ ON_BELT = np.zeros(6)
     ],
 )  # fmt: skip
 def test_bad_starts(paper_scene, y0, error, fragments):
-    """Were one accepted, the run would start from a state that nobody asked for, or inside the belt."""
+    """A start of the wrong shape or kind, below the belt or moving into it is refused: it is no state of the model."""
     with refused(error, "`y0`", *fragments):
         fj.simulate(paper_scene, 0.01, y0=y0)
 
 
 @pytest.mark.parametrize("y0", [np.zeros(6), [0.0] * 6, (np.zeros(3), np.zeros(3)), ([0.0] * 3, [0.0] * 3)])
 def test_good_starts(paper_scene, y0):
-    """Were one of the promised forms refused, a run could not be continued from where another ended."""
+    """A start may be one vector or a pair, of arrays or lists, so that a run can go on from the end of another."""
     with pytest.raises(EngineReached):
         fj.simulate(paper_scene, 0.01, y0=y0)
 
 
 def test_scenes_that_cannot_be_simulated(paper_scene):
-    """Were one run, its first row would be NaN or one of several solutions."""
+    """A scene beyond the Painlevé limit, or without a sliding equilibrium to start from, is refused."""
     with refused(ValueError, "Painlevé", "150", "108.5"):
         fj.simulate(paper_scene.replace(mu=150.0))
     with refused(ValueError, "`belt_speed`", "zero", "`y0`"):
@@ -328,7 +328,7 @@ def test_scenes_that_cannot_be_simulated(paper_scene):
 
 
 def test_method_of_simulate(paper_scene):
-    """Were a plain diffrax solver taken, contact would be ignored."""
+    """A plain diffrax solver is refused as a method: it knows nothing of the contact."""
     with refused(TypeError, "`method`", "EventExact()", "Dopri5"):
         fj.simulate(paper_scene, method=diffrax.Dopri5())
 
@@ -340,7 +340,7 @@ DATASET = xr.Dataset({"a": ("x", np.arange(3.0))})
 
 @pytest.fixture
 def breaks_midway(monkeypatch):
-    """Datasets and figures whose writing fails after some bytes: a full disk, an interrupt."""
+    """Gives a dataset and a figure whose writing fails midway, as on a full disk or at an interrupt."""
 
     def make(error):
         def sync(_):
@@ -359,7 +359,7 @@ ERRORS = [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeEr
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
 def test_writing_that_fails_leaves_nothing(tmp_path, breaks_midway, writer, name, error):
-    """Were half a file left, the next reader would take it for a result; were a temporary left, folders would fill up."""
+    """Writing that fails leaves no half a file, which could pass for a result, and no temporary file."""
     with untouched(tmp_path), pytest.raises(type(error)):
         writer(breaks_midway(error)[writer], tmp_path / name)
 
@@ -367,27 +367,27 @@ def test_writing_that_fails_leaves_nothing(tmp_path, breaks_midway, writer, name
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["save", "save_figure"])
 def test_writing_that_fails_keeps_the_earlier_result(tmp_path, breaks_midway, writer, name, error):
-    """Were the old file opened for writing, a night's work would be lost to a full disk."""
+    """Writing that fails keeps the earlier result: a full disk must not cost a night's work."""
     (tmp_path / name).write_bytes(b"the result of last night")
     with untouched(tmp_path), pytest.raises(type(error)):
         writer(breaks_midway(error)[writer], tmp_path / name)
 
 
 def test_a_dataset_that_cannot_be_stored_leaves_nothing(tmp_path):
-    """Were the failure of a real dataset handled otherwise than that of a stand-in, the tests above would prove little."""
+    """A real dataset that cannot be stored leaves nothing behind either, as the simulated failures above."""
     strange = DATASET.assign(b=("x", np.array([object(), object(), object()], dtype=object)))
     with untouched(tmp_path), pytest.raises((TypeError, ValueError)):
         fj.save(strange, tmp_path / "result.nc")
 
 
 def test_a_picture_of_unknown_kind_leaves_nothing(tmp_path):
-    """Were the suffix found out after opening the file, an empty picture would stay."""
+    """An unknown kind of picture is refused before a file is opened: no empty picture stays behind."""
     with untouched(tmp_path), pytest.raises(ValueError, match="'xyz' is not supported"):
         fj.save_figure(Figure(), tmp_path / "result.xyz")
 
 
 def test_results_are_whole_and_alone(tmp_path):
-    """Were a temporary left beside a good result, or the result not what was saved, nothing could be trusted."""
+    """Saving replaces the earlier file by exactly what was saved, and leaves no temporary file beside it."""
     (tmp_path / "result.nc").write_bytes(b"an earlier one")
     assert fj.save(DATASET, tmp_path / "result.nc") == tmp_path / "result.nc"
     assert fj.save_figure(Figure(), tmp_path / "result.png") == tmp_path / "result.png"
@@ -398,7 +398,7 @@ def test_results_are_whole_and_alone(tmp_path):
 
 
 def test_results_can_be_read_by_others_like_any_new_file(tmp_path):
-    """Were the temporary's permissions kept, colleagues could not open a result on a shared disk."""
+    """A result has the permissions of any new file: colleagues can read it on a shared disk."""
     plain = tmp_path / "plain"
     plain.write_bytes(b"")
     assert fj.save(DATASET, tmp_path / "result.nc").stat().st_mode == plain.stat().st_mode
@@ -407,7 +407,7 @@ def test_results_can_be_read_by_others_like_any_new_file(tmp_path):
 @pytest.mark.parametrize("check", [files.check_writable, lambda p: fj.save(DATASET, p), lambda p: fj.save_figure(Figure(), p)],
                          ids=["check_writable", "save", "save_figure"])  # fmt: skip
 def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
-    """Were a path found bad only after the work, the work would be lost."""
+    """A path that cannot be written is refused before the work, with the reason: no result is lost to it."""
     (tmp_path / "folder").mkdir()
     with untouched(tmp_path):
         with refused(ValueError, str(tmp_path / "folder"), "is a folder"):
@@ -418,7 +418,7 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
         def denied(*_, **__):
             raise PermissionError(13, "Permission denied")
 
-        # A folder that even an administrator cannot write cannot be made on every machine.
+        # An administrator may write to any folder, so the system's refusal is simulated.
         monkeypatch.setattr(files.tempfile, "NamedTemporaryFile", denied)
         with refused(ValueError, str(tmp_path), "cannot be written", "Permission denied"):
             check(tmp_path / "result.nc")
@@ -426,26 +426,26 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
 def test_a_real_folder_that_nobody_can_write():
-    """Were the probe not a real write, this folder, whose permission bits look fine to an administrator, would pass."""
+    """Whether a folder can be written is found by writing: permission bits alone mislead an administrator."""
     with refused(ValueError, "`/proc`", "cannot be written"):
         files.check_writable("/proc/result.nc")
 
 
 def test_a_file_in_place_of_the_folder_is_called_a_file(tmp_path):
-    """Were it said not to exist, the user would look for a spelling mistake."""
+    """Where a file stands in place of the folder, the refusal says so, and not that the folder is missing."""
     (tmp_path / "taken").write_bytes(b"")
     with refused(ValueError, "`", "not a folder"):
         files.check_writable(tmp_path / "taken" / "result.nc")
 
 
 def test_long_names_that_the_file_system_allows(tmp_path):
-    """Were they refused, the sentence would blame the folder."""
+    """A name as long as the file system allows is accepted."""
     assert files.check_writable(tmp_path / ("x" * 252 + ".nc")).parent == tmp_path
 
 
 @pytest.mark.parametrize("thing", [{"a": 1}, np.zeros(3), None], ids=["dict", "array", "None"])
 def test_what_is_no_dataset(tmp_path, thing):
-    """Were the mistake not named, the message would be about an attribute."""
+    """What is no dataset is refused as the argument `result`, not by an attribute that it lacks."""
     with refused(TypeError, "`result`"):
         fj.save(thing, tmp_path / "result.nc")
 
@@ -485,7 +485,7 @@ def test_what_is_no_dataset(tmp_path, thing):
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip
 def test_command_line_refusals(tmp_path, capsys, arguments, fragments):
-    """Were the answer a traceback, an exit code of 0 or a file, a script would go on with nothing."""
+    """Bad input ends a command with one sentence, a failing exit code and no file: no script goes on with nothing."""
     with untouched(tmp_path):
         message = refused_on_the_command_line(capsys, [*arguments, "--out", tmp_path / "out"])
     for fragment in fragments:
@@ -494,7 +494,7 @@ def test_command_line_refusals(tmp_path, capsys, arguments, fragments):
 
 @pytest.mark.parametrize("command", ["map", "simulate"])
 def test_command_line_refuses_paths_before_anything_else(tmp_path, capsys, command):
-    """Were a path checked at the end, an hour's map would have nowhere to go."""
+    """The output path is checked before all else: an hour's map must have somewhere to go."""
     (tmp_path / "taken.nc").mkdir()
     with untouched(tmp_path):
         message = refused_on_the_command_line(capsys, [command, "--out", tmp_path / "missing" / "out", "--m1", "-1"])
@@ -505,7 +505,7 @@ def test_command_line_refuses_paths_before_anything_else(tmp_path, capsys, comma
 
 @pytest.mark.parametrize("suffix", [".nc", ".png"])
 def test_a_picture_that_cannot_be_written_is_found_before_the_run(tmp_path, capsys, suffix):
-    """Were only the data's path checked, the command would fail after the run."""
+    """The paths of the picture and of the data are both checked before the run."""
     (tmp_path / f"out{suffix}").mkdir()
     message = refused_on_the_command_line(capsys, ["simulate", "--out", tmp_path / "out"])
     assert f"out{suffix}" in message
@@ -514,7 +514,7 @@ def test_a_picture_that_cannot_be_written_is_found_before_the_run(tmp_path, caps
 @pytest.mark.parametrize("arguments", [[], ["squeal"], ["map", "--mu", "abc"], ["simulate", "--quantity", "jerk"], ["map", "--muu", "1"]],
                          ids=" ".join)  # fmt: skip
 def test_command_lines_that_do_not_parse(tmp_path, monkeypatch, capsys, arguments):
-    """Were one run with defaults, the user would get an answer to another question."""
+    """A command line that does not parse is refused: run with defaults, it would answer another question."""
     monkeypatch.chdir(tmp_path)
     with untouched(tmp_path), pytest.raises(SystemExit) as stop:
         cli.main(arguments)
@@ -526,12 +526,12 @@ def test_command_lines_that_do_not_parse(tmp_path, monkeypatch, capsys, argument
 
 @pytest.mark.parametrize("out", [".", "/", ""])
 def test_an_output_without_a_name(tmp_path, monkeypatch, capsys, out):
-    """Were the answer pathlib's, the user would not learn what to give instead."""
+    """An output without a file name is refused in words of this program, not of `pathlib`."""
     monkeypatch.chdir(tmp_path)
     assert "PosixPath" not in refused_on_the_command_line(capsys, ["simulate", "--out", out])
 
 
 def test_an_axis_without_end(tmp_path, capsys):
-    """Were NumPy's warning all there is, the user would read about an invalid value in a multiplication."""
+    """An infinite axis is refused in a sentence, not by a NumPy warning about a multiplication."""
     message = refused_on_the_command_line(capsys, ["map", "--x", "mu=0:inf:3", "--out", tmp_path / "out"])
     assert "finite" in message

@@ -15,7 +15,7 @@ A = np.sin(400.0 * T)
 
 @pytest.fixture(autouse=True)
 def no_engine(monkeypatch):
-    """A check that is made after compiling lets a typing error cost a minute: it is rejected."""
+    """Makes it an error to reach an engine: bad input is refused before a minute of compiling, not after it."""
     without_engines(monkeypatch)
 
 
@@ -55,7 +55,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_the_commands_here_reach_the_engine_with_good_input(folder):
-    """Were the stand-ins in the wrong place, every other test here would pass whatever is checked and when."""
+    """Good input reaches the stand-ins for the engines; if it did not, the tests below would prove nothing."""
     for command in (["calibrate", "good.csv", "--free", "mu", "--rate", "1000"], ["tradeoff", "--t1", "0.1"]):
         with pytest.raises(EngineReached):
             cli.main([*command, "--out", "out"])
@@ -108,7 +108,7 @@ MU = ["--free", "mu"]
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip
 def test_calibrate(folder, capsys, arguments, fragments):
-    """Were one accepted, the fit would be of something that was not measured."""
+    """A recording or an option that does not fit is refused: the fit would be of something that was not measured."""
     with untouched(folder):
         message = refused_on_the_command_line(capsys, ["calibrate", *arguments, "--out", "out"])
     for fragment in fragments:
@@ -152,7 +152,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip
 def test_other_commands(folder, capsys, arguments, fragments):
-    """Were one accepted, the command would compute for an hour, or write what means nothing."""
+    """Values outside the model, and maps or runs too large to hold, are refused before anything is computed."""
     with untouched(folder):
         message = refused_on_the_command_line(capsys, [*arguments, "--out", "out"])
     for fragment in fragments:
@@ -161,7 +161,7 @@ def test_other_commands(folder, capsys, arguments, fragments):
 
 @pytest.mark.parametrize("command", [["cea"], ["tradeoff"], ["calibrate", "good.csv", *MU]], ids=lambda c: c[0])
 def test_where_to_write_is_asked_first(folder, capsys, command):
-    """Were a path checked at the end, the work would have nowhere to go."""
+    """An output path that cannot be written is refused before the work, not after it."""
     (folder / "taken.nc").mkdir()
     for out, fragment in (
         ("missing/out", "does not exist"),
@@ -186,7 +186,7 @@ def test_where_to_write_is_asked_first(folder, capsys, command):
     ids=lambda x: " ".join(x),
 )
 def test_results_are_not_overwritten_unasked(folder, capsys, command, there):
-    """A file of that name may be a night's work: it is refused before any work, and replaced only with `--overwrite`."""
+    """A file that is already there is refused before any work, and replaced only with `--overwrite`."""
     for name in there:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("earlier")
@@ -196,18 +196,18 @@ def test_results_are_not_overwritten_unasked(folder, capsys, command, there):
     if command[0] not in ("cea", "reproduce"):
         with pytest.raises(EngineReached):
             cli.main([*command, "--out", "out", "--overwrite"])
-    # Where nothing is there, nothing is asked.
+    # Neither the refusal nor the run that was stopped has written over the earlier file.
     assert (folder / there[0]).read_text() == "earlier"
 
 
 def test_reproducing_into_a_file(folder, capsys):
-    """Were it found out after the first figure, minutes would be lost."""
+    """A file in place of the output folder is refused before the first figure is computed."""
     with untouched(folder):
         refused_on_the_command_line(capsys, ["reproduce", "--figure", "3", "--out", "good.csv"])
 
 
 def test_resuming_what_is_another_map(folder, capsys):
-    """Were it taken, lanes of two scenes would stand in one picture; were it overwritten, a night's work would be gone."""
+    """A file that is no checkpoint of this map is neither continued, which would mix two scenes, nor overwritten."""
     (folder / "text.unfinished").write_text("notes")
     message = refused_on_the_command_line(capsys, ["map", "--out", "text", "--resume"])
     assert "is not a checkpoint" in message
@@ -271,6 +271,6 @@ def good() -> fj.Recording:
     ],
 )  # fmt: skip
 def test_functions(call, error, fragments):
-    """Were one accepted, the answer would come from somewhere deep inside, or be wrong."""
+    """Bad arguments of public functions are refused by name, before they fail deep inside or give a wrong answer."""
     with refused(error, *fragments):
         call()

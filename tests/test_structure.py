@@ -70,7 +70,7 @@ def sentence(message):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_belt_oscillator_is_eq_5(seed):
-    """Were an entry or a sign of Eq. 5 different, every result of the paper would be."""
+    """Mass, damping and stiffness are those of Eq. 5, every entry and sign: all results rest on them."""
     parameters = random_parameters(seed)
     structure = fj.belt_oscillator(**parameters)
     for made, printed in zip((structure.mass, structure.damping, structure.stiffness), eq5(**parameters), strict=True):
@@ -80,7 +80,7 @@ def test_belt_oscillator_is_eq_5(seed):
 
 
 def test_defaults_are_table_1():
-    """Were a default not Table 1's, "the paper's oscillator" would be another one."""
+    """The defaults are the parameters of Table 1: they are what "the paper's oscillator" means."""
     table_1 = {"m1": 0.53, "m2": 0.045, "c1": 1.0, "c2": 1.0, "k1": 100e3, "k2": 101e3, "theta": 0.01}
     structure = fj.belt_oscillator()
     assert {name: float(value) for name, value in structure.parameters.items()} == table_1
@@ -88,7 +88,7 @@ def test_defaults_are_table_1():
 
 @pytest.mark.parametrize("k2", [101e3, 101_000, np.float64(101e3), np.asarray(101e3)])
 def test_double_precision_without_x64(k2):
-    """Were a matrix rounded to single precision, modes 0.03 Hz apart could not be told from each other."""
+    """Matrices are kept in double precision: single precision could not tell modes 0.03 Hz apart."""
     assert not jax.config.jax_enable_x64
     structure = fj.belt_oscillator(theta=0.3, k2=k2)
     for matrix in (structure.mass, structure.damping, structure.stiffness, structure.load_direction):
@@ -103,7 +103,7 @@ def test_double_precision_without_x64(k2):
 
 @pytest.mark.parametrize(("n", "tangential", "normal"), [(2, 1, 0), (2, 0, 1), (12, 5, 11)])
 def test_any_number_of_coordinates(n, tangential, normal):
-    """Were matrices changed, reordered or refused, only the paper's oscillator could be studied."""
+    """Structures of any size and order of coordinates are accepted, and their matrices kept as given."""
     mass, damping, stiffness = random_matrices(n, seed=n)
     direction = np.random.default_rng(n).normal(size=n)
     structure = fj.Structure(mass, damping, stiffness, direction, tangential=tangential, normal=normal)
@@ -116,7 +116,7 @@ def test_any_number_of_coordinates(n, tangential, normal):
 
 
 def test_lists_and_integers_are_matrices_too():
-    """Were lists refused or integers kept, small structures could not be typed in, or would divide as integers."""
+    """A small matrix may be typed as a list of integers, and becomes one of double-precision numbers."""
     structure = fj.Structure([[2, 0], [0, 1]], [[0, 0], [0, 0]], [[3, -1], [-1, 3]], [0, -1], tangential=0, normal=1)
     assert structure.stiffness.dtype == np.float64
     np.testing.assert_array_equal(np.asarray(structure.stiffness), [[3.0, -1.0], [-1.0, 3.0]])
@@ -124,19 +124,19 @@ def test_lists_and_integers_are_matrices_too():
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e9])
 def test_masses_of_very_different_size_are_accepted(ratio):
-    """Were definiteness judged without scaling, a light wheel on a heavy frame would be called indefinite."""
+    """A light wheel on a heavy frame has a definite mass matrix: definiteness is judged relative to each mass."""
     structure = fj.Structure(np.diag([1.0, ratio]), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
     assert float(structure.mass[1, 1]) == ratio
 
 
 def test_rounding_in_symmetry_is_forgiven():
-    """Were exact symmetry demanded, matrices out of a finite-element code would be refused for their last digit."""
+    """Matrices from a finite-element code are symmetric only to rounding, and are accepted."""
     stiffness = np.array([[3.0, -1.0], [-1.0 - 1e-13, 3.0]])
     assert fj.Structure(np.eye(2), np.eye(2), stiffness, [0, -1], tangential=0, normal=1).size == 2
 
 
 def test_matrices_may_be_traced():
-    """Were traced matrices refused, no derivative with respect to an entry could be taken."""
+    """A matrix may be traced by JAX, so that derivatives with respect to its entries exist."""
 
     def stiffness_of(k):
         return fj.Structure(np.eye(2), np.eye(2), k * np.eye(2), [0, -1], tangential=0, normal=1).stiffness.sum()
@@ -146,7 +146,7 @@ def test_matrices_may_be_traced():
 
 
 def test_entries_of_a_list_may_be_traced():
-    """Were a traced entry refused, the natural way to write a small matrix would not be differentiable."""
+    """A list may hold traced entries: a small matrix written out by hand can be differentiated too."""
 
     def mass_of(m):
         return fj.Structure([[m, 0.0], [0.0, m]], np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1).mass.sum()
@@ -159,7 +159,7 @@ def test_entries_of_a_list_may_be_traced():
 
 
 def test_replace_rebuilds_with_the_new_value_and_keeps_the_rest():
-    """Were a value lost or the matrices not rebuilt, a parameter study would show another structure's results."""
+    """`replace` rebuilds the matrices with the new value and keeps all other parameters, as a parameter study needs."""
     parameters = random_parameters(11)
     changed = fj.belt_oscillator(**parameters).replace(k1=90e3, theta=0.2)
     fresh = fj.belt_oscillator(**{**parameters, "k1": 90e3, "theta": 0.2})
@@ -171,7 +171,7 @@ def test_replace_rebuilds_with_the_new_value_and_keeps_the_rest():
 
 
 def test_replace_leaves_the_original_alone():
-    """Were the original changed, comparing before and after would compare a structure with itself."""
+    """`replace` leaves the original as it was, so that the two can be compared."""
     structure = fj.belt_oscillator()
     structure.replace(m1=2.0)
     assert float(structure.parameters["m1"]) == 0.53
@@ -179,27 +179,27 @@ def test_replace_leaves_the_original_alone():
 
 
 def test_replace_refuses_unknown_names():
-    """Were an unknown name ignored, a typing error would pass for a parameter without influence."""
+    """An unknown name is refused: ignored, a misspelt parameter would seem to have no influence."""
     with pytest.raises(ValueError, match=r"`k3`.*m1, m2, c1, c2, k1, k2, theta") as refusal:
         fj.belt_oscillator().replace(k3=1.0)
     assert sentence(str(refusal.value))
 
 
 def test_replace_refuses_what_the_builder_refuses():
-    """Were the check left out here, a negative mass could come in by the back door."""
+    """A negative mass is refused by `replace` as it is when the structure is built."""
     with pytest.raises(ValueError, match=r"`m1` must be positive, but is -1"):
         fj.belt_oscillator().replace(m1=-1.0)
 
 
 def test_replace_of_a_structure_given_as_matrices_says_why_not():
-    """Were it silent, a parameter study of plain matrices would return the same structure again and again."""
+    """A structure given as matrices has no parameters: replacing one is refused, with the reason."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
     with pytest.raises(ValueError, match=r"`k1`.*given as matrices"):
         structure.replace(k1=1.0)
 
 
 def test_replacing_nothing_changes_nothing():
-    """Were it an error, code that loops over parameters would stumble over a structure that has none."""
+    """Replacing nothing is allowed, so that a loop over parameters also works where there are none."""
     structure = fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1], tangential=0, normal=1)
     assert structure.replace().size == 2
 
@@ -218,7 +218,7 @@ def test_replacing_nothing_changes_nothing():
     ],
 )
 def test_belt_oscillator_refuses_values_out_of_range(name, value, rule, shown):
-    """Were one accepted, matrices would be indefinite or NaN and every answer nonsense."""
+    """Masses must be positive, springs and dampers non-negative, all numbers finite: others are not physical."""
     with pytest.raises(ValueError, match=rf"^Argument `{name}` must be {rule}, but is {re.escape(shown)}\.$"):
         fj.belt_oscillator(**{name: value})
 
@@ -227,20 +227,20 @@ def test_belt_oscillator_refuses_values_out_of_range(name, value, rule, shown):
     ("value", "shown"), [("0.5", "'0.5' (str)"), (None, "None (NoneType)"), (1j, "1j (complex)"), (True, "True (bool)")]
 )
 def test_belt_oscillator_refuses_what_is_no_real_number(value, shown):
-    """Were a text or a complex number taken, the failure would come later, in words about arrays."""
+    """A text, a complex number or a truth value is refused by the name of its argument, before it reaches an array."""
     with pytest.raises(TypeError, match=rf"^Argument `m2` must be .*, but is {re.escape(shown)}\.$"):
         fj.belt_oscillator(m2=value)
 
 
 def test_belt_oscillator_refuses_several_values_at_once():
-    """Were an array taken, the matrices would silently get a third dimension."""
+    """An array in place of one parameter is refused: it would give every matrix a third dimension."""
     with pytest.raises(ValueError, match=r"`k1` must be one number, but has shape \(2,\).*axis") as refusal:
         fj.belt_oscillator(k1=[1e5, 2e5])
     assert sentence(str(refusal.value))
 
 
 def test_undamped_and_unsprung_oscillators_are_allowed():
-    """Were zero refused for springs and dampers, the undamped coalescence could not be computed."""
+    """Springs and dampers may be zero: the coalescence of modes is studied without damping."""
     structure = fj.belt_oscillator(c1=0, c2=0.0, k1=0)
     assert float(np.abs(structure.damping).max()) == 0.0
 
@@ -275,7 +275,7 @@ MATRICES = ("mass", "damping", "stiffness")
     ],
 )
 def test_structure_refuses_bad_matrices(name, value, error, fragments):
-    """Were one accepted, energy would not be conserved, or the failure would come later and name nothing."""
+    """Matrices must be real, finite, square, symmetric and without negative eigenvalues: no structure has others."""
     with pytest.raises(error) as refusal:
         fj.Structure(**{**GOOD, name: value})
     message = str(refusal.value)
@@ -287,14 +287,14 @@ def test_structure_refuses_bad_matrices(name, value, error, fragments):
 
 @pytest.mark.parametrize("name", ["damping", "stiffness"])
 def test_structure_refuses_matrices_of_different_sizes(name):
-    """Were they combined, one of them would be broadcast or cut."""
+    """Damping and stiffness must have the size of the mass matrix: they act on the same coordinates."""
     with pytest.raises(ValueError, match=rf"`{name}` must have shape \(3, 3\).*but has shape \(2, 2\)"):
         fj.Structure(**{**GOOD, name: np.eye(2)})
 
 
 @pytest.mark.parametrize("value", [np.diag([1.0, 1.0, 0.0]), np.ones((3, 3))])
 def test_a_coordinate_without_mass_is_refused(value):
-    """Were the mass matrix singular, accelerations would be infinite."""
+    """A singular mass matrix is refused: its accelerations would be infinite."""
     with pytest.raises(ValueError, match=r"`mass` must be positive definite.*Every coordinate needs a positive mass"):
         fj.Structure(**{**GOOD, "mass": value})
 
@@ -311,7 +311,7 @@ def test_a_coordinate_without_mass_is_refused(value):
     ],
 )
 def test_structure_refuses_bad_load_directions(value, error, fragments):
-    """Were one accepted, the load would act nowhere, everywhere or with half of its value lost."""
+    """A load direction must have one real, finite component for each coordinate: it says where the load acts."""
     with pytest.raises(error) as refusal:
         fj.Structure(**{**GOOD, "load_direction": value})
     message = str(refusal.value)
@@ -328,20 +328,20 @@ def test_structure_refuses_bad_load_directions(value, error, fragments):
      ("y2", TypeError, "'y2' (str)"), (None, TypeError, "None")],
 )  # fmt: skip
 def test_structure_refuses_bad_indices(name, value, error, shown):
-    """Were −1 or True taken as an index, another coordinate than meant would touch the belt."""
+    """Negative, too large and non-integer indices are refused: they would put the contact on another coordinate."""
     with pytest.raises(error, match=rf"`{name}` must be .*{re.escape(shown)}") as refusal:
         fj.Structure(**GOOD, **{name: value})
     assert sentence(str(refusal.value))
 
 
 def test_structure_refuses_one_coordinate_in_both_roles():
-    """Were it accepted, normal and tangential force would be the same force."""
+    """One coordinate cannot be both tangential and normal: friction and normal force would be the same force."""
     with pytest.raises(ValueError, match=r"`tangential` and `normal`.*both are 1"):
         fj.Structure(**GOOD, tangential=1, normal=1)
 
 
 def test_default_indices_do_not_fit_two_coordinates():
-    """Were the default gap index 2 wrapped round for two coordinates, the contact would be on the wrong one."""
+    """The default gap index 2 is refused for two coordinates, not wrapped round to another coordinate."""
     with pytest.raises(ValueError, match=r"`normal` must be between 0 and 1, but is 2"):
         fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1])
 
@@ -349,7 +349,7 @@ def test_default_indices_do_not_fit_two_coordinates():
 @pytest.mark.parametrize("k2", [0.1, 1e5, 1e10])
 @pytest.mark.parametrize("theta", [0.0, 0.3, -1.2])
 def test_springs_are_the_stiffness_and_none_where_the_structure_is_free(theta, k2):
-    """Lifted off the belt as a whole, the oscillator stretches no spring: its energy is of second order in rounding."""
+    """Springs store the energy of the stiffness matrix; a rigid-body motion off the belt stores none, to rounding."""
     with jax.enable_x64(True):
         structure = fj.belt_oscillator(theta=theta, k2=k2)
         springs = Springs(structure.stiffness)
@@ -365,7 +365,7 @@ def test_springs_are_the_stiffness_and_none_where_the_structure_is_free(theta, k
 
 
 def test_springs_of_any_stiffness():
-    """Definite, of lower rank, or none at all."""
+    """Springs are found for a definite stiffness matrix, for one of lower rank, and for zero."""
     rng = np.random.default_rng(2)
     for rank in (5, 3, 0):
         root = rng.normal(size=(5, rank))
@@ -380,7 +380,7 @@ def test_springs_of_any_stiffness():
 
 
 def test_matrices_follow_parameters_wherever_these_are_changed():
-    """Rejects a structure whose matrices and parameters disagree after one of them is changed behind its back."""
+    """Matrices follow the parameters; changing a matrix alone is refused, as the two would disagree."""
     structure = fj.belt_oscillator()
     with jax.enable_x64(True):
         harder = eqx.tree_at(lambda s: s.parameters["c1"], structure, jnp.asarray(7.0))
@@ -392,7 +392,7 @@ def test_matrices_follow_parameters_wherever_these_are_changed():
 
 
 def test_a_matrix_may_be_changed_once_parameters_are_forgotten():
-    """Shows the remedy that the refusal names: what is left of it has no parameters to disagree with."""
+    """`as_matrices`, which that refusal names, drops the parameters; then a matrix may be changed."""
     with jax.enable_x64(True):
         undamped = eqx.tree_at(lambda s: s.damping, fj.belt_oscillator().as_matrices(), jnp.zeros((3, 3)))
     assert not np.any(undamped.damping)
@@ -402,7 +402,7 @@ def test_a_matrix_may_be_changed_once_parameters_are_forgotten():
 
 
 def test_a_batch_of_structures_has_a_batch_of_matrices():
-    """Shows that structures out of `vmap` can be read as each of them can."""
+    """A batch of structures from `vmap` has one set of matrices for each structure."""
     with jax.enable_x64(True):
         batch = jax.vmap(lambda k1: fj.belt_oscillator(k1=k1))(jnp.array([9e4, 1e5]))
     assert batch.stiffness.shape == (2, 3, 3)
@@ -410,7 +410,7 @@ def test_a_batch_of_structures_has_a_batch_of_matrices():
 
 
 def test_derivatives_of_matrices_in_parameters():
-    """Rejects matrices that are constants to `grad`: of Eq. 5, K[1, 1] is k2, and M[0, 0] is m1 cos²θ + m2."""
+    """Matrices can be differentiated in the parameters: in Eq. 5, K[1, 1] is k2, and M[0, 0] is m1 cos²θ + m2."""
     with jax.enable_x64(True):
         slopes = jax.grad(lambda k2: fj.belt_oscillator(k2=k2).stiffness[1, 1])(1e5)
         by_theta = jax.grad(lambda theta: fj.belt_oscillator(theta=theta).mass[0, 0])(0.3)
@@ -419,7 +419,7 @@ def test_derivatives_of_matrices_in_parameters():
 
 
 def test_coordinates_have_names():
-    """Shows names in datasets; rejects names that are too few, repeated or no names."""
+    """Coordinates have names; too few, repeated or non-text names are refused."""
     assert fj.belt_oscillator().coordinates == ("x2", "y1", "y2")
     assert fj.Structure(**GOOD).coordinates == ("q0", "q1", "q2")
     assert fj.Structure(**GOOD, coordinates=["a", "b", "c"]).coordinates == ("a", "b", "c")
