@@ -139,6 +139,26 @@ def test_starts_of_the_wrong_kind_are_refused(start, fragment):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("multipliers", [False, True])
+def test_derivatives_are_those_of_differences(cycle, multipliers):
+    """In every kind of parameter, period, peak, state and multipliers move as two neighbouring cycles say."""
+    steps = {"mu": 1e-5, "belt_speed": 1e-4, "k1": 1.0, "theta": 1e-6, "c1": 1e-3}
+    slopes = fj.cycle_derivatives(cycle, steps, multipliers=multipliers)
+    for name, step in steps.items():
+        value = float(cycle.scene.parameters[name])
+        above, below = (fj.limit_cycle(cycle.scene.replace(**{name: value + s * step}), start=cycle) for s in (1, -1))
+        assert slopes.amplitude[name] == pytest.approx((above.amplitude - below.amplitude) / (2 * step), rel=1e-6)
+        # Rounding of the period is 1e-16 of it.
+        assert slopes.period[name] == pytest.approx(
+            (above.period - below.period) / (2 * step), rel=1e-6, abs=1e-17 / step
+        )
+        np.testing.assert_allclose(slopes.state[name], (above.state - below.state) / (2 * step), rtol=1e-5, atol=1e-7)
+        if multipliers:
+            expected = (above.multipliers[1:3] - below.multipliers[1:3]) / (2 * step)
+            np.testing.assert_allclose(slopes.multipliers[name][:2], expected, rtol=1e-5)
+
+
+@pytest.mark.slow
 def test_the_paper_s_cycle_loses_its_stability_in_a_neimark_sacker_bifurcation():
     """A complex pair leaves the unit circle between 1.6 and 3 m/s: below that speed it is inside, above outside."""
     before = fj.limit_cycle(paper(1.8))

@@ -30,19 +30,21 @@ class CycleDerivatives(eqx.Module):
     period: dict[str, float]  # s
     amplitude: dict[str, float]  # m/s
     state: dict[str, Float[np.ndarray, "..."]]  # m and m/s, of the state on the section
-    multipliers: dict[str, Complex[np.ndarray, "..."]]  # of `section_multipliers`, in its order
+    multipliers: dict[str, Complex[np.ndarray, "..."]]  # of `section_multipliers`, in its order; empty unless asked for
 
 
 @in_double_precision
-def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str]) -> CycleDerivatives:
+def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: bool = False) -> CycleDerivatives:
     """Derivatives of period, peak tangential speed, state and multipliers of a periodic limit cycle.
 
         d = fj.cycle_derivatives(fj.limit_cycle(scene), ["mu", "belt_speed", "k1"])
-        d.period["k1"], d.multipliers["mu"]
+        d.period["k1"], d.amplitude["mu"]
 
-    **Arguments:** `cycle`, from `limit_cycle` or `saddle_cycle`; `wrt`, names of parameters of its scene.
+    **Arguments:** `cycle`, from `limit_cycle` or `saddle_cycle`; `wrt`, names of parameters of its scene; `multipliers`,
+    whether those of the section's return map are differentiated too, largest first: second derivatives, which take minutes to
+    compile.
 
-    **Returns:** `CycleDerivatives`; `multipliers` are those of the section's return map, largest first.
+    **Returns:** `CycleDerivatives`.
 
     **Raises:** `TypeError` for anything but a `LimitCycle`; `ValueError` for a torus, or a name that is no parameter.
     """
@@ -59,6 +61,7 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str]) -> CycleDerivatives
             f"{', '.join(sorted(cycle.scene.parameters))}."
         )
     stepper, point = EventExact(), point_of(cycle)
+    arguments.truth("multipliers", multipliers)
     segments = int(seen_around(cycle.scene, stepper, point, cycle.period, 60).segments.count)
     correction = jnp.linalg.inv(jnp.eye(len(point.y)) - jnp.asarray(cycle.return_jacobian))
     slopes = _slopes(
@@ -69,6 +72,7 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str]) -> CycleDerivatives
         jnp.asarray(cycle.crossings, jnp.int32),
         correction,
         power_of_4(segments + 4),
+        bool(multipliers),
     )
     period, amplitude, state, jacobian = (dict(zip(names, np.asarray(part), strict=True)) for part in slopes)
     values, right = np.linalg.eig(cycle.return_jacobian)
@@ -79,12 +83,21 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str]) -> CycleDerivatives
         {name: float(slope) for name, slope in period.items()},
         {name: float(slope) for name, slope in amplitude.items()},
         state,
-        moved,
+        moved if multipliers else {},
     )
 
 
 @compiled
-def _slopes(scene: Scene, stepper: EventExact, names: tuple[str, ...], point: Point, crossings, correction, most: int):
+def _slopes(
+    scene: Scene,
+    stepper: EventExact,
+    names: tuple[str, ...],
+    point: Point,
+    crossings,
+    correction,
+    most: int,
+    twice: bool,
+):
     def of(values):
         own = scene.replace(**dict(zip(names, values, strict=True)))
         mechanics = mechanics_about_sliding(own)
@@ -95,13 +108,14 @@ def _slopes(scene: Scene, stepper: EventExact, names: tuple[str, ...], point: Po
         # One step of Newton's method from the root: the same root, with its derivative. A second one makes the derivative of
         # what is a derivative itself, the return map's, right.
         y = point.y
-        for _ in range(2):
+        for _ in range(1 + twice):
             gap = image(y).point.y - y
             y = y + correction @ (gap - jax.lax.stop_gradient(gap))
         back = image(y)
-        jacobian = jax.vmap(lambda direction: jax.jvp(lambda y: image(y).point.y, (y,), (direction,))[1], out_axes=1)(
-            jnp.eye(len(y), dtype=y.dtype)
-        )
+        jacobian = jnp.zeros((len(y), len(y)), y.dtype)
+        if twice:
+            units = jnp.eye(len(y), dtype=y.dtype)
+            jacobian = jax.vmap(lambda unit: jax.jvp(lambda y: image(y).point.y, (y,), (unit,))[1], out_axes=1)(units)
         around = once_around(stepper, mechanics, Point(y, point.contact), back.time, most)
         peak = peak_speed(stepper, mechanics, around)
         return back.time, peak, y + sliding_state(own, own.load.final), jacobian
