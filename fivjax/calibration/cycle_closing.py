@@ -47,7 +47,7 @@ def corrected(structure: Structure, cycle: Cycle, step, gap, contact: Contact) -
     return chosen, jnp.where(astray & ~changed, jnp.nan, moved)
 
 
-def growth_of_disturbances(system: Float[np.ndarray, "2n 2n"], where: int) -> float:
+def growth_of_disturbances(system: Float[np.ndarray, "state state"], where: int) -> float:
     """The largest factor by which a disturbance of a cycle grows from one return to the next (its Floquet multipliers)."""
     rest = np.delete(np.arange(len(system)), where)
     # A disturbed state comes back later; the period is what brings the tangential velocity back.

@@ -158,7 +158,7 @@ def taper(count: int) -> Float[np.ndarray, " count"]:
     return np.hanning(count) ** 2
 
 
-def _waves(t, frequency: float, count: int) -> Float[np.ndarray, "B 1+2*count"]:
+def _waves(t, frequency: float, count: int) -> Float[np.ndarray, "B wave"]:
     turns = 2 * np.pi * frequency * t[:, None] * np.arange(1, count + 1)
     return np.concatenate([np.ones((len(t), 1)), np.cos(turns), np.sin(turns)], axis=1)
 

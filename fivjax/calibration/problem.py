@@ -102,8 +102,8 @@ class About(NamedTuple):
 
     x: Float[Array, " j"]
     cycles: tuple[Cycle, ...]
-    follow: tuple[Float[Array, "2n j"], ...]  # how the unknowns of each cycle follow the parameters
-    systems: tuple[Float[Array, "2n 2n"], ...]  # how what does not close follows the unknowns
+    follow: tuple[Float[Array, "state j"], ...]  # how the unknowns of each cycle follow the parameters
+    systems: tuple[Float[Array, "state state"], ...]  # how what does not close follows the unknowns
     models: list[Float[Array, "B k"]]
 
 

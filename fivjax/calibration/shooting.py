@@ -39,11 +39,11 @@ class Cycle(NamedTuple):
     contact: Contact
     period: Float[Array, ""]  # s
 
-    def unknowns(self, tangential: int) -> Float[Array, " 2n"]:
+    def unknowns(self, tangential: int) -> Float[Array, " state"]:
         """What closes the cycle: the state, with the period in place of the tangential velocity."""
         return self.y.at[self.y.shape[0] // 2 + tangential].set(self.period)
 
-    def at(self, unknowns: Float[Array, " 2n"], tangential: int) -> "Cycle":
+    def at(self, unknowns: Float[Array, " state"], tangential: int) -> "Cycle":
         """The cycle with these unknowns."""
         where = unknowns.shape[0] // 2 + tangential
         return Cycle(unknowns.at[where].set(self.y[where]), self.contact, unknowns[where])

@@ -25,7 +25,7 @@ class SlidingMisfit(AbstractMisfit):
     """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
     found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
 
-    edges: Float[Array, " B+1"]
+    edges: Float[Array, " edge"]
     means: Float[Array, "B k"]
     sigma: Float[Array, " k"]
     known: dict[str, Array]
@@ -65,7 +65,7 @@ class SlidingMisfit(AbstractMisfit):
 class KickMisfit(AbstractMisfit):
     """The response to the scene's own load, from steady sliding, through every contact event."""
 
-    edges: Float[Array, " B+1"]
+    edges: Float[Array, " edge"]
     means: Float[Array, "B k"]
     sigma: Float[Array, " k"]
     known: dict[str, Array]
@@ -92,7 +92,7 @@ class KickMisfit(AbstractMisfit):
         return _integrals(y, self.channels)
 
 
-def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
     """States at instants of the simulation (s): the response from steady sliding, which it was in before, too."""
     q, _ = steady_sliding(scene, scene.load.force)
     y0 = jnp.concatenate([q, jnp.zeros_like(q)])
@@ -101,7 +101,7 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
     return y[1:]
 
 
-def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i 2n"]:
+def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
     """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
     matrix, keep = (
         linear_sliding(scene).matrix,

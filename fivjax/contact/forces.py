@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from .mechanics import Mechanics
 from .mode import Contact, Status
 
-State = Float[Array, " 2n"]  # displacements, then velocities
+State = Float[Array, " state"]  # displacements, then velocities
 
 
 def relative_velocity(mechanics: Mechanics, y: State) -> Float[Array, ""]:

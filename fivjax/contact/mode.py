@@ -17,5 +17,5 @@ class Status(enum.IntEnum):
 class Contact(eqx.Module):
     """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides."""
 
-    status: Int[Array, ""]
-    direction: Float[Array, ""]
+    status: Int[Array, "*batch"]
+    direction: Float[Array, "*batch"]

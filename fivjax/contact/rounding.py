@@ -40,7 +40,7 @@ def zero_at_start(
     return found
 
 
-def exactly_zero(contact: Contact) -> Bool[Array, "2"]:
+def exactly_zero(contact: Contact) -> Bool[Array, "2 *batch"]:
     """Which guards are put at zero exactly where their status begins: slip and gap.
 
     If these are small, they are small, and not zero but for rounding: a slow belt under a high load has a slip that the

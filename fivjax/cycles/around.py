@@ -34,7 +34,7 @@ class Round(NamedTuple):
 
     t: Float[Array, " s"]  # when each begins, s
     h: Float[Array, " s"]  # how long it lasts, s; zero where empty
-    y: Float[Array, "s 2n"]  # where it begins
+    y: Float[Array, "s state"]  # where it begins
     contact: Contact
     ended: Bool[Array, "s 2"]  # which guard ended it
     count: Int[Array, ""]
@@ -56,7 +56,7 @@ def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period:
     def record(total: Round, segment: Segment) -> Round:
         row = Round(segment.t, segment.after.h, segment.y, segment.contact, segment.after.ended, total.count + 1)
         kept = jax.tree.map(lambda all_, one: all_.at[total.count].set(one), total[:-1], row[:-1])
-        return Round(*kept, row.count)
+        return Round._make((*kept, row.count))
 
     zero = jnp.zeros((), point.y.dtype)
     return follow(

@@ -25,7 +25,7 @@ class Closed(NamedTuple):
     point: Point
     crossings: int  # of the section, in one period
     period: float  # s
-    jacobian: Float[np.ndarray, "2n 2n"]  # of the return map there
+    jacobian: Float[np.ndarray, "state state"]  # of the return map there
     residual: float  # how far it is from closing, relative to its size
     segments: int  # of motion, in one period
     events: int  # contact events in one period

@@ -30,7 +30,7 @@ class LimitCycle(eqx.Module):
     scene: Scene  # under its final load
     kind: str = eqx.field(static=True)  # "periodic" or "torus"
     period: float  # s; of a torus, the mean time between points of the section
-    state: Float[np.ndarray, " 2n"]  # displacements (m) and velocities (m/s) on the section
+    state: Float[np.ndarray, " state"]  # displacements (m) and velocities (m/s) on the section
     contact: Contact  # the contact mode there
     word: tuple[Phase, ...]  # contact modes in order, with their durations (s)
     multipliers: Complex[np.ndarray, " m"]  # by size, largest first
@@ -39,8 +39,8 @@ class LimitCycle(eqx.Module):
     residual: float  # how far it is from closing, relative to its size
     crossings: int  # points of the section in one period
     harmonics: Complex[np.ndarray, "count n"]  # lines of the velocities, m/s
-    points: Float[np.ndarray, "k 2n"]  # of the section, on one period or the torus, as deviations from sliding
-    return_jacobian: Float[np.ndarray, "2n 2n"]  # of the section's return map over one period
+    points: Float[np.ndarray, "k state"]  # of the section, on one period or the torus, as deviations from sliding
+    return_jacobian: Float[np.ndarray, "state state"]  # of the section's return map over one period
     rotation_number: float | None = None  # of a torus: turns per return
 
     @property
@@ -49,7 +49,7 @@ class LimitCycle(eqx.Module):
         return 1.0 / self.period
 
     @property
-    def deviation(self) -> Float[np.ndarray, " 2n"]:
+    def deviation(self) -> Float[np.ndarray, " state"]:
         """`state` as a deviation from the sliding equilibrium."""
         return self.state - _equilibrium(self.scene)
 
@@ -106,7 +106,7 @@ class LimitCycle(eqx.Module):
         )
 
 
-def section_multipliers(jacobian: Float[np.ndarray, "2n 2n"]) -> Complex[np.ndarray, " 2n"]:
+def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[np.ndarray, " state"]:
     """Eigenvalues of the return map's derivative, largest first: the multipliers without that of the cycle's own direction."""
     values = np.linalg.eigvals(jacobian).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
@@ -135,7 +135,7 @@ def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCy
     )
 
 
-def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> Float[np.ndarray, "k 2n"]:
+def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> Float[np.ndarray, "k state"]:
     """The points of the section on one period from the given one on."""
     points = [np.asarray(point.y)]
     for _ in range(crossings - 1):

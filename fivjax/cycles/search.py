@@ -208,7 +208,9 @@ def _among(found: list[LimitCycle], cycle: LimitCycle) -> bool:
     return any(abs(c.period - cycle.period) < SAME * c.period for c in same)
 
 
-def _closed_near(scene: Scene, stepper: EventExact, point: Point, path: Float[np.ndarray, "k 2n"]) -> LimitCycle | None:
+def _closed_near(
+    scene: Scene, stepper: EventExact, point: Point, path: Float[np.ndarray, "k state"]
+) -> LimitCycle | None:
     """The cycle that a trajectory with these last (weighted) points of the section may be coming to."""
     size = np.linalg.norm(path[-1])
     back = np.array([np.linalg.norm(path[-1] - path[-1 - k]) / size for k in range(1, MOST_CROSSINGS + 1)])
@@ -242,7 +244,7 @@ def _released(scene: Scene, starts: Sequence) -> Point:
     return states_in_contact(scene, jnp.asarray(np.concatenate([states, np.stack(given)]) if given else states))
 
 
-def states_in_contact(scene: Scene, y: Float[jax.Array, "e 2n"]) -> Point:
+def states_in_contact(scene: Scene, y: Float[jax.Array, "e state"]) -> Point:
     """States (deviations from sliding; leading axis) with the contact modes that their forces demand."""
     return Point(y, _in_contact_mode(scene, y))
 

@@ -124,7 +124,7 @@ def section_return(
 
 def return_with_jacobian(
     scene: Scene, stepper: EventExact, point: Point, crossings: int
-) -> tuple[Return, Float[np.ndarray, "2n 2n"]]:
+) -> tuple[Return, Float[np.ndarray, "state state"]]:
     """The return map at a point, and its derivative: saltation at each event and at the section included."""
     found, jacobian = _moved_with_jacobian(
         scene, stepper, point, jnp.asarray(crossings, jnp.int32), jnp.asarray(jnp.inf)
@@ -134,7 +134,7 @@ def return_with_jacobian(
 
 def flow_with_jacobian(
     scene: Scene, stepper: EventExact, start: Point, time: float
-) -> tuple[Point, Float[np.ndarray, "2n 2n"]]:
+) -> tuple[Point, Float[np.ndarray, "state state"]]:
     """Where the motion is after a time (s), and its derivative in the start at that fixed time."""
     # The same program as the return map's, with crossings that are never reached.
     never = jnp.asarray(np.iinfo(np.int32).max, jnp.int32)

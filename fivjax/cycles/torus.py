@@ -57,7 +57,7 @@ HOME, TUBE_LOOKS = 16, 4
 class Curve(NamedTuple):
     """A closed curve of the section."""
 
-    points: Float[np.ndarray, "k 2n"]  # in the order of their phases, deviations from sliding
+    points: Float[np.ndarray, "k state"]  # in the order of their phases, deviations from sliding
     rotation: float  # turns per return
     jumps: int
     residual: float  # the median distance of a point's image from the curve, relative to its size
@@ -117,7 +117,7 @@ def _orbit(scene: Scene, stepper: EventExact, point: Point):
     return None if not np.all(np.isfinite(returns)) else (returns, np.concatenate(times), windows)
 
 
-def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k 2n"]) -> Curve | None:
+def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k state"]) -> Curve | None:
     """The curve through the points of one trajectory, if its points lie on one."""
     weighted = weights * returns
     size = np.mean(np.linalg.norm(weighted, axis=-1))
@@ -136,12 +136,12 @@ def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k 2n"]) -> Curve | N
     return Curve(returns[order], float(rotation), jumps, float(residual))
 
 
-def _extent(weighted: Float[np.ndarray, "k 2n"]) -> float:
+def _extent(weighted: Float[np.ndarray, "k state"]) -> float:
     """How far points lie from their middle, in the root mean square."""
     return float(np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1))))
 
 
-def _drifts(weighted: Float[np.ndarray, "k 2n"]) -> bool:
+def _drifts(weighted: Float[np.ndarray, "k state"]) -> bool:
     """Whether the points move on in the mean: on a torus they go round and round."""
     third = len(weighted) // 3
     x = (np.arange(third) + 0.5) / third
@@ -150,13 +150,13 @@ def _drifts(weighted: Float[np.ndarray, "k 2n"]) -> bool:
     return bool(np.linalg.norm(late - early) > DRIFT * _extent(weighted))
 
 
-def tube_radius(weighted: Float[np.ndarray, "k 2n"]) -> float:
+def tube_radius(weighted: Float[np.ndarray, "k state"]) -> float:
     """The radius of the tube about a curve through these points."""
     size = float(np.mean(np.linalg.norm(weighted, axis=-1)))
     return min(TUBE * size, TUBE_OF_EXTENT * _extent(weighted))
 
 
-def _rotation(weighted: Float[np.ndarray, "k 2n"]) -> float:
+def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
     """Turns per return: a guess from the angle about the middle, then where the points in order make the shortest path."""
     centred = weighted - np.mean(weighted, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
@@ -235,7 +235,7 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
     return True
 
 
-def on_torus(scene: Scene, torus: LimitCycle, points: Float[np.ndarray, "k 2n"]) -> bool:
+def on_torus(scene: Scene, torus: LimitCycle, points: Float[np.ndarray, "k state"]) -> bool:
     """Whether the last of these points (weighted deviations) lie in the torus' tube."""
     weighted = np.asarray(scene.structure.weights) * torus.points
     apart = np.min(np.linalg.norm(points[-HOME:, None] - weighted, axis=-1), axis=-1)

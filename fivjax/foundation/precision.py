@@ -24,6 +24,8 @@ from jaxtyping import Array
 
 P = ParamSpec("P")
 R = TypeVar("R")
+# What a user gets back: NumPy's where values are known, JAX's under a transformation; see above.
+Returned = Array | np.ndarray
 
 
 def in_double_precision(function: Callable[P, R]) -> Callable[P, R]:

@@ -127,7 +127,7 @@ class Recording(eqx.Module):
 class Averaged(NamedTuple):
     """Means over blocks of samples. `edges` are s after the first sample, half a step before each block's first one."""
 
-    edges: Float[np.ndarray, " B+1"]
+    edges: Float[np.ndarray, " edge"]
     means: Float[np.ndarray, "B k"]
     per_block: int
 

@@ -23,7 +23,7 @@ class LinearSliding(eqx.Module):
     `m` is twice the number of coordinates that sliding leaves free: the structure's without the normal one.
     """
 
-    equilibrium: Float[Array, " 2n"]  # the state about which the deviation z is measured
+    equilibrium: Float[Array, " state"]  # the state about which the deviation z is measured
     matrix: Float[Array, "m m"]
     frictionless: Float[Array, "m m"]  # the same without friction
     pressing: Float[Array, " m"]  # row: how z changes the pressing acceleration, the free one towards the belt

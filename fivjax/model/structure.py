@@ -234,7 +234,7 @@ class Structure(eqx.Module):
 
     @property
     @in_double_precision
-    def weights(self) -> Float[Array, " 2n"]:
+    def weights(self) -> Float[Array, " state"]:
         """What makes the squares of displacements and velocities comparable energies: the square roots of the diagonals."""
         matrices = self.matrices
         return jnp.sqrt(jnp.concatenate([jnp.diag(matrices.stiffness), jnp.diag(matrices.mass)]))

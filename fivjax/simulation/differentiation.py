@@ -222,7 +222,7 @@ def _closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> _Call
 class _Look(eqx.Module):
     """One advance, and its guards at even instants of it."""
 
-    y: Float[Array, " 2n"]
+    y: Float[Array, " state"]
     contact: Contact
     h: Float[Array, ""]
     turned: Array  # whether it slides the other way now

@@ -336,7 +336,7 @@ def along_rows(
     mechanics: Mechanics,
     contacts: Contact,
     loads: Float[Array, " T"],
-    ys: Float[Array, "T 2n"],
+    ys: Float[Array, "T state"],
     rows: Ledger,
 ) -> Energy:
     """The ledger of a trajectory from its rows and what had been entered up to each of them."""

@@ -15,6 +15,7 @@ from ..contact import Contact, Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import (
+    Returned,
     in_double_precision,
     is_known,
     known_to_numpy,
@@ -43,17 +44,17 @@ LEAST_ROWS, MOST_REPEATED = 64, 4**8
 class Trajectory(eqx.Module):
     """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size."""
 
-    t: Float[Array, " T"]  # s
-    displacement: Float[Array, "T n"]  # m
-    velocity: Float[Array, "T n"]  # m/s
-    acceleration: Float[Array, "T n"]  # m/s²
-    status: Int[Array, " T"]  # 0 stick, 1 slide, 2 detach
-    normal_force: Float[Array, " T"]  # N
-    friction_force: Float[Array, " T"]  # N
-    load: Float[Array, " T"]  # N
+    t: Float[Returned, " T"]  # s
+    displacement: Float[Returned, "T n"]  # m
+    velocity: Float[Returned, "T n"]  # m/s
+    acceleration: Float[Returned, "T n"]  # m/s²
+    status: Int[Returned, " T"]  # 0 stick, 1 slide, 2 detach
+    normal_force: Float[Returned, " T"]  # N
+    friction_force: Float[Returned, " T"]  # N
+    load: Float[Returned, " T"]  # N
     scene: Scene
     energy: Energy | None = None  # the ledger, when asked for
-    outcome: Int[Array, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
+    outcome: Int[Returned | np.generic, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
     # How it was computed, as pairs of a name and a value: method, dt, dt_save, t1, start.
     settings: tuple[tuple[str, str | float], ...] = eqx.field(static=True, default=())
 
@@ -63,12 +64,12 @@ class Trajectory(eqx.Module):
         return ENDING[Ending(int(self.outcome))]
 
     @property
-    def slip_velocity(self) -> Float[Array, " T"]:
+    def slip_velocity(self) -> Float[Returned, " T"]:
         """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
         return self.velocity[:, self.scene.structure.tangential] - np.asarray(self.scene.belt_speed)
 
     @property
-    def gap(self) -> Float[Array, " T"]:
+    def gap(self) -> Float[Returned, " T"]:
         """Distance from the belt, in m."""
         return self.displacement[:, self.scene.structure.normal]
 
@@ -270,7 +271,9 @@ def _simulate(
     }
 
 
-def _grown(scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T 2n"]) -> Bool[Array, " T"]:
+def _grown(
+    scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T state"]
+) -> Bool[Array, " T"]:
     """Which states are a billionfold beyond what the start, the belt and the load can explain."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
@@ -296,7 +299,7 @@ def states_at(
     most: int,
     books: Books | None = None,
     derivatives: str = "both",
-) -> tuple[Float[Array, "T 2n"], Contact, Ledger | None]:
+) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
     """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
     where `most` advances between two of them were not enough.
 

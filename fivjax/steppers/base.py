@@ -77,7 +77,7 @@ def advance_between(
 class Within(NamedTuple):
     """The motion inside one advance, in a form to integrate along it: the sum of weight times integrand over the states."""
 
-    states: Float[Array, "k 2n"]
+    states: Float[Array, "k state"]
     weights: Float[Array, " k"]  # s
     times: Float[Array, " k"]  # s after its start
     end: State  # where the status's own motion ends, before anything that follows from its end

@@ -29,7 +29,7 @@ class Segment(NamedTuple):
     after: Advance
 
 
-class Followed(NamedTuple, Generic[Total]):
+class Followed(eqx.Module, Generic[Total]):
     """Where `follow` has come to."""
 
     y: State

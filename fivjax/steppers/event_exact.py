@@ -140,7 +140,7 @@ class EventExact(AbstractStepper):
 
     def series(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
-    ) -> tuple[Float[Array, "order+1 2n"], Float[Array, ""]]:
+    ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
         """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
         unit = _time_unit(mechanics)
         states, _ = _series(mechanics, contact, load, y, self.order_, unit)

@@ -65,7 +65,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
     uncubic = jnp.max(jnp.abs(coefficients[4] @ samples), axis=0) * (2 * math.factorial(4) / 384)
     rounding = [largest_rounding(terms), uncubic]
 
-    def table(parts: list[Float[Array, "*k 4 x c"]]) -> Float[Array, "r c"]:
+    def table(parts: list[Float[Array, "... 4 _ column"]]) -> Float[Array, "row entry"]:
         flat = [jnp.moveaxis(part, -3, 0).reshape(4, -1, 2 * n + 2) for part in parts]
         rows = jnp.concatenate(flat, axis=1)
         closed, everything = _columns(n, mechanics.normal)
@@ -92,7 +92,7 @@ def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stacked(
-    mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"]
+    mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "state l"]
 ) -> Float[Array, "c l"]:
     """(state, load, 1) in the columns of the way the contact is in, zero in the others."""
     n, normal = y.shape[0] // 2, mechanics.normal

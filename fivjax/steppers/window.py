@@ -50,7 +50,7 @@ class Window(eqx.Module):
         first = jnp.where(first_safe[0] & first_safe[1], first, 0)
         return jnp.minimum(first, jnp.floor(steps).astype(jnp.int32))
 
-    def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "2n l"]:
+    def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "state l"]:
         """The state where an interval begins."""
         samples = self.parts[-1]
         return jnp.where(interval == INTERVALS, samples[INTERVALS], chosen(samples[:INTERVALS], interval))
@@ -115,7 +115,7 @@ class Series(eqx.Module):
         c = self.parts[0]
         return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
 
-    def state(self, x: Float[Array, " l"]) -> Float[Array, "2n l"]:
+    def state(self, x: Float[Array, " l"]) -> Float[Array, "state l"]:
         """Displacements, and velocities in m per interval."""
         return jnp.concatenate(value_and_slope(self.parts[2], x))
 

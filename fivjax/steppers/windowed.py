@@ -82,7 +82,7 @@ def _advance_many(size: int, batched, prepared: Propagators, *trajectories):
 
 
 def _advance(
-    prepared: Propagators, contact: Contact, load: Float[Array, " l"], y: Float[Array, "2n l"], h: Float[Array, " l"]
+    prepared: Propagators, contact: Contact, load: Float[Array, " l"], y: Float[Array, "state l"], h: Float[Array, " l"]
 ) -> Advance:
     """One advance of trajectories side by side: to the next event, the end of the step or that of the window, whichever comes
     first.
@@ -131,8 +131,8 @@ def _advance(
 
 
 def _rise(
-    before: Float[Array, "2n l"], after: Float[Array, "2n l"], h: Float[Array, " l"], tangential: int
-) -> Float[Array, "2n l"]:
+    before: Float[Array, "state l"], after: Float[Array, "state l"], h: Float[Array, " l"], tangential: int
+) -> Float[Array, "state l"]:
     """Where the tangential velocity rises through zero between two states a time `h` (s) apart, on cubics through both.
 
     It is off by some thousandths, and by the same ones whenever the motion is the same: as good a place to compare orbits
