@@ -26,7 +26,7 @@ FLOORS = (
 )
 LONGEST, MEDIAN = 400, 150
 # Modules that are too long and are being divided; the list may only shrink.
-STILL_TOO_LONG = {}
+STILL_TOO_LONG: set[str] = set()
 # Functions that still have the name of their module; the list may only shrink.
 STILL_NAMED_ALIKE: set[str] = set()
 # What takes time to load and is not wanted by everyone.

@@ -56,16 +56,16 @@ DIRECTIONS = 64
 class Neighbourhood(NamedTuple):
     """An ellipsoid on the section about a stable periodic cycle, checked to be mapped into itself."""
 
-    centre: Float[np.ndarray, " 2n"]  # the cycle's state, as a deviation from the sliding equilibrium
+    centre: Float[np.ndarray, " state"]  # the cycle's state, as a deviation from the sliding equilibrium
     status: int  # the contact mode there
     direction: float  # and the way friction points, if it slides
-    norm: Float[np.ndarray, "2n 2n"]  # sizes are lengths of norm @ (y - centre)
+    norm: Float[np.ndarray, "state state"]  # sizes are lengths of norm @ (y - centre)
     radius: float  # in that norm, which is never less than the weighted deviation's length
     contraction: float  # the largest that was seen in one period, in that norm
     points: int  # how many were checked
 
     def contains(
-        self, y: Float[np.ndarray, "*m 2n"], status: Int[np.ndarray, "*m"], direction: Float[np.ndarray, "*m"]
+        self, y: Float[np.ndarray, "*m state"], status: Int[np.ndarray, "*m"], direction: Float[np.ndarray, "*m"]
     ) -> Bool[np.ndarray, "*m"]:
         """Which of several states of the section lie in it: trajectories that are captured."""
         size = np.linalg.norm((y - self.centre) @ self.norm.T, axis=-1)
@@ -75,14 +75,14 @@ class Neighbourhood(NamedTuple):
 class Returned(NamedTuple):
     """Where a return map leads from several states (leading axis); NaN where it does not come back."""
 
-    y: Float[np.ndarray, "m 2n"]
+    y: Float[np.ndarray, "m state"]
     status: Int[np.ndarray, " m"]
     direction: Float[np.ndarray, " m"]
     events: Int[np.ndarray, " m"]  # contact events on the way
 
 
 # The return map over one period of the cycle, from many states of the section in the cycle's contact mode.
-ReturnMap = Callable[[Float[np.ndarray, "m 2n"]], Returned]
+ReturnMap = Callable[[Float[np.ndarray, "m state"]], Returned]
 
 
 def free_on_section(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:
@@ -115,16 +115,16 @@ def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray
 class Trial(NamedTuple):
     """A stable cycle with the norm of the module's text, about which a neighbourhood is sought."""
 
-    centre: Float[np.ndarray, " 2n"]
+    centre: Float[np.ndarray, " state"]
     status: int
     direction: float
-    norm: Float[np.ndarray, "2n 2n"]
-    steps: Float[np.ndarray, "m 2n"]  # deviations of the points to be checked, for a radius of one
+    norm: Float[np.ndarray, "state state"]
+    steps: Float[np.ndarray, "m state"]  # deviations of the points to be checked, for a radius of one
     sizes: Float[np.ndarray, " m"]  # of these, in the norm
     allowed: float  # the contraction asked for
     largest: float  # the radius to begin with
 
-    def states(self, radius: float) -> Float[np.ndarray, "1+m 2n"]:
+    def states(self, radius: float) -> Float[np.ndarray, "point state"]:
         """Where the return map is to be evaluated: the centre, to compare with, and the points."""
         return np.concatenate([self.centre[None], self.centre + radius * self.steps])
 
@@ -140,11 +140,11 @@ class Trial(NamedTuple):
 
 
 def trial(
-    centre: Float[np.ndarray, " 2n"],
+    centre: Float[np.ndarray, " state"],
     status: int,
     direction: float,
-    jacobian: Float[np.ndarray, "2n 2n"],
-    weights: Float[np.ndarray, " 2n"],
+    jacobian: Float[np.ndarray, "state state"],
+    weights: Float[np.ndarray, " state"],
     free: Int[np.ndarray, " f"],
 ) -> Trial | None:
     """What is to be checked about a cycle; none where it is not stable by a margin.

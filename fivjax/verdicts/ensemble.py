@@ -44,7 +44,7 @@ class Attractor(eqx.Module):
     """A limit cycle that is known: what trajectories are compared with."""
 
     # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
-    crossings: Float[Array, "s 2n"]
+    crossings: Float[Array, "s state"]
     amplitude: Float[Array, ""]  # its largest tangential speed, m/s; zero while it is not known
 
     @property
@@ -55,7 +55,7 @@ class Attractor(eqx.Module):
 class Approach(eqx.Module):
     """How near a trajectory has been to the known limit cycle lately."""
 
-    seen: Float[Array, "k 2n"]  # the crossing states that were looked at last, newest first
+    seen: Float[Array, "k state"]  # the crossing states that were looked at last, newest first
     near: Int[Array, ""]  # crossing states in a row that were close
     first: Float[Array, ""]  # relative distance of the first of these
 
@@ -63,7 +63,7 @@ class Approach(eqx.Module):
 class Ensemble(NamedTuple):
     """The last crossing states of `e` members, look by look; NaN where a member was not followed any more."""
 
-    deviations: Float[np.ndarray, "k e 2n"]  # weighted
+    deviations: Float[np.ndarray, "k e state"]  # weighted
     peaks: Float[np.ndarray, "k e"]  # largest tangential speed since the look before, m/s
     times: Float[np.ndarray, "k e"]  # s
     events: Int[np.ndarray, "k e"]  # contact events so far
@@ -114,7 +114,7 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     return states[chosen], float(np.max(ensemble.peaks[later][:, members]))
 
 
-def _distance(known: Float[np.ndarray, "k 2n"], states: Float[np.ndarray, "m 2n"]) -> Float[np.ndarray, " m"]:
+def _distance(known: Float[np.ndarray, "k state"], states: Float[np.ndarray, "m state"]) -> Float[np.ndarray, " m"]:
     size = np.sum(states**2, axis=-1)
     apart = size[:, None] - 2 * states @ known.T + np.sum(known**2, axis=-1)
     return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0) / size)

@@ -43,8 +43,8 @@ DRIFT = 0.02
 class Recurrence(eqx.Module):
     """What has to be remembered of a trajectory to see that it returns: one earlier state and a few counts."""
 
-    latest: Float[Array, " 2n"]  # the last crossing state
-    anchor: Float[Array, " 2n"]  # the crossing state that later ones are compared with
+    latest: Float[Array, " state"]  # the last crossing state
+    anchor: Float[Array, " state"]  # the crossing state that later ones are compared with
     crossings: Int[Array, ""]  # since the anchor was set
     search_length: Int[Array, ""]  # crossings after which a search starts again from a newer anchor
     changes: Int[Array, ""]  # status changes since the anchor was set
@@ -88,7 +88,7 @@ def new_recurrence(y: State) -> Recurrence:
 
 def observe(
     memory: Recurrence,
-    weights: Float[Array, " 2n"],
+    weights: Float[Array, " state"],
     equilibrium: State,
     rise: Rise,
     changed: Bool[Array, ""],

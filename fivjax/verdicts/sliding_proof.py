@@ -30,25 +30,27 @@ class SlidingModes(eqx.Module):
     """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper one is kept, counted twice."""
 
     linear: LinearSliding
-    eigenvalues: Complex[Array, " k"]  # 1/s
-    to_modal: Complex[Array, "k m"]  # rows of V⁻¹
-    pressing: Complex[Array, " k"]  # shares of the modes in the two signals
-    slip: Complex[Array, " k"]
-    remainder: Complex[Array, " k"]
+    eigenvalues: Complex[Array | np.ndarray, "*groups k"]  # 1/s
+    to_modal: Complex[Array | np.ndarray, "*groups k m"]  # rows of V⁻¹
+    pressing: Complex[Array | np.ndarray, "*groups k"]  # shares of the modes in the two signals
+    slip: Complex[Array | np.ndarray, "*groups k"]
+    remainder: Complex[Array | np.ndarray, "*groups k"]
     envelope: "Envelope"
-    slowest_decay: Float[Array, ""]  # of the structure on a belt without friction, 1/s; negative where it grows
-    stable: Bool[Array, ""]
+    slowest_decay: Float[
+        Array | np.ndarray, "*groups"
+    ]  # of the structure on a belt without friction, 1/s; negative where it grows
+    stable: Bool[Array | np.ndarray, "*groups"]
 
 
 class Envelope(eqx.Module):
     """What `envelope_peak` wants to know of the modes, at some instants; clusters are modes that are bounded together."""
 
-    growth: Complex[Array, "c i k"]  # of each mode relative to the mean of its cluster
-    bending: Float[Array, "c i k"]  # bounds on the second derivatives of that, 1/s²
-    decay: Float[Array, "c i-1"]  # of the cluster
-    chord: Float[Array, "c i-1"]  # how far a unit of bending departs from the chord, s²
-    last: Float[Array, "c k"]  # sizes of the modes at the last instant
-    members: Float[Array, "c k"]  # one for the modes of a cluster, else zero
+    growth: Complex[Array | np.ndarray, "*groups c i k"]  # of each mode relative to the mean of its cluster
+    bending: Float[Array | np.ndarray, "*groups c i k"]  # bounds on the second derivatives of that, 1/s²
+    decay: Float[Array | np.ndarray, "*groups c interval"]  # of the cluster
+    chord: Float[Array | np.ndarray, "*groups c interval"]  # how far a unit of bending departs from the chord, s²
+    last: Float[Array | np.ndarray, "*groups c k"]  # sizes of the modes at the last instant
+    members: Float[Array | np.ndarray, "*groups c k"]  # one for the modes of a cluster, else zero
 
 
 def sliding_modes(linear: LinearSliding) -> SlidingModes:

@@ -22,10 +22,10 @@ class StickingDrift(eqx.Module):
     """What the proof wants to know of a scene, worked out once."""
 
     load: Float[Array, ""]  # N
-    base: Float[Array, " 2n"]  # the drift's state where the tangential displacement is zero
-    per_displacement: Float[Array, " 2n"]  # and how it changes with that displacement
+    base: Float[Array, " state"]  # the drift's state where the tangential displacement is zero
+    per_displacement: Float[Array, " state"]  # and how it changes with that displacement
     slopes: Float[Array, "2"]  # how fast the guards rise along the drift, N/s
-    energy: Float[Array, "2n 2n"]  # the deviation's energy as a quadratic form, J
+    energy: Float[Array, "state state"]  # the deviation's energy as a quadratic form, J
     reach: Float[Array, "2"]  # how far a deviation of unit energy can move the guards, N/√J
 
 

@@ -1,0 +1,63 @@
+"""The types and shapes in annotations hold for what really happens: jaxtyping and beartype look at every call."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+# In a process of its own, because the package has to be imported under the hook. An `int` passes for a `float`, as for
+# every static checker (PEP 484); beartype asks for that to be said.
+CHECKED = """
+import importlib, pkgutil, sys, types
+from beartype import BeartypeConf, beartype
+from jaxtyping import install_import_hook
+
+checker = types.ModuleType("checker")
+checker.checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+sys.modules["checker"] = checker
+
+ROOMS = ["foundation", "model", "contact", "steppers", "linear", "simulation", "cycles"]
+PROOFS = ["verdicts." + name for name in ("capture", "recurrence", "sliding_proof", "sticking_proof", "verdict")]
+with install_import_hook(["fivjax." + name for name in ROOMS + PROOFS], "checker.checked"):
+    for name in [*ROOMS, "verdicts"]:
+        room = importlib.import_module("fivjax." + name)
+        for module in pkgutil.iter_modules(room.__path__, room.__name__ + "."):
+            importlib.import_module(module.name)
+"""
+
+WORK = """
+import fivjax as fj
+
+scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=3.0, load=fj.Pulse(100.0, 1.2))
+run = fj.simulate(scene, 0.02, 2e-3, energy=True)
+assert run.slip_velocity.shape == run.gap.shape == run.t.shape
+assert fj.cea.eigenvalues(scene).shape == (4,)
+assert 0.227 < fj.cea.critical_friction(fj.belt_oscillator()) < 0.229
+found = fj.bistability_map(scene, mu=[0.1, 0.227], p=[1.0, 1.1, 1.2, 1.3], t_max=0.5, progress=False)
+assert found["verdict"].shape == (2, 4)
+"""
+
+MISTAKE = """
+import jax.numpy as jnp
+from jaxtyping import TypeCheckError
+from fivjax.contact import Contact
+
+try:
+    Contact(jnp.zeros(3, int), jnp.zeros(4))
+except TypeCheckError as refused:
+    assert "direction" in str(refused)
+else:
+    raise AssertionError("a status for three and a direction for four went through")
+"""
+
+
+def in_process(code: str) -> subprocess.CompletedProcess:
+    paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+
+
+def test_annotations_hold_in_a_simulation_a_stability_limit_and_a_map():
+    """No annotation says what is not so; and the checker is at work, because it refuses arrays that do not match."""
+    done = in_process(CHECKED + WORK + MISTAKE)
+    assert done.returncode == 0, done.stderr[-3000:]
