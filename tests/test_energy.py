@@ -18,6 +18,7 @@ from fivjax.cycles.section_map import mechanics_about_sliding
 from fivjax.maps.engine import run_to_verdict
 from fivjax.plot import energy as plot_energy
 from fivjax.simulation import energy as accounts
+from fivjax.steppers.core import Segment
 from fivjax.verdicts.verdict import Verdict
 
 # What the issue of this ledger asks for is 1e-10 of the energy exchanged; rounding over some 10⁴ advances is this.
@@ -442,7 +443,7 @@ def entered_with_mistakes(scene, wrong, lost_impacts, t1):
         t, y, contact, ledger = carry
         after = method.advance(mechanics, contact, load, y, t1 - t)
         at = eqx.tree_at(lambda m: m.friction, mechanics, mistaken.friction)
-        entry = accounts.enter(wrong_books, method, at, load, ledger, contact, y, after)
+        entry = accounts.enter(wrong_books, method, at, ledger, Segment(t, load, contact, y, after))
         entry = eqx.tree_at(lambda ledger: ledger.impact, entry, jnp.where(lost_impacts, 0.0, entry.impact))
         return t + after.h, after.y, after.contact, entry
 
@@ -488,7 +489,9 @@ def test_one_advance_entered_by_hand(paper_scene):
         @jax.jit
         def advance(ledger, contact, y, left):
             after = method.advance(mechanics, contact, scene.load(0.0), y, left)
-            return accounts.enter(books, method, mechanics, scene.load(0.0), ledger, contact, y, after), after
+            return accounts.enter(
+                books, method, mechanics, ledger, Segment(0.0, scene.load(0.0), contact, y, after)
+            ), after
 
         t = 0.0
         while t < 0.1:
