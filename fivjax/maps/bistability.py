@@ -18,6 +18,7 @@ from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from . import store as checkpoint
+from .attractor_table import attractor_table
 from .axes import add_linear_limit, check_run, checked_axes
 from .crossing import first_crossings
 from .engine import MOST_STEPS, run_to_verdict
@@ -93,9 +94,10 @@ def bistability_map(
     known, keep = _kept(
         resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}, axes
     )
+    columns = {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
     verdicts = run_to_verdict(
         scene,
-        {name: values.ravel() for name, values in zip(axes, grid, strict=True)},
+        columns,
         method,
         t_max=t_max,
         memory=memory,
@@ -106,6 +108,7 @@ def bistability_map(
         keep=keep,
         energy=bool(energy),
     )
+    place, table = attractor_table(columns, verdicts)
     dataset = xr.Dataset(
         {
             "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),
@@ -113,6 +116,8 @@ def bistability_map(
             "decided_at": (tuple(axes), verdicts.decided_at.reshape(shape)),
             "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
             "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
+            "attractor": (tuple(axes), place.reshape(shape)),
+            **{name: ("attractors", column) for name, column in table.items()},
             **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},
         },
         coords=axes,

@@ -35,15 +35,18 @@ def in_blocks(
     width: int,
     pool: ThreadPoolExecutor,
     in_place: bool = False,
+    size: int | None = None,
 ) -> Flattened:
     """`function(shared, trajectories)` of all trajectories, in blocks of one size: a scene is compiled once for any map.
 
     `group` says which row of `shared` is each trajectory's. In a block, `shared` has an axis of rows,
-    `trajectories` one more. With `in_place` the results, of the same form, take the place of `trajectories`.
+    `trajectories` one more. With `in_place` the results, of the same form, take the place of `trajectories`. `size` is how many
+    a block holds on a CPU, unless it is to be chosen here.
     """
     slots, filled = _side_by_side(group, width)
-    size = BLOCK_ELSEWHERE
-    if jax.default_backend() == "cpu":
+    if jax.default_backend() != "cpu":
+        size = BLOCK_ELSEWHERE
+    elif size is None:
         size = LARGE_BLOCK_ON_CPU if len(group) >= MANY else BLOCK_ON_CPU
     rows = max(1, size // width)
 

@@ -1,4 +1,4 @@
-"""What can be said of one trajectory by now: whether it has come to a known limit cycle, and its verdict."""
+"""What can be said of one trajectory by now: whether it has come to a known torus, and its verdict."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .progress import Progress, Setting
 
-# Steps between two looks at how near a trajectory is to a known limit cycle: one or two cycles for the fastest method.
+# Steps between two looks at how near a trajectory is to a known torus: one or two cycles for the fastest method.
 STEPS_PER_LOOK = 8
 # A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
 GROWTH = 1e9
 
 
 def look(setting: Setting, now: Progress, reached: Bool[Array, ""]) -> tuple[Progress, Bool[Array, ""]]:
-    """A look at how near the trajectory is to the known limit cycle, and whether it has `reached` it by now."""
+    """A look at how near the trajectory is to the known torus, and whether it has `reached` it by now."""
     crossing = setting.scene.structure.weights * now.recurrence.latest
     approach, reached_now = attractors.approached(now.approach, setting.attractor, crossing)
     return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
@@ -25,14 +25,11 @@ def look(setting: Setting, now: Progress, reached: Bool[Array, ""]) -> tuple[Pro
 
 def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: Bool[Array, ""]) -> Progress:
     """The trajectory with the verdict, if it can be proved by now; it has been followed since the time `began` (s) and has
-    `reached` its known limit cycle, or not.
+    `reached` its known torus, or not. Cycles are known, and have captured it, elsewhere (`rounds`).
     """
     scene, mechanics, modes = setting.scene, setting.mechanics, setting.modes
     structure = scene.structure
     weights = structure.weights
-    reached = reached & ~now.recurrence.returned
-    amplitude = jnp.where(reached, setting.attractor.amplitude, now.recurrence.amplitude)
-    now = eqx.tree_at(lambda now: now.recurrence.amplitude, now, amplitude)
     equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
     yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
     grown = jnp.max(jnp.abs(weights * now.y)) > GROWTH * yardstick
@@ -48,7 +45,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
                 slides_forever(mechanics, modes, now.contact, now.y, quiet_load),
                 Verdict.SLIDING,
                 jnp.where(
-                    quiet_load & (now.recurrence.returned | reached),
+                    quiet_load & reached,
                     Verdict.LIMIT_CYCLE,
                     jnp.where(
                         quiet_load & (jammed | grown),

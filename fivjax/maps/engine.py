@@ -19,6 +19,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
 from . import rounds
+from .attractors import Attractors
 from .blocks import MANY, workers
 from .results import Verdicts, counted, not_run
 from .sharing import HISTORY, Batch, bytes_per_trajectory, grouped, in_bulk
@@ -49,6 +50,7 @@ def run_to_verdict(
     known: Verdicts | None = None,
     keep: Callable[[Verdicts], None] | None = None,
     energy: bool = False,
+    attractors: dict[bytes, Attractors] | None = None,
 ) -> Verdicts:
     """Follow one trajectory for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
@@ -57,6 +59,8 @@ def run_to_verdict(
 
     `known` is what an earlier run of the same trajectories has finished; those are not run again. `keep` is handed
     everything that is finished, every few seconds and at the end.
+
+    `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
 
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
@@ -90,7 +94,7 @@ def run_to_verdict(
             kept, new = time.monotonic(), 0
 
     distinct, group = grouped(values)
-    company = np.bincount(group)[group]
+    attractors = {} if attractors is None else attractors
     # The same in all rounds and portions, because products of other shapes round differently.
     in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
     width = SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1
@@ -114,7 +118,7 @@ def run_to_verdict(
                 chosen = order[start : start + portion]
                 if np.any(verdicts.pending[chosen]):
                     rows = {name: column[chosen] for name, column in values.items()}
-                    rounds.follow_all(batch, rows, company[chosen], t_max, max_steps, verdicts, chosen, finished)
+                    rounds.follow_all(batch, rows, attractors, t_max, max_steps, verdicts, chosen, finished)
         except KeyboardInterrupt:
             left = int(np.sum(verdicts.pending))
             warnings.warn(

@@ -28,6 +28,9 @@ class Verdicts(NamedTuple):
 
     verdict: np.ndarray
     amplitude: np.ndarray  # m/s
+    attractor_kind: np.ndarray  # of the one that captured it: 0 periodic, 1 torus, -1 none
+    attractor_period: np.ndarray  # s
+    attractor_multiplier: np.ndarray  # the largest
     decided_at: np.ndarray  # s
     events: np.ndarray
     last_event: np.ndarray  # s
@@ -44,6 +47,9 @@ def not_run(total: int, energy: bool) -> Verdicts:
     return Verdicts(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
         amplitude=np.full(total, np.nan),
+        attractor_kind=np.full(total, -1, np.int8),
+        attractor_period=np.full(total, np.nan),
+        attractor_multiplier=np.full(total, np.nan),
         decided_at=np.full(total, np.nan),
         events=np.zeros(total, np.int32),
         last_event=np.full(total, np.nan),
@@ -51,19 +57,31 @@ def not_run(total: int, energy: bool) -> Verdicts:
     )
 
 
-def record(verdicts: Verdicts, index: np.ndarray, ended: Progress) -> None:
+class Ended(NamedTuple):
+    """Verdicts of trajectories, and the attractors that have captured them."""
+
+    verdict: np.ndarray
+    kind: np.ndarray
+    amplitude: np.ndarray
+    period: np.ndarray
+    multiplier: np.ndarray
+
+
+def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -> None:
     """Write what is known of trajectories at their ends to their places."""
-    verdict = np.asarray(ended.verdict)
-    amplitude = np.where(verdict == Verdict.LIMIT_CYCLE, ended.recurrence.amplitude, np.nan)
-    verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, amplitude)
-    verdicts.decided_at[index] = np.where(verdict >= 0, ended.t, np.nan)
-    verdicts.events[index] = ended.events
-    verdicts.last_event[index] = ended.last_event
-    if ended.energy is not None:
-        ledger = ended.energy.ledger
+    verdict = ended.verdict
+    verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, ended.amplitude)
+    verdicts.attractor_kind[index] = ended.kind
+    verdicts.attractor_period[index] = ended.period
+    verdicts.attractor_multiplier[index] = ended.multiplier
+    verdicts.decided_at[index] = np.where(verdict >= 0, now.t, np.nan)
+    verdicts.events[index] = now.events
+    verdicts.last_event[index] = now.last_event
+    if now.energy is not None:
+        ledger = now.energy.ledger
         terms = {**ledger.work.lines("work"), "impact_loss": ledger.impact, "energy_residual": ledger.worst}
         terms["energy_exchanged"] = exchanged(ledger)
-        terms["kick_energy"] = ended.energy.vibration
+        terms["kick_energy"] = now.energy.vibration
         for name, values in verdicts.energy.items():
             values[index] = terms[name]
     # Last, and in one go: a trajectory with a verdict is complete, whenever an interrupt comes.

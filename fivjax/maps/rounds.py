@@ -13,18 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.compiling import compiled
-from ..verdicts import ensemble as attractors
 from ..verdicts.verdict import Verdict
+from . import attractors
+from .attractors import Attractors, Follower
 from .blocks import in_blocks
+from .captures import Cycle, captured, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, released, step
-from .results import Verdicts, record
+from .results import Ended, Verdicts, record
+from .section import ReturnMaps
 from .sharing import Batch, grouped, shared_by, with_values
 
-# Rounds after which trajectories want to know their limit cycle, and trajectories of a group for which it is worth the work.
+# Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4
-WORTH_KNOWING = 32
+# Those that are undecided later and seem to repeat ask for a cycle of their own, each time after so many times the steps.
+OWN_FROM, OWN_AGAIN = 16, 2
 # Ensembles that are followed at once: what is kept of them takes memory, some 0.1 MB each.
 ENSEMBLES = 128
 # Looks at a trajectory's verdict while its time grows e-fold.
@@ -34,7 +38,7 @@ LOOKS = 8
 def follow_all(
     batch: Batch,
     values: dict[str, np.ndarray],
-    company: np.ndarray,
+    known: dict[bytes, Attractors],
     t_max: float,
     max_steps: int,
     verdicts: Verdicts,
@@ -43,7 +47,8 @@ def follow_all(
 ) -> None:
     """Follow trajectories that fit in memory together; writes the results of those not run yet at `index`.
 
-    `company` says how many trajectories of the whole run are in each one's group; `report` is told how many have ended.
+    `known` has the attractors of groups, by the group's parameters, and gets those that are found; `report` is told how many
+    have ended.
     """
     distinct, group = grouped(values)
     shared = shared_by(batch, distinct)
@@ -51,25 +56,33 @@ def follow_all(
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(verdicts.pending[index])
     trajectories = _begun(batch, shared, group[pending], columns[pending])
+    basins = Basins(batch, shared, distinct, group)
+    known_from = KNOWN_FROM * batch.method.round
+    own_from = OWN_FROM * batch.method.round
     done = 0
     while True:
         _, now = trajectories.tree
-        verdict = now.verdict
+        verdict = np.array(now.verdict)
         if done >= max_steps:
             verdict = np.where((verdict == Verdict.UNDECIDED) & (now.t < t_max), Verdict.STEP_FAILURE, verdict)
-            now = eqx.tree_at(lambda progress: progress.verdict, now, verdict.astype(np.int8))
+        which = np.full(len(pending), -1)
+        if done > known_from:
+            in_time = (verdict == Verdict.UNDECIDED) & (now.t < t_max)
+            which = basins.entered(pending, now, in_time)
+            verdict[which >= 0] = Verdict.LIMIT_CYCLE
         finished = (verdict != Verdict.UNDECIDED) | (now.t >= t_max)
-        record(verdicts, index[pending[finished]], jax.tree.map(lambda leaf, done=finished: leaf[done], now))
+        ended = Ended(verdict, *basins.described(pending, verdict, which))
+        chosen = np.flatnonzero(finished)
+        record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
         report(int(finished.sum()))
         if finished.all():
             return
         pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
-        if done == KNOWN_FROM * batch.method.round:
-            many = pending[company[pending] >= WORTH_KNOWING]
-            groups, first = np.unique(group[many], return_index=True)
-            for start in range(0, len(groups), ENSEMBLES):
-                part = slice(start, start + ENSEMBLES)
-                _find_attractors(batch, shared, groups[part], columns[many[first[part]]], report)
+        if done == known_from:
+            basins.search(np.unique(group[pending]), columns, known, report)
+        elif done >= own_from:
+            basins.search_alone(pending, trajectories.tree[1], columns, report)
+            own_from = OWN_AGAIN * done
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // STEPS_PER_LOOK)
@@ -77,46 +90,101 @@ def follow_all(
         done += looks * STEPS_PER_LOOK
 
 
-def _find_attractors(batch: Batch, shared: Flattened, groups: np.ndarray, columns: np.ndarray, report) -> None:
-    """Writes the limit cycles of these groups into what they share, where their ensembles meet on one.
+def _rows(tree, chosen: np.ndarray):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], tree)
 
-    `columns` are those of any trajectory of each group.
-    """
-    structure, members = batch.scene.structure, len(attractors.RELEASES)
-    cycles, slowest_decay = shared.tree.attractor, shared.tree.modes.slowest_decay
-    own, columns = np.repeat(groups, members), np.repeat(columns, members, axis=0)
-    running, moving = np.arange(len(own)), np.ones(len(own), bool)
-    trajectories = _begun(batch, shared, own, columns, np.tile(attractors.RELEASES, len(groups)))
-    most = max(attractors.TESTS)
-    deviations = np.full((most, len(own), 2 * structure.size), np.nan)
-    peaks, times, events = (np.full((most, len(own)), np.nan) for _ in range(3))
-    looks = 0
 
-    def cycle_of(k: int):
-        mine = slice(k * members, (k + 1) * members)
-        seen = (array[:looks, mine] for array in (deviations, peaks, times, events))
-        return attractors.met(attractors.Ensemble(*seen, moving[mine]), slowest_decay[groups[k]])
+class Basins:
+    """The attractors of the groups that are followed together, and which trajectories have entered where they capture."""
 
-    while len(running) and looks < most:
-        report(0)
-        trajectories.tree[1].recurrence.peak[:] = 0.0
-        _follow(batch, shared, own[running], trajectories, attractors.SEEN)
-        _, now = trajectories.tree
-        recent = slice(looks, looks + attractors.SEEN)
-        deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
-        peaks[recent, running], times[recent, running] = now.recurrence.peak, now.t
-        # As of the last of these looks: enough to tell whether there were any since the looks before.
-        events[recent, running] = now.events
-        looks += attractors.SEEN
-        moving[running] = (now.verdict == Verdict.UNDECIDED) | (now.verdict == Verdict.LIMIT_CYCLE)
-        over = ~moving[running]
-        if looks in attractors.TESTS:
-            open_ = np.unique(running // members)
-            for k, cycle in zip(open_, batch.pool.map(cycle_of, open_), strict=True):
-                if cycle is not None:
-                    cycles.crossings[groups[k]], cycles.amplitude[groups[k]] = cycle
-            over |= cycles.known[own[running]]
-        running, trajectories = running[~over], trajectories.compacted(np.flatnonzero(~over))
+    def __init__(self, batch: Batch, shared: Flattened, distinct: np.ndarray, group: np.ndarray):
+        self.batch, self.shared, self.distinct, self.group = batch, shared, distinct, group
+        self.maps: ReturnMaps | None = None
+        self.cycles: list[Cycle] = []
+        self.of_group: dict[int, list[int]] = {}  # places in `cycles`
+        self.of_trajectory: dict[int, list[int]] = {}  # those that it nominated alone
+        self.torus = shared.tree.attractor  # views: what is written here is written there
+        self.torus_period = np.full(len(distinct), np.nan)
+
+    def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
+        """Finds the attractors of these groups, where they are not `known`."""
+        self.maps = ReturnMaps(self.batch, self.shared)
+        keys = [row.tobytes() for row in self.distinct]
+        _, first = np.unique(self.group, return_index=True)
+        unknown = np.array([g for g in groups if keys[g] not in known], int)
+        for start in range(0, len(unknown), ENSEMBLES):
+            part = unknown[start : start + ENSEMBLES]
+            follower = Follower(_begun, _follow)
+            found = attractors.search(self.batch, self.shared, self.maps, follower, part, columns[first[part]], report)
+            known.update((keys[g], one) for g, one in zip(part, found, strict=True))
+        for g in groups:
+            one = known[keys[g]]
+            self.of_group[int(g)] = list(range(len(self.cycles), len(self.cycles) + len(one.cycles)))
+            self.cycles += one.cycles
+            if one.torus is not None:
+                self.torus.crossings[g], self.torus.amplitude[g] = one.torus.states, one.torus.amplitude
+                self.torus_period[g] = one.torus.period
+
+    def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, report) -> None:
+        """Computes cycles from where trajectories are that seem to repeat, each for itself; and a torus of their group."""
+        asking = np.flatnonzero(now.recurrence.returned & (now.events > 0))
+        if not len(asking) or self.maps is None:
+            return
+        at = attractors.section_of(now).rows(asking)
+        own = self.group[pending[asking]]
+        for _, rows, cycle in stable_cycles(self.maps, own, at):
+            for row in rows:
+                self.of_trajectory.setdefault(int(pending[asking[row]]), []).append(len(self.cycles))
+            self.cycles.append(cycle)
+        without = np.array([t not in self.of_trajectory for t in pending[asking]]) & (self.torus.amplitude[own] == 0)
+        groups, first = np.unique(own[without], return_index=True)
+        chosen = asking[without][first]
+        for start in range(0, len(groups), ENSEMBLES):
+            part = slice(start, start + ENSEMBLES)
+            follower, near = Follower(_begun, _follow), np.array(now.recurrence.latest)[chosen[part]]
+            given = columns[pending[chosen[part]]]
+            found = attractors.search(
+                self.batch, self.shared, self.maps, follower, groups[part], given, report, near=near
+            )
+            for g, one in zip(groups[part], found, strict=True):
+                if one.torus is not None:
+                    self.torus.crossings[g], self.torus.amplitude[g] = one.torus.states, one.torus.amplitude
+                    self.torus_period[g] = one.torus.period
+
+    def entered(self, pending: np.ndarray, now, undecided: np.ndarray) -> np.ndarray:
+        """The place in `cycles` of the cycle that each trajectory is captured by, or -1."""
+        if self.maps is None or not self.cycles:
+            return np.full(len(pending), -1)
+        latest = np.array(now.recurrence.latest)
+        usable = undecided & np.all(np.isfinite(latest), axis=1)
+        rows_of: dict[int, list[int]] = {}
+        for row in np.flatnonzero(usable):
+            for place in self.of_trajectory.get(int(pending[row]), []):
+                rows_of.setdefault(place, []).append(row)
+        rows = np.flatnonzero(usable)
+        rows = rows[np.argsort(self.group[pending[rows]], kind="stable")]
+        mine = self.group[pending[rows]]
+        for g, places in self.of_group.items():
+            here = rows[np.searchsorted(mine, g) : np.searchsorted(mine, g, side="right")]
+            for place in places if len(here) else ():
+                rows_of[place] = list(here)
+        places = sorted(rows_of)
+        known = [(np.array(rows_of[place], int), self.cycles[place]) for place in places]
+        which = captured(self.maps, self.group[pending], attractors.section_of(now), latest, known)
+        return np.where(which >= 0, np.array([*places, -1])[which], -1)
+
+    def described(self, pending: np.ndarray, verdict: np.ndarray, which: np.ndarray):
+        """Kind, amplitude, period and multiplier of each one's attractor."""
+        torus = (verdict == Verdict.LIMIT_CYCLE) & (which < 0)
+        group = self.group[pending]
+        amplitude = np.where(torus, self.torus.amplitude[group], np.nan)
+        period = np.where(torus, self.torus_period[group], np.nan)
+        multiplier = np.full(len(pending), np.nan)
+        for row in np.flatnonzero(which >= 0):
+            cycle = self.cycles[which[row]]
+            amplitude[row], period[row], multiplier[row] = cycle.amplitude, cycle.period, cycle.multiplier
+        kind = np.where(torus, 1, np.where(which >= 0, 0, -1)).astype(np.int8)
+        return kind, amplitude, period, multiplier
 
 
 def _begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarray, releases=None) -> Flattened:

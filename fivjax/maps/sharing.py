@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..contact import Mechanics
-from ..cycles.section_map import mechanics_about_sliding
+from ..cycles.section_map import longest_return, mechanics_about_sliding
 from ..foundation.compiling import compiled
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
@@ -43,6 +43,7 @@ class Shared(eqx.Module):
     modes: SlidingModes
     drift: StickingDrift
     attractor: Attractor
+    longest_return: Float[Array, ""]  # of the section's return map, s
 
 
 class Batch(NamedTuple):
@@ -93,15 +94,15 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, _ in parts)))
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
     for start in range(0, len(distinct), size):
         # One by one into place, because they are large: they are never there twice.
-        mechanics, prepared, _, drifts = parts.pop(0)
+        mechanics, prepared, _, drifts, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown))
+        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown, longest))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)
@@ -112,7 +113,7 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
     def one(row):
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)
-        return mechanics, method.prepare(mechanics), linear_sliding(own), sticking_drift(own)
+        return mechanics, method.prepare(mechanics), linear_sliding(own), sticking_drift(own), longest_return(own)
 
     return jax.vmap(one)(values)
 

@@ -94,7 +94,8 @@ def critical_perturbation(
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
 
-    run = functools.partial(run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress)
+    # Of the rows, which are the same in the scan and in all that follows.
+    run = functools.partial(run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={})
     scan = np.linspace(low, high, round((high - low) / p_step) + 1)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)

@@ -1,12 +1,12 @@
-"""Evidence for a limit cycle: the trajectory has come to where many others of the same structure have met.
+"""Nominations of a torus: the set of crossing states on which many trajectories of the same structure meet.
 
-To see a trajectory's own orbit return (`recurrence`) takes many cycles, most of all on a torus, whose beat has to be waited
-for. Trajectories that differ in their kick only share their limit cycle; where it is known, a few cycles show that one has
-come to it. So an *ensemble* per structure is released from rest under loads of different sizes. Its members have different
-energies, and they come to know the limit cycle by meeting on it (`met`): an unstable cycle is met by nobody.
+An *ensemble* per structure is released from rest under loads of different sizes. Its members have different energies; where they
+come to be where others were (`met`) may be an attractor, and never is an unstable cycle, which is met by nobody. That is no
+proof: the ghost of a fold is met by all that pass it. Cycles are computed from where members are (`maps.captures`), and a set
+on which nothing repeats is checked to be attracting (`tube`).
 
-A trajectory has reached the limit cycle once its crossing states, one after the other, are as close to the known ones, and
-do not recede. A crossing is one of the tangential velocity through zero, upwards.
+A trajectory is on a torus once its crossing states, sixteen in a row, are in the tube about the set. A crossing is one of the
+tangential velocity through zero, upwards.
 """
 
 from typing import NamedTuple
@@ -25,23 +25,25 @@ RELEASES = np.linspace(1.5, 6.0, 16)
 # Crossing states that a trajectory keeps: an ensemble is followed for as many looks at a time.
 SEEN = 4
 # When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
-TESTS = (32, 36, 40, 44, 48, 52, 60, 68, 76, 88, 104, 128)
+TESTS = (64, 96, 128)
 # The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
 EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Members that have to meet.
 LEAST_MEMBERS = 5
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
-KEPT = 192
+KEPT = 256
+# Sets that so few balls of the size `REACHED` cover are periodic, or drift: no tori.
+LEAST_SPREAD = 16
+# A torus' mean size, in the first and in the last third of the looks of late, is the same but for this share.
+KEEPS_SIZE = 0.02
 # This close, relative to the own distance from equilibrium, it is the same limit cycle.
 REACHED = 0.02
-# Distances between crossing states and the nearest that are kept scatter by this much where the states lie on one torus.
-SCATTER = 0.01
 # Crossing states in a row that have to be as close.
-LOOKS_NEAR = 4
+LOOKS_NEAR = 16
 
 
 class Attractor(eqx.Module):
-    """A limit cycle that is known: what trajectories are compared with."""
+    """A torus that is known: what trajectories are compared with."""
 
     # Deviations from equilibrium at crossings, weighted, see `Structure.weights`.
     crossings: Float[Array, "s state"]
@@ -53,11 +55,10 @@ class Attractor(eqx.Module):
 
 
 class Approach(eqx.Module):
-    """How near a trajectory has been to the known limit cycle lately."""
+    """How near a trajectory has been to the known torus lately."""
 
     seen: Float[Array, "k state"]  # the crossing states that were looked at last, newest first
     near: Int[Array, ""]  # crossing states in a row that were close
-    first: Float[Array, ""]  # relative distance of the first of these
 
 
 class Ensemble(NamedTuple):
@@ -77,11 +78,11 @@ def unknown(groups: int, size: int) -> Attractor:
 
 def no_approach(y: State) -> Approach:
     none = jnp.full((SEEN, y.shape[0]), jnp.nan, y.dtype)
-    return Approach(none, jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype))
+    return Approach(none, jnp.zeros((), jnp.int32))
 
 
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
-    """The crossing states and the amplitude (m/s) of the limit cycle that the ensemble has met on, if it has.
+    """Crossing states and the amplitude (m/s) of what the ensemble has met on, if it has and if that may be a torus.
 
     Members have met when all their crossing states of late are close to states that *others* were in some time ago. In
     between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
@@ -108,10 +109,29 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     states, before = (
         ensemble.deviations[part][:, members].reshape(-1, ensemble.deviations.shape[-1]) for part in (later, earlier)
     )
+    third = (later.stop - earlier.start) // 3
+    thirds = (slice(earlier.start, earlier.start + third), slice(later.stop - third, later.stop))
+    first, last = (np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in thirds)
+    if abs(last / first - 1) > KEEPS_SIZE:
+        return None
     # The more of them, the closer together they are on a torus.
     states = np.concatenate([before[_distance(states, before) <= REACHED], states])
-    chosen = np.linspace(0, len(states) - 1, KEPT).round().astype(int)
-    return states[chosen], float(np.max(ensemble.peaks[later][:, members]))
+    chosen = _spread(states)
+    return None if chosen is None else (states[chosen], float(np.max(ensemble.peaks[later][:, members])))
+
+
+def _spread(states: Float[np.ndarray, "m 2n"]) -> Int[np.ndarray, " KEPT"] | None:
+    """Places of states that lie as far from each other as can be; none where a few are close to all."""
+    size = np.mean(np.linalg.norm(states, axis=-1))
+    chosen = [0]
+    away = np.linalg.norm(states - states[0], axis=-1)
+    while len(chosen) < KEPT:
+        if len(chosen) == LEAST_SPREAD and np.max(away) < REACHED * size:
+            return None
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, np.linalg.norm(states - states[chosen[-1]], axis=-1))
+    # In no order: a sample of them is one of the whole set.
+    return np.array(chosen)[np.random.default_rng(0).permutation(KEPT)]
 
 
 def _distance(known: Float[np.ndarray, "k state"], states: Float[np.ndarray, "m state"]) -> Float[np.ndarray, " m"]:
@@ -126,9 +146,8 @@ def approached(approach: Approach, attractor: Attractor, crossing: State) -> tup
     apart = size - 2 * attractor.crossings @ crossing + jnp.sum(attractor.crossings**2, axis=-1)
     distance = jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size)
     close = attractor.known & (distance <= REACHED)
-    first = jnp.where(close & (approach.near == 0), distance, approach.first)
     near = jnp.where(close, approach.near + 1, 0)
-    reached = (near >= LOOKS_NEAR) & (distance <= jnp.maximum(first, SCATTER))
+    reached = near >= LOOKS_NEAR
     fresh = jnp.any(crossing != approach.seen[0])
-    look = Approach(jnp.concatenate([crossing[None], approach.seen[:-1]]), near, first)
+    look = Approach(jnp.concatenate([crossing[None], approach.seen[:-1]]), near)
     return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), look, approach), fresh & reached

@@ -1,0 +1,209 @@
+"""The attractors of a group: computed from where an ensemble of released trajectories nominates them.
+
+What is found depends on the group alone: on no trajectory of the map, nor on their number. Cycles are computed
+(`captures`); where none is found although the members stay in motion, the set that they have met on is tried as a torus: starts
+about it, further in and further out, must all come back to it.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..contact import Status
+from ..verdicts import ensemble as nominating
+from ..verdicts import tube
+from ..verdicts.verdict import Verdict
+from .captures import Cycle, captured, distinct, stable_cycles
+from .flattened import Flattened, flatten
+from .section import ReturnMaps, Section
+from .sharing import Batch
+
+# Looks at an ensemble after which cycles are computed from where its members are.
+NEWTON_AT = (24, 64, 128)
+# Returns over which a torus' mean period is taken.
+MEAN_OVER = 64
+# Mean periods from each start in which its peak is sought.
+PEAK_OVER = 4
+
+
+class Torus(NamedTuple):
+    """A set of crossing states about which everything was seen to come back."""
+
+    states: Float[np.ndarray, "k 2n"]  # weighted deviations
+    amplitude: float  # m/s
+    period: float  # mean time between crossings, s
+
+
+class Attractors(NamedTuple):
+    """What was found of a group."""
+
+    cycles: list[Cycle]
+    torus: Torus | None
+
+
+class Follower(NamedTuple):
+    """How trajectories are begun and followed (`rounds`)."""
+
+    begun: object
+    follow: object
+
+
+def search(
+    batch: Batch,
+    shared: Flattened,
+    maps: ReturnMaps,
+    rounds: Follower,
+    groups: Int[np.ndarray, " g"],
+    columns: Float[np.ndarray, "g h"],
+    report,
+    near: Float[np.ndarray, "g 2n"] | None = None,
+) -> list[Attractors]:
+    """The attractors of these groups. `columns` are the load's histories of any trajectory of each.
+
+    With `near`, states of the section, members begin about these instead of being released.
+    """
+    members = len(nominating.RELEASES)
+    own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
+    running, moving = np.arange(len(own)), np.ones(len(own), bool)
+    trajectories = rounds.begun(batch, shared, own, each, np.tile(nominating.RELEASES, len(groups)))
+    if near is not None:
+        starts = [_about(maps, state) for state in near]
+        trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.structure.normal)
+    most, size = max(nominating.TESTS), 2 * maps.structure.size
+    deviations = np.full((most, len(own), size), np.nan)
+    peaks, times, events = (np.full((most, len(own)), np.nan) for _ in range(3))
+    decay = shared.tree.modes.slowest_decay
+    found = [Attractors([], None) for _ in groups]
+    looks = 0
+
+    def met(k: int):
+        mine = slice(k * members, (k + 1) * members)
+        seen = (array[:looks, mine] for array in (deviations, peaks, times, events))
+        return nominating.met(nominating.Ensemble(*seen, moving[mine]), decay[groups[k]])
+
+    while len(running) and looks < most:
+        report(0)
+        trajectories.tree[1].recurrence.peak[:] = 0.0
+        rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
+        _, now = trajectories.tree
+        recent = slice(looks, looks + nominating.SEEN)
+        deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
+        peaks[recent, running], times[recent, running] = now.recurrence.peak, now.t
+        # As of the last of these looks: enough to tell whether there were any since the looks before.
+        events[recent, running] = now.events
+        looks += nominating.SEEN
+        moving[running] = now.verdict == Verdict.UNDECIDED
+        if looks in NEWTON_AT:
+            _add_cycles(maps, own, running, moving, now, found, members)
+        if looks in nominating.TESTS:
+            open_ = np.unique(running[moving[running]] // members)
+            sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
+            if sets:
+                _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, report)
+                done = [k for k, _ in sets if found[k].torus is not None]
+                moving[np.isin(np.arange(len(own)) // members, done)] = False
+        left = moving[running]
+        running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
+    return found
+
+
+def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int) -> None:
+    """Cycles where members are by now; those that are captured by them need not be followed any further."""
+    latest = np.array(now.recurrence.latest)
+    usable = moving[running] & np.all(np.isfinite(latest), axis=1) & (now.events > 0)
+    at = section_of(now)
+
+    def take_captured():
+        known = [(np.flatnonzero(usable & (running // members == k)), c) for k, a in enumerate(found) for c in a.cycles]
+        inside = captured(maps, own[running], at, latest, known) >= 0
+        moving[running[inside]] = False
+        return usable & ~inside
+
+    left = take_captured() if any(a.cycles for a in found) else usable
+    picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), running // members, left)
+    if not len(picked):
+        return
+    new = stable_cycles(maps, own[running[picked]], at.rows(picked))
+    for _, rows, cycle in new:
+        mine = found[running[picked[rows[0]]] // members].cycles
+        if not any(same_cycle(maps, cycle, other) for other in mine):
+            mine.append(cycle)
+    if new:
+        take_captured()
+
+
+def same_cycle(maps: ReturnMaps, one: Cycle, other: Cycle) -> bool:
+    """Whether two cycles of a group are the same."""
+    size = np.linalg.norm(maps.weights * one.points[0])
+    apart = np.min(np.linalg.norm(maps.weights * (other.points - one.points[0]), axis=1))
+    return len(one.points) == len(other.points) and bool(apart < 1e-6 * size)
+
+
+def section_of(now) -> Section:
+    """Where trajectories are."""
+    return Section(np.array(now.y), np.array(now.contact.status), np.array(now.contact.direction))
+
+
+def _add_tori(batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, report) -> None:
+    """Which of the sets that ensembles have met on (with the group's place) are tori."""
+    structure, weights = maps.structure, maps.weights
+    starts = [_about(maps, states[:: len(states) // tube.STARTS] / weights) for _, (states, _) in sets]
+    count = tube.STARTS
+    own = np.repeat([groups[k] for k, _ in sets], count)
+    each = np.repeat(np.stack([columns[k] for k, _ in sets]), count, axis=0)
+    y = np.concatenate(starts) / weights
+    trajectories = _at(rounds.begun(batch, shared, own, each, np.ones(len(own))), y, structure.normal)
+    running, ok = np.arange(len(own)), np.ones(len(sets), bool)
+    home = np.zeros(len(sets), bool)
+    last = Section(np.zeros_like(y), np.zeros(len(y), np.int32), np.ones(len(y)))
+    ends = np.full((tube.HOME, len(own), y.shape[1]), np.nan)
+    for looks in range(nominating.SEEN, tube.MOST_LOOKS + 1, nominating.SEEN):
+        report(0)
+        rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
+        _, now = trajectories.tree
+        ends = np.roll(ends, -nominating.SEEN, axis=0)
+        ends[-nominating.SEEN :, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
+        # One that slides, or fails, has not come back.
+        ok[np.unique(running[now.verdict != Verdict.UNDECIDED] // count)] = False
+        if looks % tube.HOME == 0 and looks >= tube.LEAST_LOOKS:
+            for k in np.unique(running // count):
+                home[k] = tube.all_home(sets[k][1][0], ends[:, k * count : (k + 1) * count])
+        for whole, part in zip(last, section_of(now), strict=True):
+            whole[running] = part
+        left = (ok & ~home)[running // count]
+        running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
+        if not len(running):
+            break
+    tori = np.flatnonzero(home & ok)
+    if not len(tori):
+        return
+    rows = (count * tori[:, None] + np.arange(count)).ravel()
+    image = maps.returns(own[rows[::count]], last.rows(rows[::count]), MEAN_OVER)
+    period = image.time / MEAN_OVER
+    peaks = maps.peaks(own[rows], last.rows(rows), np.repeat(PEAK_OVER * period, count)).reshape(-1, count)
+    for k, mean, peak in zip(tori, period, peaks, strict=True):
+        place, (states, _) = sets[k]
+        if np.isfinite(mean) and np.all(np.isfinite(peak)):
+            found[place] = found[place]._replace(torus=Torus(states, float(np.max(peak)), float(mean)))
+
+
+def _about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
+    """Weighted starts on the edge of the tube about states of the section, or about one."""
+    structure = maps.structure
+    velocity, rate = structure.size + structure.tangential, structure.size + structure.normal
+    return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate)
+
+
+def _section_at(y, normal: int) -> Section:
+    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
+    return Section(y, status, np.ones(len(y)))
+
+
+def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int) -> Flattened:
+    """Trajectories that have begun, put to these states of the section."""
+    columns, now = begun.tree
+    contact = eqx.tree_at(lambda c: c.status, now.contact, _section_at(y, normal).status.astype(now.contact.status.dtype))
+    return flatten(jax.tree.map(np.asarray, (columns, eqx.tree_at(lambda n: (n.y, n.contact), now, (y, contact)))))

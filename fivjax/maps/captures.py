@@ -1,0 +1,207 @@
+"""Stable cycles of many groups, computed side by side from where trajectories nominate them, and who is captured by them.
+
+The return map is evaluated for many points of many groups in one batch: for Newton's method with its derivative, for
+neighbourhoods (`verdicts.capture`) and for crossings of trajectories without. Everything else is small linear algebra.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..cycles.closing import CLOSED, EXACT
+from ..verdicts.capture import LARGEST, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
+from .section import SEGMENTS, ReturnMaps, Section
+
+# A motion that comes back to within this share of its size after some crossings may be near a cycle.
+NEARLY = 0.1
+MOST_CROSSINGS = 8
+NEWTON_STEPS = 12
+# Points of the section that a group nominates at a time.
+NOMINATED = 4
+# The same cycle: a state this close to one of its own, relative to their size.
+SAME = 1e-6
+# How well crossings are known that tell which trajectories to ask, relative to the cycle's size.
+KNOWN_TO = 0.01
+
+
+class Cycle(NamedTuple):
+    """A stable periodic cycle of a group, with the neighbourhood in which it captures."""
+
+    points: Float[np.ndarray, "k 2n"]  # its states on the section, in order; the first is the neighbourhood's centre
+    period: float  # s
+    multiplier: float  # the size of the largest, but the one of the cycle's own direction
+    amplitude: float  # m/s
+    neighbourhood: Neighbourhood
+
+
+def stable_cycles(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> list[tuple[int, Int, Cycle]]:
+    """The stable cycles that motions from these states are near to: of each the group, the rows that led to it, and it."""
+    weights = maps.weights
+    paths = [at]
+    for _ in range(MOST_CROSSINGS + 1):
+        paths.append(maps.returns(group, paths[-1], 1).at)
+    path = weights * np.stack([p.y for p in paths[1:]], axis=1)  # [row, crossing, coordinate]
+    last, size = path[:, -1], np.linalg.norm(path[:, -1], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        back = np.linalg.norm(path[:, -2::-1] - last[:, None], axis=-1) / size[:, None]
+        nearest = back.min(axis=1)
+        lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
+        near = np.flatnonzero(np.isfinite(size) & (size > 0) & (nearest <= NEARLY))
+    if not len(near):
+        return []
+    now, lag = paths[-1].rows(near), lag[near]
+    closed = _closed(maps, group[near], now, lag)
+    # Of those that are the same, the first stands for all.
+    kept: list[int] = []
+    rows_of: list[list[int]] = []
+    for row in np.flatnonzero(closed.residual <= CLOSED):
+        size = np.linalg.norm(weights * closed.y[row])
+        for k, other in enumerate(kept):
+            same = group[near[other]] == group[near[row]] and lag[other] == lag[row]
+            if same and np.linalg.norm(weights * (closed.y[other] - closed.y[row])) < SAME * size:
+                rows_of[k].append(near[row])
+                break
+        else:
+            kept.append(row)
+            rows_of.append([near[row]])
+    attempts = [_trial(maps, closed, now, row) for row in kept]
+    stable = [k for k, attempt in enumerate(attempts) if attempt is not None and closed.segments[kept[k]] <= SEGMENTS - 4]
+    if not stable:
+        return []
+    chosen = np.array([kept[k] for k in stable])
+    own, centre = group[near[chosen]], Section(closed.y, now.status, now.direction).rows(chosen)
+    neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable])
+    amplitude = maps.peaks(own, centre, closed.period[chosen])
+    points, here = [centre.y], centre
+    for _ in range(int(np.max(lag[chosen])) - 1):
+        here = maps.returns(own, here, 1).at
+        points.append(here.y)
+    found = []
+    for k, (place, row) in enumerate(zip(stable, chosen, strict=True)):
+        if neighbourhoods[k] is not None:
+            largest = float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row]))))
+            states = np.stack([p[k] for p in points[: lag[row]]])
+            cycle = Cycle(states, float(closed.period[row]), largest, float(amplitude[k]), neighbourhoods[k])
+            found.append((int(own[k]), np.array(rows_of[place]), cycle))
+    return found
+
+
+class _Closed(NamedTuple):
+    y: Float[np.ndarray, "m 2n"]
+    residual: Float[np.ndarray, " m"]
+    jacobian: Float[np.ndarray, "m 2n 2n"]
+    period: Float[np.ndarray, " m"]
+    segments: Int[np.ndarray, " m"]
+
+
+def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
+    """Newton's method for all rows at once; a row that does not get closer is given up."""
+    weights = maps.weights
+    y, n = now.y.copy(), now.y.shape[1]
+    closure = np.full(len(y), np.inf)
+    jacobian, period, segments = np.zeros((len(y), n, n)), np.zeros(len(y)), np.zeros(len(y), int)
+    best, running = y.copy(), np.arange(len(y))
+    for _ in range(NEWTON_STEPS):
+        if not len(running):
+            break
+        at = Section(y[running], now.status[running], now.direction[running])
+        image, derived = maps.derived(group[running], at, lag[running])
+        gap = image.at.y - at.y
+        with np.errstate(invalid="ignore", divide="ignore"):
+            missed = np.linalg.norm(weights * gap, axis=1) / np.linalg.norm(weights * at.y, axis=1)
+            better = missed < closure[running]
+        better &= (image.at.status == at.status) & (image.at.direction == at.direction)
+        better &= np.all(np.isfinite(derived), axis=(1, 2))
+        rows = running[better]
+        closure[rows], best[rows], jacobian[rows] = missed[better], at.y[better], derived[better]
+        period[rows], segments[rows] = image.time[better], image.segments[better]
+        matrices = np.eye(n) - derived[better]
+        solvable = np.abs(np.linalg.det(matrices)) > 0
+        matrices[~solvable] = np.eye(n)
+        y[rows] = at.y[better] + np.linalg.solve(matrices, gap[better][..., None])[..., 0]
+        running = rows[solvable & (missed[better] > EXACT)]
+    return _Closed(best, closure, jacobian, period, segments)
+
+
+def _trial(maps: ReturnMaps, closed: _Closed, now: Section, row: int) -> Trial | None:
+    structure = maps.structure
+    status, direction = int(now.status[row]), float(now.direction[row])
+    free = free_on_section(structure.size, structure.tangential, structure.normal, status)
+    return trial(closed.y[row], status, direction, closed.jacobian[row], maps.weights, free)
+
+
+def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial]) -> list[Neighbourhood | None]:
+    """`verdicts.capture.neighbourhood` of several cycles at once."""
+    radius = [attempt.largest for attempt in trials]
+    found: list[Neighbourhood | None] = [None] * len(trials)
+    open_ = list(range(len(trials)))
+    while open_:
+        states = [trials[k].states(radius[k]) for k in open_]
+        counts = np.array([len(part) for part in states])
+        at = Section(
+            np.concatenate(states),
+            np.repeat([trials[k].status for k in open_], counts),
+            np.repeat([trials[k].direction for k in open_], counts),
+        )
+        image = maps.returns(np.repeat(group[open_], counts), at, np.repeat(crossings[open_], counts))
+        images = Returned(*image.at, image.events)
+        ends, still = np.cumsum(counts), []
+        for k, start, end in zip(open_, ends - counts, ends, strict=True):
+            found[k] = trials[k].passed(radius[k], Returned(*(part[start:end] for part in images)))
+            if found[k] is None:
+                radius[k] *= 0.5
+                if radius[k] >= SMALLEST / LARGEST * trials[k].largest:
+                    still.append(k)
+        open_ = still
+    return found
+
+
+def captured(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    latest: Float[np.ndarray, "m 2n"],
+    known: list[tuple[Int[np.ndarray, " r"], Cycle]],
+) -> Int[np.ndarray, " m"]:
+    """Which cycle each trajectory has entered the neighbourhood of, by its place in `known`; -1 where none.
+
+    `known` are cycles, each with the rows of the trajectories that it may have captured; `latest` their last crossings as
+    far as their stepper knows them, good enough to tell which ones to ask. What counts is where the exact return map leads
+    from where they are now (`at`).
+    """
+    weights = maps.weights
+    which = np.full(len(group), -1)
+    asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for place, (rows, cycle) in enumerate(known):
+        n = cycle.neighbourhood
+        with np.errstate(invalid="ignore"):
+            apart = np.linalg.norm(weights * (latest[rows][:, None] - cycle.points), axis=2)
+            close = apart.min(axis=1) <= n.radius + KNOWN_TO * np.linalg.norm(weights * n.centre)
+        chosen = rows[close]
+        if len(chosen):
+            crossings = len(cycle.points) - apart[close].argmin(axis=1)
+            asked.append((chosen, crossings, np.full(len(chosen), place)))
+    if not asked:
+        return which
+    rows, crossings, places = (np.concatenate(parts) for parts in zip(*asked, strict=True))
+    image = maps.returns(group[rows], at.rows(rows), crossings).at
+    for place in np.unique(places):
+        one = places == place
+        inside = known[place][1].neighbourhood.contains(image.y[one], image.status[one], image.direction[one])
+        which[rows[one][inside]] = place
+    return which
+
+
+def distinct(states: Float[np.ndarray, "m 2n"], group, chosen: Bool[np.ndarray, " m"]) -> Int[np.ndarray, " r"]:
+    """A few of the chosen rows of each group, far from each other."""
+    picked: list[int] = []
+    for g in np.unique(group[chosen]):
+        rows = np.flatnonzero(chosen & (group == g))
+        mine = [rows[0]]
+        away = np.linalg.norm(states[rows] - states[rows[0]], axis=1)
+        while len(mine) < min(NOMINATED, len(rows)):
+            mine.append(rows[np.argmax(away)])
+            away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
+        picked += mine
+    return np.array(picked, int)

@@ -1,0 +1,130 @@
+"""The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
+
+The programs here know nothing of a map's axes: all maps of structures of one size and friction of one kind share them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..contact import Contact
+from ..cycles.around import once_around, peak_speed
+from ..cycles.section_map import Point, moved
+from ..foundation.compiling import compiled
+from ..steppers.event_exact import EventExact
+from .blocks import in_blocks
+from .flattened import Flattened, flatten
+from .sharing import Batch
+
+# States in a block: few, because often there are few.
+BLOCK = 64
+DERIVED_BLOCK = 16
+# Segments of a cycle among which its peak is sought.
+SEGMENTS = 64
+
+
+class Section(NamedTuple):
+    """States on the section or on the way to it, in rows; deviations from the sliding equilibrium."""
+
+    y: Float[np.ndarray, "m 2n"]
+    status: Int[np.ndarray, " m"]
+    direction: Float[np.ndarray, " m"]
+
+    def rows(self, chosen) -> "Section":
+        return Section(*(part[chosen] for part in self))
+
+
+class Images(NamedTuple):
+    """Where the return map leads from several states; NaN where the section is not met."""
+
+    at: Section
+    events: Int[np.ndarray, " m"]  # contact events on the way
+    segments: Int[np.ndarray, " m"]
+    time: Float[np.ndarray, " m"]  # s
+    peak: Float[np.ndarray, " m"]  # largest tangential speed at the ends of segments, m/s
+
+
+class ReturnMaps:
+    """The return maps of all groups of a batch."""
+
+    def __init__(self, batch: Batch, shared: Flattened):
+        tree = shared.tree
+        self.mechanics = flatten((tree.mechanics, np.asarray(tree.longest_return)))
+        self.pool = batch.pool
+        self.structure = batch.scene.structure
+        self.weights = np.asarray(batch.scene.structure.weights)
+
+    def returns(self, group, at: Section, crossings) -> Images:
+        """The `crossings`-th crossing from each row."""
+        found = in_blocks(_returned, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=BLOCK).tree
+        return _images(found)
+
+    def derived(self, group, at: Section, crossings) -> tuple[Images, Float[np.ndarray, "m 2n 2n"]]:
+        """The same, and the return map's derivatives."""
+        rows = _rows(at, crossings)
+        found, derivatives = in_blocks(
+            _derived, self.mechanics, group, rows, 1, self.pool, size=DERIVED_BLOCK
+        ).tree
+        return _images(found), derivatives
+
+    def peaks(self, group, at: Section, period) -> Float[np.ndarray, " m"]:
+        """The largest tangential speed (m/s) in a time `period` from each row."""
+        return in_blocks(_peaks, self.mechanics, group, _rows(at, period, float), 1, self.pool, size=DERIVED_BLOCK).tree
+
+
+def _rows(at: Section, last, kind: type = np.int32) -> Flattened:
+    status, direction = np.asarray(at.status, np.int32), np.asarray(at.direction, float)
+    return flatten((np.asarray(at.y), status, direction, np.broadcast_to(np.asarray(last, kind), status.shape).copy()))
+
+
+def _images(found) -> Images:
+    y, status, direction, *rest = found
+    return Images(Section(y, status, direction), *rest)
+
+
+def _one(shared, y, status, direction, crossings):
+    mechanics, longest = shared
+    point = Point(y, Contact(status.astype(jnp.int32), direction))
+    found = moved(EventExact(), mechanics, point, crossings, longest * crossings)
+    y = jnp.where(found.arrived, found.point.y, jnp.nan)
+    contact = found.point.contact
+    return y, contact.status, contact.direction, found.events, found.segments, found.time, found.peak
+
+
+def _of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
+    of_group = jax.vmap(one, in_axes=(None, 0, 0, 0, 0))
+    return flatten(jax.vmap(of_group)(shared.tree, *rows.tree), row_axes=2)
+
+
+@compiled
+def _returned(shared: Flattened, rows: Flattened) -> Flattened:
+    return _of_block(_one, shared, rows)
+
+
+@compiled
+def _derived(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared, y, *row):
+        def along(direction):
+            def state(y):
+                found = _one(shared, y, *row)
+                return found[0], found
+
+            _, tangent, found = jax.jvp(state, (y,), (direction,), has_aux=True)
+            return found, tangent
+
+        return jax.vmap(along, out_axes=(None, 1))(jnp.eye(y.shape[0], dtype=y.dtype))
+
+    return _of_block(one, shared, rows)
+
+
+@compiled
+def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared, y, status, direction, period):
+        mechanics, _ = shared
+        point = Point(y, Contact(status.astype(jnp.int32), direction))
+        return peak_speed(EventExact(), mechanics, once_around(EventExact(), mechanics, point, period, SEGMENTS))
+
+    return _of_block(one, shared, rows)
