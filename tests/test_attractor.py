@@ -1,13 +1,25 @@
-"""Limit cycles that ensembles meet on, and trajectories that come to them."""
+"""Attractors of a map: what ensembles nominate, what is computed and checked of it, and which trajectories it captures."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 import fivjax as fj
-from fivjax.maps import rounds
-from fivjax.verdicts.ensemble import KEPT, REACHED, SEEN, Approach, Attractor, Ensemble, approached, met, no_approach
+from fivjax.verdicts import tube
+from fivjax.verdicts.ensemble import (
+    KEPT,
+    LOOKS_NEAR,
+    REACHED,
+    SEEN,
+    Approach,
+    Attractor,
+    Ensemble,
+    approached,
+    met,
+    no_approach,
+)
 
 LOOKS, MEMBERS, DECAY = 60, 16, 1.0
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -33,6 +45,11 @@ def test_members_from_inside_and_outside_meet_on_a_torus():
     assert states.shape == (KEPT, 2)
     np.testing.assert_allclose(np.hypot(states[:, 0] - 4, states[:, 1]), 0.5, atol=1e-4)
     assert amplitude == pytest.approx(4.5, abs=0.01)
+
+
+def test_members_that_meet_on_one_point_nominate_no_torus():
+    """A periodic motion, or the ghost of one: nearly the same state again and again. Those are computed, or nothing."""
+    assert met(ensemble(settling(0.4, final=0.01)), DECAY) is None
 
 
 def test_members_on_circles_of_their_own_have_not_met():
@@ -64,7 +81,7 @@ def test_too_few_members_or_too_short_a_time_prove_nothing():
 
 
 def looks_until_reached(distances):
-    """The look at which a trajectory has reached a cycle of one crossing state, seen at these relative distances from it."""
+    """The look at which a trajectory has reached a torus of one crossing state, seen at these relative distances from it."""
     with jax.enable_x64(True):
         attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0))
         approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
@@ -76,41 +93,110 @@ def looks_until_reached(distances):
     return None
 
 
-def test_a_trajectory_that_stays_close_has_reached_it():
-    assert looks_until_reached([0.3, 0.1, 0.019, 0.015, 0.01, 0.005, 0.002]) == 5
+def test_a_trajectory_that_stays_in_the_tube_is_captured():
+    near = REACHED * (0.9 - 0.5 * np.arange(LOOKS_NEAR + 2) / LOOKS_NEAR)
+    assert looks_until_reached([0.3, 0.1, *near]) == LOOKS_NEAR + 1
 
 
-def test_a_trajectory_that_passes_by_or_recedes_has_not():
-    assert looks_until_reached([0.3, 0.019, 0.015, 0.018, 0.03] * 3) is None
-    assert looks_until_reached(0.011 * 1.1 ** np.arange(6)) is None
-    assert looks_until_reached([0.021] * 20) is None and REACHED < 0.021
+def test_a_trajectory_that_passes_through_the_tube_is_not():
+    assert looks_until_reached([0.3, *[0.019] * (LOOKS_NEAR - 1), 0.03] * 3) is None
+    assert looks_until_reached([0.021] * 40) is None and REACHED < 0.021
 
 
 def test_the_same_crossing_state_is_looked_at_once():
     """A slow method looks many times between two crossings."""
-    assert looks_until_reached([0.01] * 20) is None
+    assert looks_until_reached([0.01] * 40) is None
 
 
 def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
         unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0))
-        near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(9), jnp.asarray(0.0))
+        near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(99))
         assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
 
 
-def test_known_limit_cycles_change_no_verdict(paper_scene, monkeypatch):
-    """A map with trajectories enough to be worth an ensemble, and its halves, whose trajectories see their own orbits return."""
-    axes = {"mu": [0.1, 0.16, 0.22], "p": np.linspace(1.05, 3.9, 36)}
-    assert len(axes["p"]) // 2 < rounds.WORTH_KNOWING <= len(axes["p"])
-    monkeypatch.setattr(rounds, "ENSEMBLES", 2)  # the three are not followed at once
+def circle(radius=0.5, count=KEPT):
+    """Weighted states (displacement, gap, velocity, rate of the gap) in contact on a closed curve, in no order."""
+    angle = 2 * np.pi * GOLDEN * np.arange(count)
+    zero = np.zeros(count)
+    return np.stack([2 + radius * np.cos(angle), zero, radius * np.sin(angle), zero], axis=-1)
+
+
+def test_the_tube_is_entered_from_all_sides_on_its_edge():
+    """Starts lie at the tube's radius, inwards and outwards among them; contact and the section hold."""
+    states = circle()
+    starts = tube.starts(states[:, [0, 2, 1, 3]], velocity=2, gap=1, gap_rate=3)
+    size = np.mean(np.linalg.norm(states, axis=1))
+    assert np.all(starts[:, 2] == 0) and len(starts) == tube.STARTS
+    contact = tube.starts(states, velocity=3, gap=1, gap_rate=1)
+    assert np.all(contact[:, [1, 3]] == 0)
+    apart = np.linalg.norm(contact[:, None] - states, axis=-1)
+    chosen = states[np.linspace(0, KEPT - 1, tube.STARTS).round().astype(int)]
+    np.testing.assert_allclose(np.linalg.norm(contact - chosen, axis=1), tube.RADIUS * size)
+    assert apart.min(axis=1).max() > 0.5 * tube.RADIUS * size
+    radial = np.linalg.norm(contact, axis=1) - np.linalg.norm(chosen, axis=1)
+    assert np.sum(radial > 0.99 * tube.RADIUS * size) >= 4 and np.sum(radial < -0.99 * tube.RADIUS * size) >= 4
+
+
+def test_all_have_to_be_home_and_not_nearly_all():
+    states = circle()
+    size = np.mean(np.linalg.norm(states, axis=1))
+    ends = np.stack([states[: 5 * tube.HOME].reshape(tube.HOME, 5, 4)] * 2, axis=1).reshape(tube.HOME, 10, 4)
+    assert tube.all_home(states, ends)
+    ends[3, 7, 1] = 0.6 * tube.RADIUS * size
+    assert not tube.all_home(states, ends)
+    assert not tube.all_home(states, np.where(ends == ends[3, 7, 1], np.nan, ends))
+
+
+def paper(mu, v, **parts):
+    return fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(mu), v, fj.Pulse(100.0, 1.2))
+
+
+@pytest.mark.parametrize("count", [31, 32])
+def test_the_ghost_of_a_fold_is_no_limit_cycle(count):
+    """Just below the fold of the paper's cycle at 1 m/s everything slides, and lingers where the cycle was; however many."""
+    m = fj.bistability_map(paper(0.163, 1.0), p=np.linspace(3.0, 6.0, count), progress=False)
+    assert np.all(m["verdict"] == fj.Verdict.SLIDING)
+    assert m.sizes["attractors"] == 0 and np.all(m["attractor"] == -1)
+
+
+@pytest.mark.parametrize("count", [31, 32])
+def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
+    """At 0.5 m/s cycles coexist; those kicked like this end on the smaller one, whoever stands beside them."""
+    m = fj.bistability_map(paper(0.227, 0.5), p=np.linspace(1.0537, 1.0545, count), progress=False)
+    assert np.all(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
+    theirs = reference.fate([{**reference.of_scene(paper(0.227, 0.5)), "p": 1.054}])
+    assert theirs.fate[0] == "sustained"
+    np.testing.assert_allclose(m["amplitude"], theirs.amplitude[0], rtol=1e-4)
+    assert m["attractor_amplitude"].item() == m["amplitude"].values[0]
+    assert m["attractor_kind"].values.tolist() == ["periodic"]
+    assert 0 < m["attractor_multiplier"].item() < 1 and np.all(m["attractor"] == 0)
+
+
+def test_a_slow_fade_near_the_stability_limit_is_no_limit_cycle():
+    """Friction close to its critical value takes nearly all damping from sliding; this one squeals for two seconds."""
+    scene = paper(0.0981, 1.0, m1=1.2, m2=0.014, c1=29.0, c2=0.125, k1=56.8e3, k2=61.4e3, theta=0.1)
+    m = fj.bistability_map(scene, p=[2.0], progress=False)
+    assert m["verdict"].item() == fj.Verdict.SLIDING
+    assert m["last_event"].item() == pytest.approx(1.932, abs=1e-3)
+
+
+def test_no_critical_perturbation_is_invented_below_the_fold():
+    found = fj.critical_perturbation(paper(0.163, 1.0), p_range=(2.4, 2.6), progress=False)
+    assert np.isnan(found["p_crit"].item()) and found["only_crossing"].item()
+
+
+def test_the_papers_torus_captures_and_a_row_alone_is_the_row_of_a_map(paper_scene):
+    """At 3 m/s the limit cycle beats. A map of one row has the same cells as that row of a map; and the oracle's amplitude."""
+    axes = {"mu": [0.15, 0.227], "p": [1.02, 1.1, 1.5, 2.5]}
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
-    halves = [fj.bistability_map(paper_scene, progress=False, mu=axes["mu"], p=axes["p"][k::2]) for k in (0, 1)]
-    verdict, amplitude, when = (
-        whole[name].transpose("mu", "p").values for name in ("verdict", "amplitude", "decided_at")
+    assert whole["attractor_kind"].values.tolist() == ["torus", "torus"]
+    row = fj.bistability_map(paper_scene, progress=False, **{**axes, "mu": [0.227]})
+    for name in ("verdict", "amplitude", "decided_at", "last_event"):
+        np.testing.assert_allclose(row[name].sel(mu=0.227), whole[name].sel(mu=0.227), rtol=1e-9, err_msg=name)
+    assert row["verdict"].values.ravel().tolist() == [0, 0, 1, 1]
+    theirs = reference.fate(
+        [{**reference.of_scene(paper_scene), "mu": 0.227, "mu_static": 0.227, "p": p} for p in (1.1, 1.5)]
     )
-    for k, half in enumerate(halves):
-        np.testing.assert_array_equal(half["verdict"].transpose("mu", "p"), verdict[:, k::2])
-        np.testing.assert_allclose(half["amplitude"].transpose("mu", "p"), amplitude[:, k::2], rtol=0.01)
-    assert np.all(verdict >= 0)
-    alone = np.concatenate([half["decided_at"].values[half["verdict"].values == 1] for half in halves])
-    assert 0.6 * np.mean(alone) > np.mean(when[verdict == 1])
+    assert theirs.fate.tolist() == ["slides", "sustained"]
+    assert whole["amplitude"].sel(mu=0.227, p=1.5).item() == pytest.approx(theirs.amplitude[1], rel=0.01)

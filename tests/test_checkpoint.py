@@ -15,7 +15,7 @@ import fivjax as fj
 from fivjax import cli
 from fivjax.maps import engine, rounds
 from fivjax.maps import store as checkpoint
-from fivjax.maps.results import Verdicts, record
+from fivjax.maps.results import Ended, not_run, record
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 
@@ -72,18 +72,15 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
     """The verdict is written last: an interrupt before it leaves the trajectory as not run."""
 
     class Unreadable:
-        verdict = np.array([1])
         energy = None
 
         @property
-        def recurrence(self):
+        def t(self):
             raise KeyboardInterrupt
 
-    verdicts = Verdicts(
-        np.full(1, fj.Verdict.NOT_RUN, np.int8), np.ones(1), np.ones(1), np.ones(1, np.int32), np.ones(1), {}
-    )
+    verdicts, none = not_run(1, energy=False), np.full(1, np.nan)
     with pytest.raises(KeyboardInterrupt):
-        record(verdicts, np.array([0]), Unreadable())
+        record(verdicts, np.array([0]), Unreadable(), Ended(np.array([1]), np.array([0]), none, none, none))
     assert verdicts.verdict[0] == fj.Verdict.NOT_RUN
 
 

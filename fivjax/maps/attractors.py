@@ -5,6 +5,7 @@ What is found depends on the group alone: on no trajectory of the map, nor on th
 about it, further in and further out, must all come back to it.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from .section import ReturnMaps, Section
 from .sharing import Batch
 
 # Looks at an ensemble after which cycles are computed from where its members are.
-NEWTON_AT = (24, 64, 128)
+NEWTON_AT = (24, 64, 128, 256, 512)
 # Returns over which a torus' mean period is taken.
 MEAN_OVER = 64
 # Mean periods from each start in which its peak is sought.
@@ -47,8 +48,8 @@ class Attractors(NamedTuple):
 class Follower(NamedTuple):
     """How trajectories are begun and followed (`rounds`)."""
 
-    begun: object
-    follow: object
+    begun: Callable
+    follow: Callable
 
 
 def search(
@@ -81,8 +82,9 @@ def search(
 
     def met(k: int):
         mine = slice(k * members, (k + 1) * members)
-        seen = (array[:looks, mine] for array in (deviations, peaks, times, events))
-        return nominating.met(nominating.Ensemble(*seen, moving[mine]), decay[groups[k]])
+        whole = nominating.Ensemble(deviations, peaks, times, events, moving)
+        seen = nominating.Ensemble(*(part[:looks, mine] for part in whole[:-1]), moving=moving[mine])
+        return nominating.met(seen, decay[groups[k]])
 
     while len(running) and looks < most:
         report(0)
@@ -205,5 +207,7 @@ def _section_at(y, normal: int) -> Section:
 def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int) -> Flattened:
     """Trajectories that have begun, put to these states of the section."""
     columns, now = begun.tree
-    contact = eqx.tree_at(lambda c: c.status, now.contact, _section_at(y, normal).status.astype(now.contact.status.dtype))
+    contact = eqx.tree_at(
+        lambda c: c.status, now.contact, _section_at(y, normal).status.astype(now.contact.status.dtype)
+    )
     return flatten(jax.tree.map(np.asarray, (columns, eqx.tree_at(lambda n: (n.y, n.contact), now, (y, contact)))))

@@ -66,7 +66,9 @@ def stable_cycles(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -
             kept.append(row)
             rows_of.append([near[row]])
     attempts = [_trial(maps, closed, now, row) for row in kept]
-    stable = [k for k, attempt in enumerate(attempts) if attempt is not None and closed.segments[kept[k]] <= SEGMENTS - 4]
+    stable = [
+        k for k, attempt in enumerate(attempts) if attempt is not None and closed.segments[kept[k]] <= SEGMENTS - 4
+    ]
     if not stable:
         return []
     chosen = np.array([kept[k] for k in stable])

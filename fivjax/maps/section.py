@@ -65,9 +65,7 @@ class ReturnMaps:
     def derived(self, group, at: Section, crossings) -> tuple[Images, Float[np.ndarray, "m 2n 2n"]]:
         """The same, and the return map's derivatives."""
         rows = _rows(at, crossings)
-        found, derivatives = in_blocks(
-            _derived, self.mechanics, group, rows, 1, self.pool, size=DERIVED_BLOCK
-        ).tree
+        found, derivatives = in_blocks(_derived, self.mechanics, group, rows, 1, self.pool, size=DERIVED_BLOCK).tree
         return _images(found), derivatives
 
     def peaks(self, group, at: Section, period) -> Float[np.ndarray, " m"]:

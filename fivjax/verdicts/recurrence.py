@@ -1,4 +1,4 @@
-"""The recurrence test: the orbit is seen to return to its section.
+"""The recurrence test: the orbit is seen to return to its section. It nominates where a cycle is computed, and proves nothing.
 
 The state at successive upward zero crossings of the tangential velocity comes back to within a tolerance, at the same
 lag again and again, with contact events in between and without drifting off. Two kinds of return count:

@@ -1,9 +1,9 @@
 """The check that a motion which beats for ever is attracting: what starts in a tube about it comes back.
 
 Where a limit cycle has lost its stability to a torus, no state of the section repeats. The torus is then known by a set of its
-crossing states, and the proof is that of an attractor: starts that are displaced from the set by a fixed share of its size, in all
-directions and further in as well as further out, all come back to within half of that, and stay there for many crossings. Next
-to a slow fade, and next to the ghost of a fold, nothing comes back: what is further in goes in.
+crossing states, and the proof is that of an attractor: starts that are displaced from the set by a fixed share of its size, in
+all directions and further in as well as further out, all come back to within half of that, and stay there for many crossings.
+Next to a slow fade, and next to the ghost of a fold, nothing comes back: what is further in goes in.
 """
 
 import numpy as np
@@ -14,12 +14,10 @@ RADIUS = 0.04
 # Starts in it: one in four displaced outwards, one in four inwards, the others at random.
 STARTS = 16
 # Crossings in a row within half the tube, within so many crossings.
-HOME, LEAST_LOOKS, MOST_LOOKS = 16, 64, 192
+HOME, LEAST_LOOKS, MOST_LOOKS = 16, 64, 384
 
 
-def starts(
-    states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int
-) -> Float[np.ndarray, "m 2n"]:
+def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
     """States on the edge of the tube about weighted deviations `states`.
 
     `velocity`, `gap` and `gap_rate` are places of the tangential velocity, which is zero on the section, and of the normal
