@@ -2,8 +2,8 @@
 
 An *ensemble* per structure is released from rest under loads of different sizes. Its members have different energies;
 where they come to be where others were (`met`) may be an attractor, and never is an unstable cycle, which is met by nobody.
-That is no proof: the ghost of a fold is met by all that pass it. Cycles are computed from where members are (`maps.captures`), and a set
-on which nothing repeats is checked to be attracting (`tube`).
+That is no proof: the ghost of a fold is met by all that pass it. Cycles are computed from where members are
+(`maps.captures`), and a set on which nothing repeats is checked to be attracting (`tube`).
 
 A trajectory is on a torus once its crossing states, sixteen in a row, are in the tube about the set. A crossing is one of the
 tangential velocity through zero, upwards.
@@ -86,8 +86,8 @@ def no_approach(y: State) -> Approach:
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
     """Crossing states and the amplitude (m/s) of what the ensemble has met on, if it has and if that may be a torus.
 
-    Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago. In
-    between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
+    Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago.
+    In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
     1/s); theirs has changed in size by no more than a tenth of that.
     """
     looks = len(ensemble.times)
