@@ -61,13 +61,14 @@ class Scene(eqx.Module):
         arguments.real_number("restitution", restitution, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
         # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
-        friction, load = jax.tree.map(real_if_real, friction), jax.tree.map(real_if_real, load)
+        friction = jax.tree.map(real_if_real, friction)
+        own_load: AbstractLoad = jax.tree.map(real_if_real, load)
         friction.check()
-        load.check()
+        own_load.check()
         self.structure = structure
         self.friction = friction
         self.belt_speed = real(belt_speed)
-        self.load = load
+        self.load = own_load
         self.restitution = real(restitution)
         self.impact_law = impact_law
 
