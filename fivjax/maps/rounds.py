@@ -27,7 +27,7 @@ from .sharing import Batch, grouped, shared_by, with_values
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4
-# Those that are undecided later and seem to repeat ask for a cycle of their own, each time after so many times the steps.
+# Those that are undecided later ask for a cycle of their own, each time after so many times the steps.
 OWN_FROM, OWN_AGAIN = 16, 2
 # Ensembles that are followed at once: what is kept of them takes memory, some 0.1 MB each.
 ENSEMBLES = 128
@@ -126,8 +126,11 @@ class Basins:
                 self.torus_period[g] = one.torus.period
 
     def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, report) -> None:
-        """Computes cycles from where trajectories are that seem to repeat, each for itself; and a torus of their group."""
-        asking = np.flatnonzero(now.recurrence.returned & (now.events > 0))
+        """Computes cycles from where trajectories are, each for itself; and a torus of their group.
+
+        Not only those that repeat to the last digits are asked: a motion that closes in slowly is near its cycle long before.
+        """
+        asking = np.flatnonzero(np.all(np.isfinite(np.array(now.recurrence.latest)), axis=1) & (now.events > 0))
         if not len(asking) or self.maps is None:
             return
         at = attractors.section_of(now).rows(asking)
