@@ -5,8 +5,8 @@ from .calibration.fit import calibrate as calibrate
 from .calibration.result import Calibration as Calibration
 from .contact import Status as Status
 from .cycles.cycle import LimitCycle as LimitCycle
-from .cycles.cycle_derivatives import CycleDerivatives as CycleDerivatives
-from .cycles.cycle_derivatives import cycle_derivatives as cycle_derivatives
+from .cycles.differentiation import CycleDerivatives as CycleDerivatives
+from .cycles.differentiation import cycle_derivatives as cycle_derivatives
 from .cycles.saddle import saddle_cycle as saddle_cycle
 from .cycles.search import NoLimitCycle as NoLimitCycle
 from .cycles.search import limit_cycle as limit_cycle

@@ -24,7 +24,7 @@ def prepared_for(method, scene):
 @eqx.filter_jit
 def advanced(method, prepared, scene, contact, y, t, t1):
     end = jnp.minimum(next_step_end(scene.load, t, method.dt), t1)
-    after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t)
+    after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t, True)
     return after, jnp.where(after.h >= end - t, end, t + after.h)
 
 

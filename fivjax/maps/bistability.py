@@ -18,7 +18,7 @@ from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from . import store as checkpoint
-from .attractor_table import attractor_table
+from .attractors_listed import attractor_table
 from .axes import add_linear_limit, check_run, checked_axes
 from .crossing import first_crossings
 from .engine import MOST_STEPS, run_to_verdict
