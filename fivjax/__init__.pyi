@@ -22,6 +22,10 @@ from .maps.bistability import bistability_map as bistability_map
 from .maps.threshold import critical_perturbation as critical_perturbation
 from .maps.tradeoff_study import tradeoff as tradeoff
 from .model.belt import belt_oscillator as belt_oscillator
+from .model.contact_coordinates import in_contact_coordinates as in_contact_coordinates
+from .model.contact_point import ContactPoint as ContactPoint
+from .model.delassus_matrix import Delassus as Delassus
+from .model.delassus_matrix import delassus as delassus
 from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import Coulomb as Coulomb
 from .model.friction import ExponentialDecay as ExponentialDecay

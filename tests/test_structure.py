@@ -325,10 +325,10 @@ def test_structure_refuses_bad_load_directions(value, error, fragments):
 @pytest.mark.parametrize(
     ("value", "error", "shown"),
     [(3, ValueError, "is 3"), (-1, ValueError, "is -1"), (1.0, TypeError, "1.0 (float)"), (True, TypeError, "True (bool)"),
-     ("y2", TypeError, "'y2' (str)"), (None, TypeError, "None")],
+     ("y2", ValueError, "'y2'"), (None, TypeError, "None")],
 )  # fmt: skip
 def test_structure_refuses_bad_indices(name, value, error, shown):
-    """Negative, too large and non-integer indices are refused: they would put the contact on another coordinate."""
+    """Negative, too large and non-integer indices and unknown names are refused: they would put the contact on another coordinate."""
     with pytest.raises(error, match=rf"`{name}` must be .*{re.escape(shown)}") as refusal:
         fj.Structure(**GOOD, **{name: value})
     assert sentence(str(refusal.value))

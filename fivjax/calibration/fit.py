@@ -17,7 +17,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..io.recordings import Averaged, Recording, averaged
 from ..linear.linearisation import linear_sliding
-from ..model.scene import Scene, sliding_equilibrium
+from ..model.scene import Scene, refuse_several_contacts, sliding_equilibrium
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .conclusion import concluded, not_tried
@@ -77,6 +77,7 @@ def calibrate(
     **Raises:** `ValueError` or `TypeError`, as a sentence, for names, bounds or channels that do not fit the scene.
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`calibrate`")
     recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, list | tuple) else data
     if not isinstance(recordings, tuple) or not recordings:
         raise TypeError(f"Argument `data` must be a Recording or a list of them, but is {arguments.describe(data)}.")

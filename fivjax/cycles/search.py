@@ -13,7 +13,7 @@ from ..contact import Contact, State, Status, status_from_forces
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
-from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
+from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, sliding_equilibrium
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
 from .closing import close
@@ -163,6 +163,7 @@ def _merged(parts: list[list[Met]]) -> list[Met]:
 
 def _check(scene: Scene) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "A search for limit cycles")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
 

@@ -7,7 +7,7 @@ import xarray as xr
 
 from ..foundation import arguments
 from ..linear.critical import critical_friction
-from ..model.scene import Scene
+from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
 
 
@@ -37,6 +37,7 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "A map")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t_max", t_max, above=0)
     arguments.real_number("memory", memory, above=0)

@@ -18,7 +18,7 @@ from ..io.datasets import labelled
 from ..linear.cea import eigenvalues
 from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
-from ..model.scene import Scene, refuse_painleve
+from ..model.scene import Scene, refuse_painleve, refuse_several_contacts
 from ..simulation.energy import Books
 from ..simulation.trajectory import start_state, states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
@@ -146,6 +146,7 @@ def table(dataset: xr.Dataset) -> str:
 
 def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`tradeoff`")
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
     for name, method in methods.items():

@@ -12,7 +12,9 @@ import numpy as np
 
 from ..foundation.quantities import QUANTITIES
 from .belt import belt_oscillator
+from .contact_point import ContactPoint
 from .friction import AbstractFriction
+from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad
 from .structure import Structure
 
@@ -26,15 +28,27 @@ def describe(scene) -> dict:
     structure = scene.structure
     return {
         "structure": getattr(structure.builder, "__name__", "Structure"),
-        "friction": type(scene.friction).__name__,
+        "friction": _laws(scene.friction),
         "load": type(scene.load).__name__,
         "impact_law": scene.impact_law,
         "parameters": {name: np.asarray(value).tolist() for name, value in scene.parameters.items()},
         **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
-        "tangential": structure.tangential,
-        "normal": structure.normal,
+        **_places(structure),
         "coordinates": list(structure.coordinates),
     }
+
+
+def _laws(friction: AbstractFriction) -> str | list[str]:
+    if isinstance(friction, FrictionPerContact):
+        return [type(law).__name__ for law in friction.laws]
+    return type(friction).__name__
+
+
+def _places(structure: Structure) -> dict:
+    pairs = [dict(zip(("tangential", "normal"), pair, strict=True)) for pair in structure.places]
+    if len(pairs) == 1 and structure.contacts_at_coordinates:
+        return pairs[0]
+    return {"contacts": pairs}
 
 
 def description_in(dataset) -> dict:
@@ -66,7 +80,7 @@ def arguments_of_scene(description: Mapping) -> dict:
     parameters = description["parameters"]
     return {
         "structure": _structure(description),
-        "friction": _part(AbstractFriction, "friction law", description["friction"], parameters),
+        "friction": _friction(description["friction"], parameters),
         "belt_speed": parameters["belt_speed"],
         "load": _part(AbstractLoad, "load", description["load"], parameters),
         "restitution": parameters["restitution"],
@@ -81,7 +95,19 @@ def _structure(description: Mapping) -> Structure:
         if set(names) <= set(description["parameters"]):
             return builder(**{name: description["parameters"][name] for name in names})
     places = {name: description[name] for name in ("tangential", "normal", "coordinates") if name in description}
+    if "contacts" in description:
+        places["contacts"] = [ContactPoint(pair["tangential"], pair["normal"]) for pair in description["contacts"]]
     return Structure(**{name: np.asarray(description[name]) for name in MATRICES}, **places)
+
+
+def _friction(name: str | list[str], parameters: Mapping):
+    if isinstance(name, str):
+        return _part(AbstractFriction, "friction law", name, parameters)
+
+    def own(i: int) -> dict:
+        return {key.removesuffix(f"_{i}"): value for key, value in parameters.items() if key.endswith(f"_{i}")}
+
+    return [_part(AbstractFriction, "friction law", law, own(i)) for i, law in enumerate(name)]
 
 
 def _part(kind: type, what: str, name: str, parameters: Mapping):
@@ -117,5 +143,6 @@ def as_table(scene) -> str:
     left = "style='text-align:left'"
     body = "".join(f"<tr>{''.join(f'<td {left}>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
     head = "".join(f"<th {left}>{title}</th>" for title in ("parameter", "meaning", "value", "unit"))
-    parts = f"{about['structure']}, {about['friction']}, {about['load']}; impact law “{about['impact_law']}”"
+    law = about["friction"] if isinstance(about["friction"], str) else ", ".join(about["friction"])
+    parts = f"{about['structure']}, {law}, {about['load']}; impact law “{about['impact_law']}”"
     return f"<b>Scene</b>: {html.escape(parts)}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

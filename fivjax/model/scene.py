@@ -1,6 +1,7 @@
 """A scene: a structure pressed onto a moving belt, with a friction law and a load."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -12,7 +13,9 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
+from .delassus_matrix import delassus, has_one_solution
 from .friction import AbstractFriction
+from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad, ConstantLoad
 from .printing import as_call
 from .sliding import sliding_load, sliding_matrices
@@ -27,10 +30,10 @@ class Scene(eqx.Module):
     **Arguments:**
 
     - `structure`: a `Structure`, for instance from `belt_oscillator()`.
-    - `friction`: `Coulomb` or `ExponentialDecay`.
-    - `belt_speed`: in m/s; sliding equilibrium needs one that is not zero.
+    - `friction`: `Coulomb` or `ExponentialDecay`; a list of laws for several contacts, one each.
+    - `belt_speed`: in m/s; sliding equilibrium needs one that is not zero. One number, or one for each contact.
     - `load`: `ConstantLoad` or `Pulse`.
-    - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1.
+    - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1. One number, or one for each contact.
     - `impact_law`: "coulomb", "frictionless" or "reset" (see `contact.impact`).
 
     **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
@@ -38,16 +41,16 @@ class Scene(eqx.Module):
 
     structure: Structure
     friction: AbstractFriction
-    belt_speed: Float[Array, ""]
+    belt_speed: Float[Array, "*contacts"]
     load: AbstractLoad
-    restitution: Float[Array, ""]
+    restitution: Float[Array, "*contacts"]
     impact_law: str = eqx.field(static=True)
 
     @in_double_precision
     def __init__(
         self,
         structure: Structure,
-        friction: AbstractFriction,
+        friction: AbstractFriction | Sequence[AbstractFriction],
         belt_speed=3.0,
         load: AbstractLoad | None = None,
         restitution=0.0,
@@ -55,10 +58,17 @@ class Scene(eqx.Module):
     ):
         load = ConstantLoad() if load is None else load
         arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+        count = len(structure.contacts)
+        if isinstance(friction, list | tuple):
+            friction = FrictionPerContact(friction)
         arguments.instance("friction", friction, AbstractFriction, "a friction law, such as Coulomb(mu=0.2)")
+        if isinstance(friction, FrictionPerContact) and len(friction.laws) != count:
+            raise ValueError(
+                f"Argument `friction` must be one law, or one for each of the {count} contacts, but holds {len(friction.laws)}."
+            )
         arguments.instance("load", load, AbstractLoad, "a load, such as Pulse(force=100.0, p=1.2)")
-        arguments.real_number("belt_speed", belt_speed)
-        arguments.real_number("restitution", restitution, minimum=0, maximum=1)
+        _each_number("belt_speed", belt_speed, count)
+        _each_number("restitution", restitution, count, minimum=0, maximum=1)
         arguments.one_of("impact_law", impact_law, IMPACT_LAWS)
         # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
         friction = jax.tree.map(real_if_real, friction)
@@ -76,6 +86,8 @@ class Scene(eqx.Module):
     def parameters(self) -> dict[str, Array]:
         """Every numeric parameter by the name that `replace` and the axes of a map know it by."""
         found = {"belt_speed": self.belt_speed, "restitution": self.restitution}
+        if isinstance(self.friction, FrictionPerContact):
+            found.update(self.friction.parameters)
         for part in (self.friction, self.load):
             # What else is in a law of the user's own, words and switches, is no parameter.
             found.update({name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)})
@@ -93,6 +105,8 @@ class Scene(eqx.Module):
             raise ValueError(f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}.")
 
         def rebuilt(part):
+            if isinstance(part, FrictionPerContact):
+                return part.replace(**changes)
             own = {name: value for name, value in vars(part).items() if value is not None}
             if not own.keys() & changes.keys():
                 return part
@@ -126,6 +140,22 @@ class Scene(eqx.Module):
 
     def _repr_html_(self) -> str:
         return description.as_table(self)
+
+
+def _each_number(name: str, value, count: int, **bounds) -> None:
+    """Refuse anything but one number, or one for each contact."""
+    if not is_known(value):
+        return
+    if np.ndim(value) == 0 or count == 1:
+        arguments.real_number(name, value, **bounds)
+        return
+    array = arguments.numeric_array(name, value)
+    if array.shape != (count,):
+        raise ValueError(
+            f"Argument `{name}` must be one number or hold one for each of the {count} contacts, but has shape {array.shape}."
+        )
+    for one in array:
+        arguments.real_number(name, one, **bounds)
 
 
 @returning_numpy
@@ -191,9 +221,32 @@ def _painleve_friction(structure: Structure):
     return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
 
 
+def refuse_several_contacts(structure: Structure, who: str) -> None:
+    """Refuse, for `who` takes only that, anything but one contact at two coordinates."""
+    if len(structure.contacts) > 1:
+        raise ValueError(
+            f"{who} takes structures with one contact, but this one has {len(structure.contacts)}. `simulate` takes several."
+        )
+    if not structure.contacts_at_coordinates:
+        raise ValueError(
+            f"{who} takes a contact whose directions are coordinates, but this one's are vectors. Give the structure as "
+            f"`fivjax.in_contact_coordinates(structure)`."
+        )
+
+
 def refuse_painleve(scene: Scene) -> None:
     """Refuse friction at which the contact problem has no unique solution, where its value is known."""
     largest = scene.friction.static
+    if is_known(largest) and len(scene.structure.contacts) > 1:
+        g = delassus(scene.structure)
+        coefficients = np.broadcast_to(np.asarray(largest), len(scene.structure.contacts))
+        if all(map(is_known, g)) and not has_one_solution(g, coefficients):
+            raise ValueError(
+                f"The contact problem has no unique solution at friction {np.asarray(largest).tolist()}: the normal forces of "
+                f"sliding contacts follow from a matrix that is not a P-matrix (Painlevé's paradox). Lower the friction or "
+                f"the coupling in the mass matrix."
+            )
+        return
     if is_known(largest):
         limit = painleve_friction(scene.structure)
         if is_known(limit) and float(largest) >= limit:

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
-from .matrix_checks import check_matrix, check_shapes, checked_index, checked_names
+from .contact_point import ContactPoint, checked_contacts, directions
+from .matrix_checks import check_matrix, check_shapes, checked_names
 from .printing import as_call
 
 
@@ -89,29 +90,39 @@ def _matrices(matrices_of: Callable[..., tuple], parameters: dict[str, Float[Arr
     return matrices(dict(zip(names, values, strict=True)))
 
 
+Place = int | tuple[float, ...]
+
+
+def _place(direction) -> Place:
+    return tuple(direction.tolist()) if isinstance(direction, np.ndarray) else int(direction)
+
+
 class Structure(eqx.Module):
-    r"""A linear structure with one frictional contact:
-    $M \ddot q + C \dot q + K q = f F(t) + e_t T + e_n N$ (Eqs. 4–5 of the paper, with the contact forces on the right).
+    r"""A linear structure with frictional contacts:
+    $M \ddot q + C \dot q + K q = f F(t) + W_t T + W_n N$ (Eqs. 4–5 of the paper, with the contact forces on the right).
 
     **Arguments:**
 
     - `mass`, `damping`, `stiffness`: symmetric `(n, n)` matrices in kg, N·s/m and N/m. The mass matrix is positive
       definite, the other two positive semi-definite.
     - `load_direction`: `(n,)`, the coordinates' share $f$ of a positive load, without unit.
-    - `tangential`, `normal`: indices of the coordinate along the belt and of the gap (positive away from the belt).
+    - `tangential`, `normal`: the coordinate along the belt and the gap (positive away from the belt) of a structure with one
+      contact, by index or name.
+    - `contacts`: instead of these, a `ContactPoint` for each contact; their directions may be coordinates or vectors.
     - `coordinates`: the coordinates' names, ("q0", "q1", …) unless given.
 
     `Structure.from_parameters` makes one whose matrices follow from named parameters, as `belt_oscillator` does.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for a wrong shape, a non-finite entry, an unsymmetric or
-    indefinite matrix, an index out of range, or names that are not as many as the coordinates.
+    indefinite matrix, an index out of range, directions that follow from one another, or names that are not as many as
+    the coordinates.
     """
 
     # The one truth: matrices, or what they follow from. Everything else is read from here.
     source: "Matrices | FromParameters"
     coordinates: tuple[str, ...] = eqx.field(static=True)
-    tangential: int = eqx.field(static=True)
-    normal: int = eqx.field(static=True)
+    # The contacts' directions: indices, or vectors as tuples.
+    places: tuple[tuple[Place, Place], ...] = eqx.field(static=True)
 
     @in_double_precision
     def __init__(
@@ -120,9 +131,10 @@ class Structure(eqx.Module):
         damping,
         stiffness,
         load_direction,
-        tangential: int = 0,
-        normal: int = 2,
+        tangential: int | str = 0,
+        normal: int | str = 2,
         *,
+        contacts: Sequence[ContactPoint] | None = None,
         coordinates: Sequence[str] | None = None,
     ):
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
@@ -140,13 +152,15 @@ class Structure(eqx.Module):
             )
         if is_known(load_direction) and not np.all(np.isfinite(np.asarray(load_direction))):
             raise ValueError("Argument `load_direction` must be finite.")
-        self.tangential = checked_index("tangential", tangential, n)
-        self.normal = checked_index("normal", normal, n)
-        if self.tangential == self.normal:
-            raise ValueError(
-                f"Arguments `tangential` and `normal` must name two different coordinates, but both are {self.normal}."
-            )
         self.coordinates = checked_names(coordinates, n)
+        if contacts is None:
+            contacts = [ContactPoint(tangential, normal)]
+        elif (tangential, normal) != (0, 2):
+            raise ValueError("Give either `contacts`, or `tangential` and `normal` for a single contact, but not both.")
+        self.places = tuple(
+            (_place(contact.tangential), _place(contact.normal))
+            for contact in checked_contacts(contacts, self.coordinates)
+        )
         self.source = given
 
     @classmethod
@@ -156,8 +170,9 @@ class Structure(eqx.Module):
         matrices_of: Callable[..., tuple],
         parameters: Mapping[str, float],
         *,
-        tangential: int,
-        normal: int,
+        tangential: int | str = 0,
+        normal: int | str = 2,
+        contacts: Sequence[ContactPoint] | None = None,
         coordinates: Sequence[str] | None = None,
         dampers: Sequence[str] = (),
         builder: "Callable[..., Structure] | None" = None,
@@ -169,7 +184,7 @@ class Structure(eqx.Module):
         - `matrices_of`: a function of the parameters by name that returns (mass, damping, stiffness, load direction),
           written with `jax.numpy`.
         - `parameters`: their values by name.
-        - `tangential`, `normal`, `coordinates`: as for `Structure`.
+        - `tangential`, `normal`, `contacts`, `coordinates`: as for `Structure`.
         - `dampers`: names of the parameters that the damping matrix is proportional to, a part to each; the energy
           ledger then tells their losses apart.
         - `builder`: the function of the parameters by name that called this one, for `replace` to call again, with its
@@ -184,8 +199,62 @@ class Structure(eqx.Module):
         if unknown:
             raise ValueError(f"Argument `dampers` must name parameters, but has {unknown[0]!r}.")
         source = FromParameters(numbers, tuple(numbers), matrices_of, tuple(dampers), builder)
-        checked = cls(*source.matrices, tangential, normal, coordinates=coordinates)
+        checked = cls(*source.matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
+
+    @property
+    def contacts(self) -> tuple[ContactPoint, ...]:
+        """Where it may touch the belt."""
+
+        def direction(place: Place) -> int | np.ndarray:
+            return np.array(place) if isinstance(place, tuple) else place
+
+        return tuple(ContactPoint(direction(tangential), direction(normal)) for tangential, normal in self.places)
+
+    @property
+    def contacts_at_coordinates(self) -> bool:
+        """Whether all contacts' directions are coordinates."""
+        return all(isinstance(place, int) for pair in self.places for place in pair)
+
+    @property
+    def tangential_directions(self) -> Float[np.ndarray, "n c"]:
+        """$W_t$: the tangential directions of the contacts as columns, without unit."""
+        return directions(self.contacts, self.size)[0]
+
+    @property
+    def normal_directions(self) -> Float[np.ndarray, "n c"]:
+        """$W_n$: the normal directions of the contacts as columns, without unit."""
+        return directions(self.contacts, self.size)[1]
+
+    @property
+    def tangential(self) -> int:
+        """Index of the coordinate along the belt, of a structure with one contact.
+
+        **Raises:** `ValueError` for several contacts, or for one whose directions are no coordinates.
+        """
+        return self._only_contact()[0]
+
+    @property
+    def normal(self) -> int:
+        """Index of the gap, of a structure with one contact.
+
+        **Raises:** `ValueError` for several contacts, or for one whose directions are no coordinates.
+        """
+        return self._only_contact()[1]
+
+    def _only_contact(self) -> tuple[int, int]:
+        if len(self.places) != 1:
+            raise ValueError(
+                f"This needs a structure with one contact, but this one has {len(self.places)}. Several contacts are taken "
+                f"by `simulate` and by what is said to take them."
+            )
+        tangential, normal = self.places[0]
+        if not isinstance(tangential, int) or not isinstance(normal, int):
+            raise ValueError(
+                "This needs a contact whose directions are coordinates, but this one's are vectors. Give the structure as "
+                "`fivjax.in_contact_coordinates(structure)`."
+            )
+        return tangential, normal
 
     @property
     def matrices(self) -> Matrices:
@@ -242,7 +311,9 @@ class Structure(eqx.Module):
     def __repr__(self) -> str:
         if self.builder is not None:
             return as_call(getattr(self.builder, "__name__", "Structure"), self.parameters)
-        own = {**self.matrices._asdict(), "tangential": self.tangential, "normal": self.normal}
+        single = len(self.places) == 1 and self.contacts_at_coordinates
+        places = {"tangential": self.tangential, "normal": self.normal} if single else {"contacts": list(self.contacts)}
+        own = {**self.matrices._asdict(), **places}
         return as_call("Structure", own)
 
     def as_matrices(self) -> "Structure":
@@ -269,8 +340,7 @@ class Structure(eqx.Module):
         return Structure.from_parameters(
             source.matrices_of,
             parameters,
-            tangential=self.tangential,
-            normal=self.normal,
+            contacts=self.contacts,
             coordinates=self.coordinates,
             dampers=source.dampers,
         )

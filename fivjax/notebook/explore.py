@@ -13,7 +13,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..linear.critical import critical_friction
 from ..maps.bistability import bistability_map
-from ..model.scene import Scene
+from ..model.scene import Scene, refuse_several_contacts
 from ..simulation.trajectory import Trajectory, simulate
 from ..verdicts.verdict import Verdict
 from .map_picture import MapPicture
@@ -50,6 +50,7 @@ def explorer(
     two axes.
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`explorer`")
     arguments.real_number("t1", t1, above=0)
     if dataset is not None:
         arguments.instance("dataset", dataset, xr.Dataset, "a map, such as `bistability_map` returns")

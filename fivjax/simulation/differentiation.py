@@ -25,7 +25,7 @@ from ..contact import Contact, Mechanics, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, known_to_numpy
-from ..model.scene import Scene, refuse_painleve
+from ..model.scene import Scene, refuse_painleve, refuse_several_contacts
 from ..steppers.base import AbstractStepper, rates
 from ..steppers.event_exact import EventExact
 from .trajectory import Trajectory, simulate, start_state
@@ -107,6 +107,7 @@ def derivatives(
     **Raises:** `ValueError` or `TypeError`, as a sentence, for an unknown name, and whatever `simulate` refuses.
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`derivatives`")
     if not callable(functional):
         raise TypeError(
             f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."

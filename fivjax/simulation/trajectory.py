@@ -23,7 +23,7 @@ from ..foundation.precision import (
     refusing_reverse_in_single_precision,
 )
 from ..io.datasets import labelled
-from ..model.scene import Scene, refuse_painleve, sliding_equilibrium, steady_sliding
+from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, sliding_equilibrium, steady_sliding
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
@@ -147,6 +147,7 @@ def simulate(
     """
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`simulate`")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
