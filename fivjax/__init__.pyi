@@ -16,6 +16,7 @@ from .io.datasets import save as save
 from .io.files import save_figure as save_figure
 from .io.recording_files import read_recording as read_recording
 from .io.recordings import Recording as Recording
+from .io.references import citation as citation
 from .linear import cea as cea
 from .linear import design as design
 from .maps.bistability import bistability_map as bistability_map

@@ -1,4 +1,4 @@
-"""Figures of the energy ledger, as the README states them.
+"""Figures of the energy ledger, as `docs/measurements.md` states them.
 
     python tests/measure_energy.py [balance] [conservation] [tradeoff] [cost] [paper] [critical]
 

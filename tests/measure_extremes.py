@@ -1,4 +1,4 @@
-"""What holds at the extremes: the README's table and figures.
+"""What holds at the extremes: the table and figures of `docs/measurements.md`.
 
     python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [resume] [refusals]
 
@@ -364,7 +364,7 @@ def fastness(case: dict) -> float:
 
 
 def table() -> None:
-    """The README's table: one row for each extreme, one column for each method and precision; cases on standard error."""
+    """The table of `docs/measurements.md`: one row for each extreme, one column for each method and precision; cases on standard error."""
     methods = {"EventExact": fj.EventExact(), "WhereSwitched": fj.WhereSwitched(dt=2e-5)}
     pairs = list(itertools.product(methods.items(), ("float64", "float32")))
     print("| extreme | " + " | ".join(f"{name}, {kind}" for (name, _), kind in pairs) + " | ending |")

@@ -1,4 +1,4 @@
-"""Figures of trajectories, maps and critical perturbations, as the README states them.
+"""Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
     python tests/measure_maps.py [errors] [table2] [map] [speed] [start] [memory]
 

@@ -1,0 +1,68 @@
+"""What is published: versions, addresses and what to cite are said once, or alike wherever they are said again."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import fivjax as fj
+from fivjax.io.references import HOME, PAPER_DOI
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CITATION = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def field(name: str) -> str:
+    found = re.search(rf'^{name}: "?([^"\n]+)', CITATION, re.MULTILINE)
+    assert found is not None
+    return found.group(1)
+
+
+def test_the_version_is_that_of_the_project_file():
+    """Rejects a release whose citation, or whose own word, is of another version."""
+    assert fj.__version__ == PROJECT["version"] == field("version")
+    assert f"version = {{{fj.__version__}}}" in fj.citation()
+
+
+def test_what_to_cite_is_the_same_everywhere():
+    """Rejects another paper or another home in one of the places that name them."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for text in (fj.citation(), CITATION, readme):
+        assert PAPER_DOI in text
+    for author in ("Cattai", "Tonazzi", "Ciprari", "Massi"):
+        assert author in fj.citation()
+        assert author in CITATION
+        assert author in readme
+    assert field("repository-code") == PROJECT["urls"]["Source"] == HOME
+    assert field("url") == PROJECT["urls"]["Documentation"]
+    assert field("license") == PROJECT["license"]
+
+
+def test_a_type_checker_is_told_to_look():
+    """Without this file a user's checker takes everything here for `Any`."""
+    assert (Path(fj.__file__).parent / "py.typed").is_file()
+
+
+def test_the_readme_can_be_shown_anywhere():
+    """A package index shows the README by itself: a relative picture or link is broken there. It is short enough to be read."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(readme.split()) <= 900
+    for address in re.findall(r"\]\(([^)]+)\)", readme):
+        assert re.match("https://|#", address), address
+    ours = [address for address in re.findall(r"https://[^)\s]+", readme) if "fivjax" in address]
+    homes = (HOME, PROJECT["urls"]["Documentation"], HOME.replace("github.com", "raw.githubusercontent.com"))
+    for address in ours:
+        assert address.startswith(homes), address
+        for part in (r"blob/main/(.+)", r"raw\.githubusercontent\.com/fivjax/fivjax/main/(.+)"):
+            inside = re.search(part, address)
+            assert inside is None or (ROOT / inside.group(1)).exists(), address
+
+
+@pytest.mark.parametrize("name", ["CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md"])
+def test_the_source_archive_has(name):
+    """A packager works from the archive alone."""
+    included = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]
+    assert name in included["sdist"]["include"]
+    assert (ROOT / name).is_file()
