@@ -14,9 +14,12 @@ from .cycles.search import limit_cycles as limit_cycles
 from .io.datasets import open as open
 from .io.datasets import save as save
 from .io.files import save_figure as save_figure
+from .io.matrix_files import read_matrices as read_matrices
+from .io.node_contacts import NodeContact as NodeContact
 from .io.recording_files import read_recording as read_recording
 from .io.recordings import Recording as Recording
 from .io.references import citation as citation
+from .io.structure_files import read_structure as read_structure
 from .linear import cea as cea
 from .linear import design as design
 from .maps.bistability import bistability_map as bistability_map
@@ -36,6 +39,7 @@ from .model.load import Pulse as Pulse
 from .model.scene import Scene as Scene
 from .model.scene import painleve_friction as painleve_friction
 from .model.scene import sliding_equilibrium as sliding_equilibrium
+from .model.sparse_structure import SparseStructure as SparseStructure
 from .model.structure import Structure as Structure
 from .notebook.display import show as show
 from .notebook.explore import explorer as explorer

@@ -1,0 +1,212 @@
+"""Abaqus matrices: `*MATRIX OUTPUT` of a `*MATRIX GENERATE` step, and `*SUBSTRUCTURE MATRIX OUTPUT`.
+
+`FORMAT=MATRIX INPUT` and `FORMAT=LABELS` write rows of row node, row direction, column node, column direction and value,
+`FORMAT=COORDINATE` rows of row, column and value: no Matrix Market file, though both end in `.mtx`. A substructure is
+written as a linear `*USER ELEMENT`: its nodes in comments, their directions, and each matrix column by column, down to
+the diagonal where it is symmetric (Abaqus Keywords Reference Guide: *MATRIX INPUT, *USER ELEMENT, *MATRIX).
+"""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from .file_matrix import FileMatrix, Label, from_entries, text_of
+
+
+def matrices(path: Path) -> dict[str, FileMatrix]:
+    """The matrices of an Abaqus `.mtx` file by name: one, by the file's, or `STIFFNESS` and `MASS` of a substructure."""
+    text = text_of(path)
+    if re.search(r"^\s*\*USER ELEMENT", text, re.IGNORECASE | re.MULTILINE):
+        return _substructure(path, text)
+    return {path.stem: _generated(path, text)}
+
+
+def _generated(path: Path, text: str) -> FileMatrix:
+    place, lines = f"File `{path}`", text.splitlines()
+    symmetric = None
+    numbers, kept = [], []
+    for number, line in enumerate(lines, 1):
+        stripped = line.strip()
+        if stripped.startswith("*") and not stripped.startswith("**"):
+            keyword, options = _keyword(stripped)
+            if keyword != "MATRIX INPUT":
+                raise ValueError(
+                    f"{place}, line {number}: `*{keyword}` does not belong in a file of matrix entries. "
+                    f"Give the file that `*MATRIX OUTPUT` wrote."
+                )
+            if "SCALE FACTOR" in options:
+                raise ValueError(
+                    f"{place}, line {number}: `SCALE FACTOR` is not read. Write the matrix with its factor applied."
+                )
+            symmetric = options.get("TYPE", "SYMMETRIC").startswith("SYM") or None
+            if options.get("TYPE", "").startswith("UNSYM"):
+                symmetric = False
+        elif stripped and not stripped.startswith("**"):
+            numbers.append(number)
+            kept.append(stripped)
+    if not kept:
+        raise ValueError(f"{place} holds no matrix entries. Write it again.")
+    table = _table(place, numbers, kept)
+    numbers = np.array(numbers)
+    if table.shape[1] == 3:
+        _whole(place, numbers, kept, table[:, :2])
+        size = int(table[:, :2].max())
+        found = from_entries(
+            place, _plain(table[:, 0]), _plain(table[:, 1]), table[:, 2], lines=numbers, symmetric=symmetric
+        )
+        if found.size != size or table[:, :2].min() < 1:
+            raise ValueError(
+                f"{place}: rows and columns must be numbered from 1 without gaps, but {size} is the largest of "
+                f"{found.size}. Write it with `FORMAT=MATRIX INPUT`, which names nodes and directions."
+            )
+        return found._replace(labels=None)
+    _whole(place, numbers, kept, table[:, :4])
+    return from_entries(place, table[:, :2], table[:, 2:4], table[:, 4], lines=numbers, symmetric=symmetric)
+
+
+def _keyword(line: str) -> tuple[str, dict[str, str]]:
+    keyword, *options = (part.strip().upper() for part in line.lstrip("* ").split(","))
+    pairs = (option.partition("=") for option in options if option)
+    return keyword, {name.strip(): value.strip() for name, _, value in pairs}
+
+
+def _plain(indices: np.ndarray) -> np.ndarray:
+    return np.stack([indices, np.zeros_like(indices)], axis=1)
+
+
+def _entries(line: str) -> list[str]:
+    parts = [part.strip() for part in line.split(",")] if "," in line else line.split()
+    return parts[:-1] if parts and parts[-1] == "" else parts
+
+
+def _table(place: str, numbers: list[int], lines: list[str]) -> np.ndarray:
+    """The rows as an array with five columns, or three; read at once, and line by line where that fails, to say which."""
+    try:
+        width = len(_entries(lines[0]))
+        text = "\n".join(lines).replace("D", "E").replace("d", "e")
+        delimiter = "," if "," in lines[0] else None
+        table = np.loadtxt(io.StringIO(text), delimiter=delimiter, ndmin=2, comments=None)
+        if table.shape[1] == width and width in (3, 5) and np.all(np.isfinite(table)):
+            return table
+    except ValueError:
+        pass
+    rows = []
+    for number, line in zip(numbers, lines, strict=True):
+        entries = _entries(line)
+        if len(entries) not in (3, 5):
+            raise ValueError(
+                f"{place}, line {number}: five entries expected (node, direction, node, direction, value), "
+                f"{len(entries)} found. Write it again, or mend the line."
+            )
+        if rows and len(entries) != len(rows[0]):
+            raise ValueError(
+                f"{place}, line {number}: {len(rows[0])} entries expected, {len(entries)} found. Mend the line."
+            )
+        rows.append([_number(f"{place}, line {number}", entry) for entry in entries])
+    return np.array(rows)
+
+
+def _number(place: str, entry: str) -> float:
+    try:
+        value = float(entry.replace("D", "E").replace("d", "e"))
+    except ValueError:
+        raise ValueError(f"{place}: {entry!r} is no number. Write the file again, or mend the line.") from None
+    if not np.isfinite(value):
+        raise ValueError(f"{place}: must be finite, but is {entry}. Write the file again.")
+    return value
+
+
+def _whole(place: str, numbers: np.ndarray, lines: list[str], labels: np.ndarray) -> None:
+    broken = np.flatnonzero(np.any(labels != np.round(labels), axis=1))
+    if broken.size:
+        raise ValueError(
+            f"{place}, line {numbers[broken[0]]}: nodes and directions must be whole numbers, but the line is "
+            f"{lines[broken[0]]!r}. Mend the line."
+        )
+
+
+def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
+    """The matrices of a linear user element: nodes in comments, directions by node, matrices column by column."""
+    place = f"File `{path}`"
+    nodes: list[int] = []
+    directions: dict[int, list[int]] = {}
+    values: dict[str, list[float]] = {}
+    begun: dict[str, int] = {}
+    reading, listing, symmetric, count = "", False, True, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped, here = line.strip(), f"{place}, line {number}"
+        if not stripped:
+            continue
+        if stripped.startswith("**"):
+            words = stripped.lstrip("* ")
+            if words.upper().startswith("ELEMENT NODES"):
+                listing = True
+            elif listing and words:
+                nodes += [_integer(here, entry) for entry in _entries(words)]
+            continue
+        listing = False
+        if stripped.startswith("*"):
+            keyword, options = _keyword(stripped)
+            if keyword == "USER ELEMENT":
+                if count:
+                    raise ValueError(f"{here}: a second element begins. Give one substructure in a file.")
+                count = _integer(here, options.get("NODES", ""))
+                symmetric, reading = "UNSYMM" not in options, "directions"
+            elif keyword == "MATRIX":
+                reading = options.get("TYPE", "")
+                if reading in values or not reading:
+                    raise ValueError(f"{here}: `*MATRIX` must say a `TYPE` of its own, but is {stripped!r}.")
+                values[reading], begun[reading] = [], number
+            else:
+                reading = ""  # load vectors and recovery matrices are not needed
+        elif reading == "directions":
+            entries = [_integer(here, entry) for entry in _entries(stripped)]
+            # The first line is of the first node; each later one begins with the place of the node from which it holds.
+            first = 1 if not directions else entries[0]
+            directions[first] = entries if not directions else entries[1:]
+        elif reading:
+            values[reading] += [_number(here, entry) for entry in _entries(stripped)]
+    if len(nodes) != count:
+        raise ValueError(
+            f"{place} must list its {count} nodes under `** ELEMENT NODES`, but lists {len(nodes)}. Write it again."
+        )
+    labels, current = [], []
+    for position, node in enumerate(nodes, 1):
+        current = directions.get(position, current)
+        labels += [Label(node, direction) for direction in current]
+    if len(set(labels)) != len(labels):
+        double = next(label for label in labels if labels.count(label) > 1)
+        raise ValueError(f"{place}: {double} is there twice. Write the substructure with each retained node once.")
+    if not values:
+        raise ValueError(f"{place} holds no `*MATRIX`. Write it with `STIFFNESS=YES, MASS=YES`.")
+    return {
+        name: FileMatrix(
+            _filled(f"{place}, line {begun[name]}: `{name}`", numbers, len(labels), symmetric),
+            tuple(labels),
+            f"{place}, matrix `{name}`",
+        )
+        for name, numbers in values.items()
+    }
+
+
+def _integer(place: str, entry: str) -> int:
+    try:
+        return int(entry)
+    except ValueError:
+        raise ValueError(f"{place}: {entry!r} is no whole number. Write the file again, or mend the line.") from None
+
+
+def _filled(place: str, values: list[float], size: int, symmetric: bool) -> sparse.csr_array:
+    wanted = size * (size + 1) // 2 if symmetric else size * size
+    if len(values) != wanted:
+        raise ValueError(
+            f"{place} must have {wanted} entries for {size} degrees of freedom, but has {len(values)}. Write it again."
+        )
+    if not symmetric:
+        return sparse.csr_array(np.reshape(values, (size, size), order="F"))
+    matrix = np.zeros((size, size))
+    matrix[np.tril_indices(size)] = values
+    return sparse.csr_array(matrix + np.tril(matrix, -1).T)

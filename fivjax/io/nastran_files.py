@@ -1,0 +1,168 @@
+"""Nastran matrices: DMIG bulk entries, as in punch files, and OUTPUT4 files.
+
+DMIG is read here: fixed fields of 8 or 16 characters, or free fields with commas. (pyyeti reads it too, but fills a dense
+matrix, and takes an entry that was cut off for zero.) OUTPUT4 in its many variants is read by pyyeti.
+
+A DMIG matrix has a header `DMIG NAME 0 IFO TIN TOUT POLAR NCOL`, and for each column an entry `DMIG NAME GJ CJ G1 C1 A1 B1
+G2 C2 A2 B2 …`, G being nodes and C directions; A is real where TIN is 1 or 2 (MSC Nastran Quick Reference Guide: DMIG).
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from .file_matrix import FileMatrix, Label, from_entries, text_of
+
+SQUARE, SYMMETRIC = 1, 6
+
+
+def dmig(path: Path) -> dict[str, FileMatrix]:
+    """The DMIG matrices of a bulk data or punch file, by name."""
+    place = f"File `{path}`"
+    headers: dict[str, int] = {}
+    entries: dict[str, list] = {}
+    for line, fields in _cards(place, text_of(path)):
+        here, name = f"{place}, line {line}", fields[0].upper()
+        if not name:
+            raise ValueError(f"{here}: a DMIG entry must name its matrix. Mend the line.")
+        if fields[1] == "0":
+            headers[name] = _form(here, name, fields)
+            entries[name] = []
+        elif name not in headers:
+            raise ValueError(f"{here}: matrix `{name}` has no header `DMIG {name} 0 …` before it. Add it.")
+        else:
+            entries[name] += _column(here, line, fields)
+    if not headers:
+        raise ValueError(f"{place} holds no DMIG entries. Write it with `EXTSEOUT(DMIGPCH)` or `PARAM,EXTOUT,DMIGPCH`.")
+    found = {}
+    for name, form in headers.items():
+        if not entries[name]:
+            raise ValueError(f"{place}: matrix `{name}` has a header and no entries. Write it again.")
+        rows, columns, values, lines = zip(*entries[name], strict=True)
+        found[name] = from_entries(
+            f"{place}, matrix `{name}`",
+            rows,
+            columns,
+            np.array(values),
+            lines=np.array(lines),
+            symmetric=form == SYMMETRIC,
+        )
+    return found
+
+
+def _form(here: str, name: str, fields: list[str]) -> int:
+    form, kind = (_integer(here, field) for field in fields[2:4])
+    if form not in (SQUARE, SYMMETRIC):
+        raise ValueError(
+            f"{here}: matrix `{name}` has form {form} (rectangular), but mass, damping and stiffness are square (1) or "
+            f"symmetric (6). Leave it out of the file."
+        )
+    if kind not in (1, 2):
+        raise ValueError(
+            f"{here}: matrix `{name}` has type {kind}, but must be real (1 or 2). Give structural damping as a viscous "
+            f"damping matrix."
+        )
+    return form
+
+
+def _column(here: str, line: int, fields: list[str]) -> list[tuple]:
+    column = _label(here, fields[1], fields[2])
+    # The name and the column's own label fill the first fields; then come four for each row.
+    rest = fields[4:]
+    while rest and not rest[-1]:
+        rest.pop()
+    entries = []
+    for start in range(0, len(rest), 4):
+        group = [*rest[start : start + 4], "", "", ""][:4]
+        if not group[2]:
+            raise ValueError(f"{here}: the entry of {column} ends before its value. Write the file again.")
+        entries.append((_label(here, group[0], group[1]), column, _real(here, group[2]), line))
+    if not entries:
+        raise ValueError(f"{here}: the column of {column} has no entries. Write the file again.")
+    return entries
+
+
+def _cards(place: str, text: str):
+    """Each DMIG card with its first line and its fields, without the word DMIG and what marks continuations."""
+    card: list[str] = []
+    begun = 0
+    for number, raw in enumerate(text.splitlines(), 1):
+        line = raw.split("$")[0].rstrip()
+        if not line:
+            continue
+        if re.match(r"\s*DMIG[\s*,]", line, re.IGNORECASE):
+            if card:
+                yield begun, card
+            begun, card = number, _fields(f"{place}, line {number}", line)
+        elif card and line[0] in "*+, ":
+            # A continuation goes on with the field after the last of the line before.
+            card += _fields(f"{place}, line {number}", line)
+        elif card:
+            yield begun, card
+            card = []
+    if card:
+        yield begun, card
+
+
+def _fields(here: str, line: str) -> list[str]:
+    """The fields of a line without the first and the last, which name the card and its continuation."""
+    if "," in line:
+        fields = [field.strip() for field in line.split(",")]
+        return [*fields[1:9], *[""] * 8][:8]
+    if "\t" in line:
+        raise ValueError(f"{here}: tabs do not fit fixed fields. Write fields of 8 or 16 characters, or commas.")
+    wide = "*" in line[:8]
+    width, count = (16, 4) if wide else (8, 8)
+    return [line[8 + k * width : 8 + (k + 1) * width].strip() for k in range(count)]
+
+
+def _label(here: str, node: str, direction: str) -> Label:
+    return Label(_integer(here, node), _integer(here, direction or "0"))
+
+
+def _integer(here: str, field: str) -> int:
+    try:
+        return int(field)
+    except ValueError:
+        raise ValueError(f"{here}: {field!r} is no whole number. Write the file again, or mend the line.") from None
+
+
+def _real(here: str, field: str) -> float:
+    # Nastran leaves out the E, and may write D for it: 1.5+3 is 1500.
+    text = re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", field.upper().replace("D", "E"))
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{here}: {field!r} is no number. Write the file again, or mend the line.") from None
+    if not np.isfinite(value):
+        raise ValueError(f"{here}: must be finite, but is {field}. Write the file again.")
+    return value
+
+
+def output4(path: Path) -> dict[str, FileMatrix]:
+    """The matrices of an OUTPUT4 file, by name; it does not say which node and direction a row belongs to."""
+    try:
+        from pyyeti.nastran import op4
+    except ImportError as error:
+        raise ImportError(
+            f'File `{path}` needs pyyeti to be read. Install it with `pip install "fivjax[fe]"`, or give the '
+            f"matrices as DMIG in a `.pch` file."
+        ) from error
+    # Damaged files fail inside NumPy, struct or pyyeti itself, each in its own way.
+    try:
+        loaded = op4.read(str(path), sparse=True, justmatrix=True)
+    except Exception as error:
+        raise ValueError(
+            f"File `{path}` cannot be read as OUTPUT4 ({type(error).__name__}: {str(error).strip() or 'no more is said'}). "
+            f"Write it again."
+        ) from None
+    found = {
+        name.upper(): FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`, matrix `{name.upper()}`")
+        for name, matrix in loaded.items()
+        if min(np.shape(matrix)) > 1
+    }
+    if not found:
+        raise ValueError(f"File `{path}` holds no matrix. Write it again.")
+    return found

@@ -1,0 +1,225 @@
+"""Structures from the files of finite-element codes: which matrix is which, in which units, where the contacts are."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from ..foundation import arguments
+from ..model.sparse_structure import SparseStructure
+from ..model.structure_checks import check_matrices
+from .file_matrix import FileMatrix, Label
+from .matrix_files import read_matrices
+from .model_units import SYSTEMS, in_si
+from .node_contacts import NodeContact, contact_directions, load_direction
+
+# What the matrices are called in files of several, in capitals.
+NAMES = {
+    "stiffness": ("K", "STIFFNESS", "KAA", "KAAX", "KGG", "KXX", "STIF"),
+    "mass": ("M", "MASS", "MAA", "MAAX", "MGG", "MXX"),
+    "damping": ("C", "D", "DAMPING", "VISCOUS DAMPING", "BAA", "BAAX", "BGG", "BXX"),
+}
+# What Abaqus puts into the names of the files beside `…_STIF1.mtx`.
+BESIDE = {"mass": "MASS", "damping": "DMPV", "structural damping": "DMPS"}
+# Abaqus holds a degree of freedom by 1e36 on the diagonal of the stiffness matrix.
+HELD = 1e35
+
+
+def read_structure(
+    path: str | Path,
+    *,
+    units: str | None = None,
+    mass: str | Path | None = None,
+    damping: str | Path | None = None,
+    names: Mapping[str, str] | None = None,
+    labels: Sequence[tuple[int, int]] | str | Path | None = None,
+    contacts: Sequence[NodeContact] = (),
+    load: Mapping[tuple[int, int | str], float] | None = None,
+    rayleigh: tuple[float, float] = (0.0, 0.0),
+) -> SparseStructure:
+    """A structure from the files of a finite-element code, in SI units, with checks.
+
+        big = fj.read_structure("brake_STIF1.mtx", units="mm-t-s", contacts=[fj.NodeContact(17, "x", "-z")])
+        print(big.checks)
+        structure = fj.craig_bampton(big, up_to=3000.0).structure
+
+    Formats: `fj.read_matrices`. Beside an Abaqus `…_STIF1.mtx` the files `…_MASS1.mtx` and `…_DMPV1.mtx` are found by
+    themselves. Degrees of freedom that Abaqus holds (1e36 on the diagonal) are left out.
+
+    **Arguments:**
+
+    - `path`: the file with the stiffness matrix, and perhaps the others.
+    - `units`: of the files, such as "mm-t-s" (forces in N) or "SI"; files do not say. Translations (directions 1 to 3, and all
+      rows without labels) become metres; rotations are in rad already, modal coordinates keep their scale.
+    - `mass`, `damping`: their files, where they are not in the first one. A structure without damping matrix has none.
+    - `names`: what the matrices are called in files of several: `{"stiffness": "KAA", "mass": "MAA"}`.
+    - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, MATLAB, NumPy): pairs, or a
+      text file with two columns.
+    - `contacts`: by node and direction.
+    - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`.
+    - `rayleigh`: damping that is added as a·M + b·K, a in 1/s and b in s.
+
+    **Returns:** a `SparseStructure`. Matrices that are not symmetric or not definite are read and reported by its `checks`.
+
+    **Raises:** `ValueError` as a sentence for files that cannot be used, matrices that do not go together, unknown units,
+    nodes or directions.
+    """
+    if units not in SYSTEMS:
+        raise ValueError(
+            f"Argument `units` must be one of {', '.join(map(repr, SYSTEMS))}, but is {units!r}. Files do not say which; "
+            f"mass in t, forces in N and lengths in mm are 'mm-t-s'."
+        )
+    names = dict(names or {})
+    unknown = [role for role in names if role not in NAMES]
+    if unknown:
+        raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
+    parts, remarks = _parts(Path(path), mass, damping, names)
+    order, aligned = _aligned(parts, _labels(labels))
+    held = np.abs(aligned["stiffness"].diagonal()) >= HELD
+    if np.any(held):
+        aligned = {name: matrix[~held][:, ~held] for name, matrix in aligned.items()}
+        order = None if order is None else tuple(label for label, out in zip(order, held, strict=True) if not out)
+    directions = np.ones(len(held) - held.sum(), int) if order is None else np.array([label[1] for label in order])
+    matrices = in_si(aligned, directions, units)
+    for name, value in zip(("rayleigh[0]", "rayleigh[1]"), rayleigh, strict=True):
+        arguments.real_number(name, value, minimum=0)
+    matrices["damping"] = (
+        matrices["damping"] + rayleigh[0] * matrices["mass"] + rayleigh[1] * matrices["stiffness"]
+    ).tocsr()
+    if not matrices["damping"].nnz:
+        remarks.append("There is no damping: give a damping matrix, or `rayleigh`.")
+    tangential, normal = contact_directions(contacts, order, len(directions))
+    return SparseStructure(
+        **matrices,
+        load_direction=load_direction(load or {}, order, len(directions)),
+        tangential_directions=tangential,
+        normal_directions=normal,
+        labels=order,
+        checks=check_matrices(
+            **matrices, directions=None if order is None else directions, fixed=int(held.sum()), remarks=remarks
+        ),
+    )
+
+
+def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[str, FileMatrix], list[str]]:
+    """Stiffness, mass and, where there is one, damping, from the files given and those that Abaqus wrote beside them."""
+    files: dict[str, str | Path | None] = {"stiffness": path, "mass": mass, "damping": damping}
+    remarks = []
+    beside = re.fullmatch(r"(.*)_STIF(\d+)", path.stem, re.IGNORECASE)
+    if beside and path.suffix.lower() == ".mtx":
+        for role, short in BESIDE.items():
+            other = path.with_name(f"{beside[1]}_{short}{beside[2]}{path.suffix}")
+            if role == "structural damping" and other.is_file():
+                remarks.append(
+                    f"Structural damping in `{other.name}` is left out: it has no meaning in time. Give it as viscous "
+                    f"damping, divided by a frequency in rad/s."
+                )
+            elif role in files and files[role] is None and other.is_file():
+                files[role] = other
+    read: dict[Path, dict[str, FileMatrix]] = {}
+    found = {}
+    for role, file in files.items():
+        own = Path(file) if file is not None else path
+        if own not in read:
+            read[own] = read_matrices(own)
+        chosen = _chosen(role, own, read[own], names.get(role), alone=file is not None)
+        if chosen is not None:
+            found[role] = chosen
+    if "mass" not in found:
+        held = ", ".join(f"`{name}`" for name in read[path])
+        raise ValueError(
+            f"File `{path}` holds no mass matrix, but {held}. Give its file with `mass`, or its name with "
+            f"`names={{'mass': …}}`."
+        )
+    return found, remarks
+
+
+def _chosen(role: str, path: Path, held: dict[str, FileMatrix], name: str | None, *, alone: bool) -> FileMatrix | None:
+    if name is not None:
+        if name not in held:
+            raise ValueError(f"File `{path}` has no matrix `{name}`; it has: {', '.join(held)}.")
+        return held[name]
+    # A file of one matrix that was given for this purpose holds it, unless its name says otherwise.
+    if alone and len(held) == 1:
+        only = next(iter(held))
+        if not any(only.upper() in known for other, known in NAMES.items() if other != role):
+            return held[only]
+    matching = [matrix for name, matrix in held.items() if name.upper() in NAMES[role]]
+    if len(matching) == 1:
+        return matching[0]
+    if not alone and not matching:
+        return None
+    raise ValueError(
+        f"File `{path}` must say which is the {role} matrix; it has: {', '.join(held)}. Name it with "
+        f"`names={{'{role}': …}}`."
+    )
+
+
+def _labels(labels) -> tuple[Label, ...] | None:
+    if labels is None:
+        return None
+    if isinstance(labels, str | Path):
+        if not Path(labels).is_file():
+            raise ValueError(f"File `{labels}` does not exist.")
+        try:
+            labels = np.loadtxt(labels, dtype=np.int64, delimiter="," if "," in Path(labels).read_text() else None)
+        except ValueError as error:
+            raise ValueError(
+                f"File `{labels}` must hold two whole numbers a line, node and direction: {error}"
+            ) from None
+    table = np.asarray(labels)
+    if table.ndim != 2 or table.shape[1] != 2 or table.dtype.kind not in "iu":
+        raise ValueError(
+            f"Argument `labels` must hold a node and a direction, two whole numbers, for each row, but has shape "
+            f"{table.shape} and type {table.dtype}."
+        )
+    found = tuple(Label(int(node), int(direction)) for node, direction in table)
+    if len(set(found)) != len(found):
+        double = next(label for label in found if found.count(label) > 1)
+        raise ValueError(f"Argument `labels` must hold each label once, but holds {double} twice.")
+    return found
+
+
+def _aligned(parts: dict[str, FileMatrix], labels) -> tuple[tuple[Label, ...] | None, dict[str, sparse.csr_array]]:
+    """The matrices with their rows in one order; a matrix that lacks a label has zeros there."""
+    if labels is not None:
+        for part in parts.values():
+            if part.labels is None and part.size != len(labels):
+                raise ValueError(
+                    f"{part.place} has {part.size} rows, but `labels` names {len(labels)}. Give one label a row."
+                )
+        parts = {role: part._replace(labels=part.labels or labels) for role, part in parts.items()}
+    stiffness = parts["stiffness"]
+    if any(part.labels is None for part in parts.values()):
+        for role, part in parts.items():
+            if part.labels is not None or part.size != stiffness.size:
+                raise ValueError(
+                    f"{part.place}: the {role} matrix has {part.size} rows"
+                    f"{' with labels' if part.labels else ''} and the stiffness matrix {stiffness.size}"
+                    f"{' with labels' if stiffness.labels else ''}. Give matrices of one size, or `labels`."
+                )
+        order = None
+    else:
+        order = tuple(sorted({label for part in parts.values() for label in part.labels or ()}))
+        places = {label: place for place, label in enumerate(order)}
+        missing = set(parts["mass"].labels or ()) - set(stiffness.labels or ())
+        if 2 * len(missing) > len(parts["mass"].labels or ()):
+            raise ValueError(
+                f"{parts['mass'].place}: most of its nodes and directions are not in the stiffness matrix, such as "
+                f"{min(missing)}. Give files of one model."
+            )
+    found = {}
+    for role in NAMES:
+        if role not in parts:
+            found[role] = sparse.csr_array(found["stiffness"].shape)
+        elif order is None:
+            found[role] = parts[role].matrix
+        else:
+            entries = parts[role].matrix.tocoo()
+            place = np.array([places[label] for label in parts[role].labels or ()])
+            found[role] = sparse.csr_array(
+                (entries.data, (place[entries.row], place[entries.col])), shape=(len(order), len(order))
+            )
+    return order, found
