@@ -4,6 +4,8 @@ from . import plot as plot
 from .calibration.fit import calibrate as calibrate
 from .calibration.result import Calibration as Calibration
 from .contact import Status as Status
+from .cycles.continuation import continue_cycle as continue_cycle
+from .cycles.continuation import cycle_at as cycle_at
 from .cycles.cycle import LimitCycle as LimitCycle
 from .cycles.differentiation import CycleDerivatives as CycleDerivatives
 from .cycles.differentiation import cycle_derivatives as cycle_derivatives

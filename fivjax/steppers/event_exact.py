@@ -147,6 +147,24 @@ class EventExact(AbstractStepper):
         return jnp.stack(states), unit
 
 
+    def in_one_mode(self, mechanics: Mechanics, contact: Contact, y: State, h: Float[Array, ""]) -> State:
+        """The motion in one contact mode for a time `h` (s, of either sign), whatever its guards say; under no load."""
+        unit = _time_unit(mechanics)
+
+        def step(carry):
+            y, left, _ = carry
+            states, _ = _series(mechanics, contact, jnp.zeros_like(left), y, self.order_, unit)
+            trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), 1e6) * unit)
+            last = jnp.abs(left) <= trusted
+            part = jnp.where(last, left, jnp.sign(left) * trusted)
+            reached, _ = value_and_slope(states, part / unit)
+            return reached, left - part, ~last
+
+        # At least one step, so that the derivative in a time of zero is there.
+        begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
+        return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
+
+
 def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
 

@@ -1,0 +1,219 @@
+r"""Branches of limit cycles over a parameter, by pseudo-arclength continuation, stable and unstable ones alike.
+
+On a branch the motion passes folds, where the parameter turns round, and changes of its contact modes: a guard grazes zero, and
+beyond there is one more stick, lift-off or impact. Each sequence of modes has a smooth curve of cycles of its own
+(`multiple_shooting`); where it stops being the real motion, the point is computed as a root of its own (`grazing`), and the
+branch goes on along the curve of the sequence that the real motion has from there on.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..contact import Contact, Status
+from ..foundation import arguments
+from ..foundation.compiling import compiled
+from ..foundation.precision import in_double_precision
+from ..io.datasets import labelled
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .around import seen_around
+from .closing import Closed
+from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
+from .following import Point, follow_branch, seen
+from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
+from .pseudo_arclength import Curve, Family
+from .real_motion import crossings_of, on_section
+from .search import NoLimitCycle, limit_cycle
+from .section_map import Point as SectionPoint
+from .section_map import return_with_jacobian, sliding_state
+from .special_derivatives import special_derivatives
+from .special_points import MEETS_SLIDING
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@in_double_precision
+def continue_cycle(
+    scene: Scene,
+    parameter: str,
+    bounds: tuple[float, float],
+    start=None,
+    *,
+    points: int = 400,
+    derivatives: bool = False,
+) -> "xr.Dataset":
+    """The branch of limit cycles that one of them lies on, over a parameter of the scene.
+
+        branch = fj.continue_cycle(scene, "mu", (0.02, 0.3))
+        unstable = fj.continue_cycle(scene, "mu", (0.02, 0.3), start=fj.saddle_cycle(scene))
+
+    The branch is followed both ways from the start, past folds, through stable and unstable cycles.
+
+    **Arguments:**
+
+    - `scene`; `parameter`, the name of any scalar parameter of it under its final load, such as "mu" or "belt_speed".
+    - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own lies between.
+    - `start`: as in `limit_cycle`; a `LimitCycle` may be an unstable one.
+    - `points`: the most cycles that are computed each way.
+    - `derivatives`: whether special points are differentiated in all parameters.
+
+    **Returns:** a dataset over `point`, in the order along the branch:
+
+    - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
+    - `multipliers` over `multiplier`, largest first, without the one of the cycle's own direction;
+    - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
+    - `special`: what is special about a point, or nothing: "fold", "period doubling", "Neimark–Sacker", or how the contact
+      modes change there ("grazing of slip: stick inserted"). Special points are computed to rounding;
+    - with `derivatives`, `d_special` over `of`: derivatives of the parameter at which a special point lies. They are not
+      numbers at points that are not special, in the parameter itself, and where the change of modes is no simple one.
+
+    The attributes `begins` and `ends` say in a sentence where each end is, and why.
+
+    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not hold the scene's value, and whatever
+    `limit_cycle` refuses; `NoLimitCycle` where there is no cycle to start from, or it is a torus.
+    """
+    import xarray as xr
+
+    arguments.instance("scene", scene, Scene, "a Scene")
+    final = under_final_load(scene)
+    known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
+    arguments.one_of("parameter", parameter, tuple(known))
+    low, high = _checked_bounds(bounds)
+    value = float(final.parameters[parameter])
+    if not low <= value <= high:
+        raise ValueError(
+            f"Argument `bounds` must hold the scene's own {parameter}, {value:g}, but is ({low:g}, {high:g}). "
+            f"Widen it, or start elsewhere with `scene.replace`."
+        )
+    arguments.whole_number("points", points, minimum=2)
+    arguments.truth("derivatives", derivatives)
+    cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
+    if cycle.kind != "periodic":
+        raise NoLimitCycle(
+            f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
+            f"cycle is periodic, or give a `LimitCycle` as `start`."
+        )
+    stepper = EventExact()
+    around = seen_around(final, stepper, point_of(cycle), cycle.period, 60)
+    phases = phases_around(around.segments)
+    assert phases is not None
+    family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, stepper)
+    curve = Curve(family, phases)
+    place = curve.at_parameter(curve.unknowns(phases, value), value)
+    if place is None:
+        raise NoLimitCycle(
+            "The cycle to start from lies at a special point, where its equations are singular. Start a little beside it."
+        )
+    first = seen(family, curve, place)
+    down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
+    along = [*reversed(down.points), first, *up.points]
+    slopes = special_derivatives(family, along) if derivatives else None
+    return labelled(_dataset(xr, family, along, slopes), final, parameter=parameter).assign_attrs(
+        parameter=parameter, begins=down.ending, ends=up.ending
+    )
+
+
+@in_double_precision
+def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
+    """The limit cycle at a point of a branch.
+
+    **Arguments:** `branch`, from `continue_cycle`; `i`, the place of the point.
+
+    **Returns:** a `LimitCycle`.
+
+    **Raises:** `TypeError` or `ValueError` for what is no branch, or an `i` that is not among its points; `NoLimitCycle`
+    where the section is not met, as where the amplitude is next to nothing.
+    """
+    try:
+        name, row = branch.attrs["parameter"], branch.isel(point=i)
+        value = float(row["parameter"])
+    except (AttributeError, KeyError, IndexError, ValueError):
+        raise ValueError(
+            f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, but is {i!r}."
+        ) from None
+    scene = Scene.from_dataset(branch).replace(**{name: value})
+    stepper = EventExact()
+    y = np.asarray(row["state"]) - np.asarray(sliding_state(scene, scene.load.final))
+    contact = Contact(jnp.asarray(int(row["status"]), jnp.int32), jnp.asarray(float(row["direction"])))
+    point = SectionPoint(jnp.asarray(y), contact)
+    weights = np.asarray(scene.structure.weights)
+    crossings = crossings_of(scene, stepper, point, weights)
+    if crossings is None:
+        raise NoLimitCycle(f"At point {i} of the branch the motion does not come back to the section.")
+    found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
+    residual = np.linalg.norm(weights * (np.asarray(found.point.y) - y)) / np.linalg.norm(weights * y)
+    closed = Closed(
+        point, crossings, float(found.time), jacobian, float(residual), int(found.segments), int(found.events)
+    )
+    return limit_cycle_of(scene, stepper, closed)
+
+
+def _checked_bounds(bounds) -> tuple[float, float]:
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError(f"Argument `bounds` must be a pair of numbers, such as (0.02, 0.3), but is {bounds!r}.")
+    low, high = bounds
+    arguments.real_number("bounds[0]", low)
+    arguments.real_number("bounds[1]", high, above=float(low))
+    return float(low), float(high)
+
+
+def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
+    size = 2 * family.scene.structure.size
+    states, status, direction, amplitude = [], [], [], []
+    for point in points:
+        scene = family.at(point.place.parameter)
+        rest = np.asarray(_equilibrium(scene))
+        at = None if point.real is None else on_section(scene, family.stepper, point.real)
+        states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
+        status.append(-1 if at is None else int(at.contact.status))
+        direction.append(np.nan if at is None else float(at.contact.direction))
+        amplitude.append(np.nan if point.real is None else float(point.real.seen.amplitude))
+        if point.name == MEETS_SLIDING:
+            states[-1], amplitude[-1] = rest, 0.0
+    multipliers = np.stack([point.multipliers for point in points])
+    largest = np.abs(multipliers[:, 0])
+    names = list(family.scene.structure.coordinates)
+    dataset = xr.Dataset(
+        {
+            "parameter": ("point", [point.place.parameter for point in points]),
+            "period": ("point", [point.place.phases.period for point in points]),
+            "amplitude": ("point", amplitude),
+            "multipliers": (("point", "multiplier"), multipliers),
+            "stable": ("point", largest < 1 - MARGIN),
+            "word": ("point", [word_of(point.place.phases) for point in points]),
+            "special": ("point", [point.name for point in points]),
+            "state": (("point", "coordinate"), np.stack(states)),
+            "status": ("point", np.array(status, np.int8)),
+            "direction": ("point", direction),
+        },
+        coords={"coordinate": [*names, *(f"d{name}" for name in names)]},
+    )
+    if slopes is not None:
+        of, values = slopes
+        dataset = dataset.assign_coords(of=of).assign(d_special=(("point", "of"), values))
+    return dataset
+
+
+@compiled
+def _equilibrium(scene: Scene):
+    return sliding_state(scene, scene.load.final)
+
+
+def word_of(phases: Phases) -> str:
+    """The contact modes of a cycle in words; sliding that outruns the belt is "slide back"."""
+    longest = int(np.argmax(phases.h))
+    usual = next((mode.direction for mode in phases.modes if mode.status == Status.SLIDE), 1.0)
+    if phases.modes[longest].status == Status.SLIDE:
+        usual = phases.modes[longest].direction
+
+    def of(mode: Mode) -> str:
+        name = Status(mode.status).name.lower()
+        return f"{name} back" if mode.status == Status.SLIDE and mode.direction != usual else name
+
+    words = [of(mode) for mode in phases.modes]
+    turned = [words[k:] + words[:k] for k in range(len(words))]
+    # One way to begin, so that the same cycle has the same word everywhere.
+    return " – ".join(max(turned))

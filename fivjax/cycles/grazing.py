@@ -1,0 +1,144 @@
+r"""Where a cycle's sequence of contact modes ends: a guard that just touches zero inside a phase.
+
+Of the two sequences that meet there, the one with fewer phases goes on smoothly beyond. On it the place is a simple root of the
+cycle's equations together with $g = 0$ and $\dot g = 0$ at one instant of one phase: Newton's method locates it to rounding, and
+the implicit function theorem differentiates it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..contact import Status
+from .multiple_shooting import Images, Mode, Phases, inside, looked_up
+from .pseudo_arclength import Curve, Place, assembled
+
+MOST_ITERATIONS = 12
+EXACT = 1e-13
+
+NAMES = {
+    (Status.SLIDE, 0): "grazing of N",
+    (Status.SLIDE, 1): "grazing of slip",
+    (Status.DETACH, 0): "grazing of the gap",
+    (Status.STICK, 0): "edge of the friction cone",
+    (Status.STICK, 1): "edge of the friction cone",
+}
+
+
+class Touch(NamedTuple):
+    """A guard that is smallest at an instant inside a phase, or decides at its start what follows."""
+
+    phase: int
+    guard: int
+    time: float  # s after the phase's start
+    value: float  # relative to the guard's largest value
+    bend: float  # its second derivative in time, of the guard itself; zero at the start of a phase, an instant that is fixed
+
+
+class Grazing(NamedTuple):
+    """A cycle with a guard that touches zero."""
+
+    place: Place
+    touch: Touch
+    row: Float[np.ndarray, " m"]  # derivative of the smallest guard in the unknowns
+
+
+def touches(curve: Curve, place: Place) -> list[Touch]:
+    """All smallest values of guards inside the phases of a cycle, the lowest first."""
+    family, phases = curve.family, place.phases
+    looked = inside(family.at(place.parameter), family.stepper, phases)
+    found = []
+    for k, mode in enumerate(phases.modes):
+        step = phases.h[k] / (looked.guards.shape[1] - 1)
+        for j in range(1 if mode.status == Status.DETACH else 2):
+            guard = looked.guards[k, :, j]
+            size = np.max(np.abs(guard))
+            if not size > 0:
+                continue
+            if mode.status == Status.STICK or (mode.status == Status.SLIDE and j == 0):
+                found.append(Touch(k, j, 0.0, float(guard[0] / size), 0.0))
+            inner = guard[1:-1]
+            for i in np.flatnonzero((inner <= guard[:-2]) & (inner <= guard[2:])) + 1:
+                bend = float(guard[i - 1] - 2 * guard[i] + guard[i + 1]) / step**2
+                slope = (guard[i + 1] - guard[i - 1]) / (2 * step)
+                shift = -slope / bend if bend > 0 else 0.0
+                value = guard[i] + 0.5 * slope * shift
+                if bend <= 0:
+                    continue
+                found.append(Touch(k, j, float(i * step + shift), float(value / size), float(bend)))
+    return sorted(found, key=lambda touch: touch.value)
+
+
+def looked_at(curve: Curve, parameter: float, phases: Phases, touch: Touch, direction=None) -> tuple[Images, Images]:
+    """Images of all phases, and of the touched one up to the instant of touching."""
+    family, k = curve.family, touch.phase
+    status, pointing, _ = phases.modes[k]
+    partial = Mode(status, pointing, touch.guard)
+    modes = (*phases.modes, partial)
+    following = (*phases.modes[1:], phases.modes[0], partial)
+    found = looked_up(
+        family.at(parameter),
+        family.direction if direction is None else direction,
+        family.stepper,
+        modes,
+        following,
+        np.concatenate([phases.y, phases.y[k : k + 1]]),
+        np.append(phases.h, touch.time),
+    )
+    return Images(*(part[:-1] for part in found)), Images(*(part[-1:] for part in found))
+
+
+def row_of(curve: Curve, phases: Phases, touch: Touch, partial: Images) -> Float[np.ndarray, " m"]:
+    """The derivative of a smallest guard in the unknowns: its instant may move, without effect to first order."""
+    size = phases.y.shape[1]
+    row = np.zeros(len(curve.scales))
+    row[touch.phase * size : (touch.phase + 1) * size] = partial.guard_y[0]
+    row[-1] = partial.guard_parameter[0]
+    return row * curve.scales
+
+
+def grazing_near(curve: Curve, guess: Place, touch: Touch) -> Grazing | None:
+    """The cycle near a guess on which this guard touches zero."""
+    u, last = guess.u.copy(), np.inf
+    for iteration in range(MOST_ITERATIONS):
+        phases, parameter = curve.phases(u)
+        found, partial = looked_at(curve, parameter, phases, touch)
+        residuals, rows = assembled(found, phases)
+        residuals, rows = np.append(residuals, partial.guard[0]), rows * curve.scales
+        row = row_of(curve, phases, touch, partial)
+        system = np.vstack([rows, row])
+        sizes = np.max(np.abs(system), axis=1)
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        if not (np.all(np.isfinite(system)) and np.all(np.isfinite(residuals))):
+            return None
+        try:
+            step = -np.linalg.solve(system / sizes[:, None], residuals / sizes)
+        except np.linalg.LinAlgError:
+            return None
+        size = float(np.max(np.abs(step)))
+        slope = float(partial.guard_h[0])
+        shift = -slope / touch.bend if touch.bend > 0 else 0.0
+        limit = 0.25 * phases.h[touch.phase]
+        shift = float(np.clip(shift, -limit, limit))
+        if (size < EXACT and abs(shift) < 1e-9 * curve.time) or (last < 1e-10 and size > 0.5 * last):
+            place = Place(u, rows / sizes[:-1, None], found, phases, parameter, iteration)
+            return Grazing(place, touch, row / sizes[-1])
+        if size > 0.5 and iteration > 0:
+            return None
+        u, last = u + step, size
+        if touch.bend > 0:
+            touch = touch._replace(time=touch.time + shift, bend=_bend(curve, u, touch, shift))
+    return None
+
+
+def _bend(curve: Curve, u, touch: Touch, shift: float) -> float:
+    """The guard's second derivative, by the difference of its slopes."""
+    phases, parameter = curve.phases(u)
+    apart = 1e-4 * curve.time
+    slopes = [
+        looked_at(curve, parameter, phases, touch._replace(time=touch.time + shift + side * apart))[1].guard_h[0]
+        for side in (-1.0, 1.0)
+    ]
+    bend = float(slopes[1] - slopes[0]) / (2 * apart)
+    return bend if bend > 0 else touch.bend

@@ -1,0 +1,212 @@
+r"""A cycle with a prescribed sequence of contact modes, as the root of a system that stays smooth where the sequence ends.
+
+A cycle is its *phases*: in phase $k$ the motion starts at $y_k$ and keeps one contact mode for a time $h_k$, at whose end one
+guard is zero (or, in a cycle without any event, the tangential velocity rises through zero). With $φ$ the flow of one mode and
+$T$ the transition at its end,
+
+$$ T_k(φ_k(y_k, h_k)) = y_{k+1}, \qquad g_k(φ_k(y_k, h_k)) = 0, $$
+
+cyclically, is as many equations as unknowns. The flow of one mode goes on, smoothly, where its guards are no longer positive
+and for times that are negative. So what a cycle with these phases becomes beyond a grazing, where real motion has other phases,
+has a value too, and the grazing is a simple root, which Newton's method finds to rounding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State, Status
+from ..foundation.compiling import compiled, power_of_4
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .around import Round
+from .section_map import mechanics_about_sliding
+
+# The row that ends a phase: one of the two guards of its mode, or the section.
+AT_SECTION = 2
+# Instants of each phase at which its guards are looked at.
+LOOKS = 48
+# Phases that are compiled for, at least: few cycles have more.
+LEAST = 16
+
+
+class Mode(NamedTuple):
+    """What a phase is: its contact mode, and which guard ends it."""
+
+    status: int
+    direction: float  # of friction, if it slides; else zero
+    ending: int  # 0 or 1, a guard of the mode (`contact.guards`), or `AT_SECTION`
+
+
+class Phases(NamedTuple):
+    """A cycle, or a guess of one: modes, and where and how long each phase is. States are deviations from sliding."""
+
+    modes: tuple[Mode, ...]
+    y: Float[np.ndarray, "k state"]
+    h: Float[np.ndarray, " k"]  # s
+
+    @property
+    def period(self) -> float:
+        """In s."""
+        return float(np.sum(self.h))
+
+
+class Images(NamedTuple):
+    """Where each phase leads, and the derivatives."""
+
+    y: Float[np.ndarray, "k state"]  # the start of the next one
+    guard: Float[np.ndarray, " k"]
+    y_y: Float[np.ndarray, "k state state"]
+    y_h: Float[np.ndarray, "k state"]
+    y_parameter: Float[np.ndarray, "k state"]
+    guard_y: Float[np.ndarray, "k state"]
+    guard_h: Float[np.ndarray, " k"]
+    guard_parameter: Float[np.ndarray, " k"]
+
+
+def phases_around(segments: Round) -> Phases | None:
+    """The phases that one period of real motion from a point of the section consists of; none where it is at rest."""
+    count = int(segments.count)
+    modes, starts, lengths, whole = [], [], [], True
+    for k in range(count):
+        status = int(segments.contact.status[k])
+        direction = float(segments.contact.direction[k]) if status == Status.SLIDE else 0.0
+        if whole:
+            starts.append(np.asarray(segments.y[k]))
+            lengths.append(0.0)
+        lengths[-1] += float(segments.h[k])
+        whole = bool(np.any(segments.ended[k]))
+        if whole:
+            ending = int(np.argmax(segments.ended[k])) if status != Status.DETACH else 0
+            modes.append(Mode(status, direction, ending))
+    if not modes:
+        if not count:
+            return None
+        status = int(segments.contact.status[0])
+        direction = float(segments.contact.direction[0]) if status == Status.SLIDE else 0.0
+        return Phases((Mode(status, direction, AT_SECTION),), np.stack(starts), np.array(lengths))
+    if not whole:
+        # The section cuts the first phase in two.
+        starts[0], lengths[0] = starts[-1], lengths[0] + lengths[-1]
+        del starts[-1], lengths[-1]
+    return Phases(tuple(modes), np.stack(starts), np.array(lengths))
+
+
+def same_modes(a: tuple[Mode, ...], b: tuple[Mode, ...]) -> bool:
+    """Whether two sequences are the same, wherever they begin."""
+    return len(a) == len(b) and any(a == b[k:] + b[:k] for k in range(len(b)))
+
+
+def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> Images:
+    """Images of all phases and their derivatives in state, duration and along a direction in the parameters."""
+    modes = phases.modes
+    following = modes[1:] + modes[:1]
+    return looked_up(scene, direction, stepper, modes, following, phases.y, phases.h)
+
+
+def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> Images:
+    """`images` of single phases, each with the mode that follows it."""
+    count = len(modes)
+    most = power_of_4(max(count, LEAST))
+    fill = np.minimum(np.arange(most), count - 1)
+    own = np.array(modes, float)[fill]
+    next_ = np.array(following, float)[fill]
+    found = _images(
+        scene,
+        direction,
+        stepper,
+        np.asarray(y, float)[fill],
+        np.asarray(h, float)[fill],
+        own[:, 0].astype(np.int32),
+        own[:, 1],
+        own[:, 2].astype(np.int32),
+        next_[:, 0].astype(np.int32),
+        next_[:, 1],
+    )
+    return Images(*(np.asarray(part)[:count] for part in found))
+
+
+@compiled
+def _images(scene, direction, stepper, y, h, status, pointing, ending, next_status, next_pointing):
+    mechanics, mechanics_direction = jax.jvp(mechanics_about_sliding, (scene,), (direction,))
+    n2 = y.shape[1]
+    # Directions of the derivatives: the state's, the duration's, the parameter's.
+    eye = jnp.eye(n2 + 2, dtype=y.dtype)
+
+    def of_phase(y, h, *modes):
+        def along(unit):
+            tangent = jax.tree.map(lambda leaf: unit[-1] * leaf, mechanics_direction)
+            return jax.jvp(
+                lambda y, h, mechanics: _image(stepper, mechanics, y, h, *modes),
+                (y, h, mechanics),
+                (unit[:n2], unit[n2], tangent),
+            )
+
+        (reached, guard), (to, of_guard) = jax.vmap(along, out_axes=(None, 0))(eye)
+        return reached, guard, to[:n2].T, to[n2], to[n2 + 1], of_guard[:n2], of_guard[n2], of_guard[n2 + 1]
+
+    return jax.vmap(of_phase)(y, h, status, pointing, ending, next_status, next_pointing)
+
+
+def _image(stepper, mechanics: Mechanics, y: State, h, status, pointing, ending, next_status, next_pointing):
+    contact, following = Contact(status, pointing), Contact(next_status, next_pointing)
+    n, none = y.shape[0] // 2, jnp.zeros((), y.dtype)
+    begin = physics.on_constraint(mechanics, contact, y)
+    end = physics.on_constraint(mechanics, contact, stepper.in_one_mode(mechanics, contact, begin, h))
+    velocity = n + mechanics.tangential
+    guards = jnp.append(physics.guards(mechanics, contact, none, end), -end[velocity])
+    ended = jnp.arange(2) == ending
+    _, after = physics.transition(mechanics, contact, none, end, ended, none)
+    after = jnp.where(ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after))
+    return after, jnp.sum(jnp.where(jnp.arange(3) == ending, guards, 0.0))
+
+
+class Inside(NamedTuple):
+    """Guards and tangential speed inside phases, at even shares of each."""
+
+    guards: Float[np.ndarray, "k look 2"]
+    states: Float[np.ndarray, "k look state"]
+
+
+def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
+    """Guards and states along all phases, the two ends of each among them."""
+    count = len(phases.modes)
+    most = power_of_4(max(count, LEAST))
+    fill = np.minimum(np.arange(most), count - 1)
+    own = np.array(phases.modes, float)[fill]
+    found = _inside(scene, stepper, phases.y[fill], phases.h[fill], own[:, 0].astype(np.int32), own[:, 1])
+    return Inside(*(np.asarray(part)[:count] for part in found))
+
+
+@compiled
+def _inside(scene, stepper, y, h, status, pointing):
+    mechanics = mechanics_about_sliding(scene)
+
+    def of_phase(y, h, status, pointing):
+        contact = Contact(status, pointing)
+
+        def to_next(state, _):
+            following = stepper.in_one_mode(mechanics, contact, state, h / LOOKS)
+            return following, following
+
+        _, rest = jax.lax.scan(to_next, y, None, length=LOOKS)
+        states = jnp.concatenate([y[None], rest])
+        none = jnp.zeros((), y.dtype)
+        return jax.vmap(lambda state: physics.guards(mechanics, contact, none, state))(states), states
+
+    return jax.vmap(of_phase)(y, h, status, pointing)
+
+
+def parameter_direction(scene: Scene, name: str) -> Scene:
+    """The scene's derivative in one of its parameters: one there, and zero elsewhere."""
+    value = jnp.asarray(scene.parameters[name], jnp.float64)
+    return jax.jvp(lambda value: scene.replace(**{name: value}), (value,), (jnp.ones_like(value),))[1]
+
+
+def moved_along(scene: Scene, direction: Scene, by: Float[Array, ""] | float) -> Scene:
+    """The scene with a parameter changed; without the checks of `replace`, which take longer than a return."""
+    return jax.tree.map(lambda leaf, slope: np.asarray(leaf) + by * np.asarray(slope), scene, direction)

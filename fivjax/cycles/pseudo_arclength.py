@@ -1,0 +1,188 @@
+r"""A branch of cycles with one sequence of contact modes, followed by its arclength.
+
+The unknowns of `multiple_shooting` and the parameter together are one more than the equations, so the cycles form a curve. A
+point of it is found by Newton's method in the plane through a prediction, at right angles to the tangent: that passes folds,
+where the parameter turns round.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..contact import Status
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .multiple_shooting import Images, Mode, Phases, images, moved_along
+
+MOST_ITERATIONS = 10
+# Newton's method has converged where its next correction would be this small, relative to the cycle's size.
+EXACT = 3e-12
+# And where corrections no longer shrink, this is close enough: what is left is rounding.
+CLOSE = 1e-9
+
+
+class Family(NamedTuple):
+    """Scenes that differ in one parameter."""
+
+    scene: Scene
+    direction: Scene  # the derivative of the scene in the parameter
+    name: str
+    value: float  # of the parameter in `scene`
+    scale: float  # a large change of the parameter
+    stepper: EventExact
+
+    def at(self, parameter: float) -> Scene:
+        """The scene with this value of the parameter."""
+        return moved_along(self.scene, self.direction, parameter - self.value)
+
+
+class Place(NamedTuple):
+    """A cycle on the branch."""
+
+    u: Float[np.ndarray, " m"]  # the unknowns, scaled; the parameter comes last
+    jacobian: Float[np.ndarray, "m-1 m"]
+    images: Images
+    phases: Phases
+    parameter: float
+    iterations: int
+
+
+class Curve:
+    """Cycles with one sequence of modes."""
+
+    def __init__(self, family: Family, phases: Phases):
+        """`phases`, a cycle of these modes, or a guess of one: sizes are measured in its own."""
+        self.family, self.modes = family, phases.modes
+        self.weights = np.asarray(family.scene.structure.weights)
+        self.size = float(np.max(np.linalg.norm(self.weights * phases.y, axis=-1)))
+        self.time = phases.period
+        self.of_state = np.tile(self.size / self.weights, len(self.modes))
+        self.scales = np.concatenate([self.of_state, np.full(len(self.modes), self.time), [family.scale]])
+
+    def unknowns(self, phases: Phases, parameter: float) -> Float[np.ndarray, " m"]:
+        """Phases and parameter as one vector, in the curve's own units."""
+        return np.concatenate([phases.y.ravel(), phases.h, [parameter]]) / self.scales
+
+    def phases(self, u: Float[np.ndarray, " m"]) -> tuple[Phases, float]:
+        """What a vector stands for."""
+        count, values = len(self.modes), u * self.scales
+        many = count * len(self.weights)
+        return Phases(self.modes, values[:many].reshape(count, -1), values[many:-1]), float(values[-1])
+
+    def system(self, u: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray, Images, Phases, float]:
+        """Residuals and their derivatives, each equation in units of its own derivatives."""
+        phases, parameter = self.phases(u)
+        family = self.family
+        found = images(family.at(parameter), family.direction, family.stepper, phases)
+        residuals, rows = assembled(found, phases)
+        rows = rows * self.scales
+        sizes = np.max(np.abs(rows), axis=1)
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        return residuals / sizes, rows / sizes[:, None], found, phases, parameter
+
+    def corrected(
+        self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
+    ) -> Place | None:
+        """The cycle next to a guess: in the plane through the guess with this normal, or the nearest, without one."""
+        target, last = u.copy(), np.inf
+        for iteration in range(MOST_ITERATIONS):
+            residuals, rows, found, phases, parameter = self.system(u)
+            if not (np.all(np.isfinite(residuals)) and np.all(np.isfinite(rows))):
+                return None
+            try:
+                if normal is None:
+                    step = -np.linalg.lstsq(rows, residuals, rcond=None)[0]
+                else:
+                    system = np.vstack([rows, normal])
+                    step = -np.linalg.solve(system, np.append(residuals, normal @ (u - target)))
+            except np.linalg.LinAlgError:
+                return None
+            size = float(np.max(np.abs(step)))
+            if size < EXACT or (last < CLOSE and size > 0.5 * last):
+                return Place(u, rows, found, phases, parameter, iteration)
+            if size > 1.0 or (iteration > 4 and size > last):
+                return None
+            u, last = u + step, size
+        return None
+
+    def tangent(self, place: Place, like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
+        """The curve's direction there, of unit length, on the side of `like`."""
+        _, _, axes = np.linalg.svd(place.jacobian)
+        found = axes[-1]
+        return found if like is None or found @ like >= 0 else -found
+
+    def along(self, place: Place, tangent: Float[np.ndarray, " m"], by: float) -> Place | None:
+        """The cycle about a distance `by` further on along the tangent."""
+        return self.corrected(place.u + by * tangent, tangent)
+
+    def at_parameter(self, guess: Float[np.ndarray, " m"], parameter: float) -> Place | None:
+        """The cycle near a guess at this value of the parameter."""
+        u, normal = guess.copy(), np.zeros_like(guess)
+        u[-1], normal[-1] = parameter / self.scales[-1], 1.0
+        return self.corrected(u, normal)
+
+
+def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
+    """How many times the guard that ends a phase is zero at the phase's own start.
+
+    Slip that sets out the other way is zero there once, after sticking twice; a gap that opens, three times. The duration zero
+    would solve their equations always, so these roots are divided out.
+    """
+    before, own = modes[k - 1], modes[k]
+    if own.status == Status.SLIDE and own.ending == 1:
+        if before.status == Status.SLIDE and before.ending == 1:
+            return 1
+        return 2 if before.status == Status.STICK and len(modes) > 1 else 0
+    return 3 if own.status == Status.DETACH and before.status != Status.DETACH else 0
+
+
+def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of all equations of a cycle, and their derivatives in states, durations and the parameter."""
+    count, size = phases.y.shape
+    many = count * size
+    found = _without_roots_at_start(found, phases)
+    residuals = np.concatenate([(found.y - np.roll(phases.y, -1, axis=0)).ravel(), found.guard])
+    rows = np.zeros((many + count, many + count + 1))
+    for k in range(count):
+        own, following = slice(k * size, (k + 1) * size), (k + 1) % count
+        rows[own, own] += found.y_y[k]
+        rows[own, following * size : (following + 1) * size] -= np.eye(size)
+        rows[own, many + k] = found.y_h[k]
+        rows[own, -1] = found.y_parameter[k]
+        rows[many + k, own] = found.guard_y[k]
+        rows[many + k, many + k] = found.guard_h[k]
+        rows[many + k, -1] = found.guard_parameter[k]
+    return residuals, rows
+
+
+def _without_roots_at_start(found: Images, phases: Phases) -> Images:
+    power = np.array([roots_at_start(phases.modes, k) for k in range(len(phases.modes))])
+    h = phases.h / phases.period
+    h = np.where(np.abs(h) < 1e-9, 1e-9, h)
+    share = h**-power
+    return found._replace(
+        guard=found.guard * share,
+        guard_y=found.guard_y * share[:, None],
+        guard_h=found.guard_h * share - power * found.guard * share / (h * phases.period),
+        guard_parameter=found.guard_parameter * share,
+    )
+
+
+def monodromy(found: Images) -> Float[np.ndarray, "state state"]:
+    """The derivative of the return map from the first phase's start to the next one's, by saltation at each event."""
+    matrix = np.eye(found.y.shape[1])
+    for k in range(len(found.guard)):
+        with np.errstate(all="ignore"):
+            saltation = found.y_y[k] - np.outer(found.y_h[k], found.guard_y[k]) / found.guard_h[k]
+        matrix = saltation @ matrix
+    return matrix
+
+
+def multipliers_of(found: Images) -> Complex[np.ndarray, " m"]:
+    """Floquet multipliers without the one of the cycle's own direction, largest first; not a number at a grazing."""
+    matrix = monodromy(found)
+    if not np.all(np.isfinite(matrix)):
+        return np.full(len(matrix) - 1, np.nan, complex)
+    values = np.linalg.eigvals(matrix).astype(complex)
+    return values[np.lexsort((-values.imag, -np.abs(values)))][:-1]

@@ -1,0 +1,68 @@
+"""What the motion that starts on a computed cycle does really: its modes, its peak and its point on the section."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..contact import Contact, Status
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .around import Seen, seen_around
+from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around, same_modes
+from .section_map import Point, return_with_jacobian
+
+# Crossings of the section in one period, at most.
+MOST_CROSSINGS = 24
+# A motion is back where it started within this share of its size, or it is not the cycle.
+BACK = 1e-6
+
+
+class Real(NamedTuple):
+    """One period of the motion that starts on a computed cycle."""
+
+    start: Point  # where it was looked at from, in the middle of the longest phase
+    seen: Seen
+    phases: Phases | None
+
+    def has_the_modes_of(self, phases: Phases) -> bool:
+        """Whether it goes through the same modes as these phases."""
+        return self.phases is not None and same_modes(self.phases.modes, phases.modes)
+
+
+def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | None:
+    """One period of the real motion from a cycle; none where what was computed runs backwards in time."""
+    # A phase that is just vanishing, on a special point, lasts as long as rounding says.
+    if not (np.all(np.isfinite(phases.y)) and np.all(phases.h > -1e-9 * phases.period)):
+        return None
+    # From the middle of a phase no event is near, so that none is met twice or not at all.
+    longest = int(np.argmax(np.where([mode.status == Status.STICK for mode in phases.modes], 0.0, phases.h)))
+    status, direction, ending = phases.modes[longest]
+    states = phases.y if ending == AT_SECTION else inside(scene, stepper, phases).states[:, LOOKS // 2]
+    contact = Contact(jnp.asarray(status, jnp.int32), jnp.asarray(direction if direction else 1.0, jnp.float64))
+    start = Point(jnp.asarray(states[longest]), contact)
+    seen = seen_around(scene, stepper, start, phases.period, 60)
+    if int(seen.segments.count) >= len(seen.segments.h):
+        seen = seen_around(scene, stepper, start, phases.period, 250)
+    return Real(start, seen, phases_around(seen.segments))
+
+
+def on_section(scene: Scene, stepper: EventExact, real: Real) -> Point | None:
+    """Where a motion crosses the section first; none if it does not."""
+    if float(real.start.y[scene.structure.size + scene.structure.tangential]) == 0.0:
+        return real.start
+    found, _ = return_with_jacobian(scene, stepper, real.start, 1)
+    return found.point if bool(found.arrived) else None
+
+
+def crossings_of(scene: Scene, stepper: EventExact, point: Point, weights: Float[np.ndarray, " state"]) -> int | None:
+    """How often a cycle crosses the section until it is back at a point of it; none if it does not come back."""
+    y = weights * np.asarray(point.y)
+    now = point
+    for count in range(1, MOST_CROSSINGS + 1):
+        found, _ = return_with_jacobian(scene, stepper, now, 1)
+        now = found.point
+        if np.linalg.norm(weights * np.asarray(now.y) - y) <= BACK * np.linalg.norm(y):
+            return count
+    return None

@@ -1,0 +1,108 @@
+r"""Derivatives of where a special point lies, in all parameters of the scene, by the implicit function theorem.
+
+A special point is a root of the cycle's equations $F(u, λ; θ) = 0$ together with one more. At a grazing that is the smallest
+value of a guard, at the vanishing of a phase its duration: one linear system. A fold has a vector $l$ with $l^T ∂F/∂u = 0$, so
+$dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit circle, $|m|(λ, θ) = 1$, and its derivatives along the family
+of cycles are differences of values that are good to rounding.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from .following import Point, sliding_rates
+from .grazing import looked_at
+from .multiple_shooting import images, moved_along, parameter_direction
+from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
+from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier
+
+# Relative change of a parameter over which multipliers are compared.
+APART = 1e-6
+
+
+def special_derivatives(
+    family: Family, points: list[Point]
+) -> tuple[list[str], Float[np.ndarray, "point of"]]:
+    """Names of the parameters, and the derivatives for each point; not a number where there are none."""
+    scene = family.scene
+    names = [name for name, value in scene.parameters.items() if np.ndim(value) == 0 and name != family.name]
+    values = np.full((len(points), len(names)), np.nan)
+    for row, point in enumerate(points):
+        if point.special is not None:
+            for column, name in enumerate(names):
+                values[row, column] = _derivative(family, point.special, name)
+    return names, values
+
+
+def _derivative(family: Family, special: Special, name: str) -> float:
+    curve, place = special.curve, special.place
+    if special.name == MEETS_SLIDING:
+        return _of_stability_limit(family, place.parameter, name)
+    direction = parameter_direction(family.scene, name)
+    found = images(family.at(place.parameter), direction, family.stepper, place.phases)
+    _, rows = assembled(found, place.phases)
+    _, own = assembled(place.images, place.phases)
+    slope, own = rows[:, -1], own * curve.scales
+    if special.name == FOLD:
+        left, _, _ = np.linalg.svd(own[:, :-1] / np.max(np.abs(own), axis=1, keepdims=True))
+        null = left[:, -1] / np.max(np.abs(own), axis=1)
+        return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
+    if special.multiplier is not None:
+        return _of_multiplier(family, special, name, own, slope)
+    if special.row is None:
+        return np.nan
+    last, row = 0.0, special.row
+    if special.grazing is not None:
+        _, partial = looked_at(curve, place.parameter, place.phases, special.grazing.touch, direction)
+        _, itself = looked_at(curve, place.parameter, place.phases, special.grazing.touch)
+        last, size = float(partial.guard_parameter[0]), itself.guard_y.shape[1]
+        row = np.zeros(len(curve.scales))
+        k = special.grazing.touch.phase
+        row[k * size : (k + 1) * size], row[-1] = itself.guard_y[0], itself.guard_parameter[0]
+        row = row * curve.scales
+    system = np.vstack([own, row])
+    sizes = np.max(np.abs(system), axis=1)
+    change = np.linalg.solve(system / sizes[:, None], -np.append(slope, last) / sizes)
+    return float(change[-1] * curve.scales[-1])
+
+
+def _of_stability_limit(family: Family, limit: float, name: str) -> float:
+    def slope(other: str) -> float:
+        scene, direction = family.at(limit), parameter_direction(family.scene, other)
+        value = abs(float(np.asarray(scene.parameters[other])))
+        by = APART * (value if value else 1.0)
+        low, high = (sliding_rates(moved_along(scene, direction, side * by))[0].real for side in (-1.0, 1.0))
+        return float(high - low) / (2 * by)
+
+    return -slope(name) / slope(family.name)
+
+
+def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray, slope: np.ndarray) -> float:
+    """By differences of the multiplier's size along the families over either parameter."""
+    curve, place = special.curve, special.place
+    scene = family.at(place.parameter)
+    value = float(np.asarray(scene.parameters[name]))
+    by = APART * (abs(value) if value else 1.0)
+    through_other = np.linalg.solve(own[:, :-1], -slope)
+    through_own = np.linalg.solve(own[:, :-1], -own[:, -1])
+    step = APART * max(abs(place.parameter), 0.1 * family.scale) / family.scale
+
+    def size(own_step: float, other_step: float) -> float:
+        u = place.u.copy()
+        u[:-1] += own_step * through_own + other_step * through_other
+        u[-1] += own_step
+        moved = family._replace(scene=moved_along(family.scene, parameter_direction(family.scene, name), other_step))
+        at = _solved(Curve(moved, place.phases), u, curve)
+        if at is None:
+            return np.nan
+        which = critical_multiplier(multipliers_of(at.images), special.name)
+        return np.nan if which is None else abs(which)
+
+    with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)
+    with_own = (size(step, 0.0) - size(-step, 0.0)) / (2 * step)
+    return float(-with_other / with_own * curve.scales[-1])
+
+
+def _solved(curve: Curve, u: np.ndarray, like: Curve) -> Place | None:
+    # In the units of the curve that the guess was made in.
+    values = u * like.scales
+    return curve.at_parameter(values / curve.scales, values[-1])

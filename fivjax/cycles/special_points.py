@@ -1,0 +1,197 @@
+"""Special points of a branch: folds, period doublings, Neimark–Sacker bifurcations, and changes of the contact modes."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..contact import Status
+from .grazing import NAMES, Grazing, grazing_near, touches
+from .multiple_shooting import AT_SECTION, Mode, Phases, same_modes
+from .pseudo_arclength import Curve, Place, multipliers_of
+
+FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
+MEETS_SLIDING = "amplitude meets the sliding equilibrium"
+# Multipliers this close to the real axis are real.
+REAL = 1e-9
+# A branch that runs at one value of the parameter, to rounding, has no folds: cycles of a linear motion at its stability limit.
+LEVEL = 1e-8
+
+
+class Special(NamedTuple):
+    """A special point."""
+
+    name: str
+    curve: Curve
+    place: Place
+    # The equation that it adds to the cycle's: a row in the unknowns; none for a fold, which adds none.
+    row: Float[np.ndarray, " m"] | None = None
+    grazing: Grazing | None = None
+    multiplier: complex | None = None
+
+
+class Change(NamedTuple):
+    """How one sequence of modes becomes another with fewer phases."""
+
+    phase: int  # in the longer sequence, the one that vanishes, or that two become one at
+    merges: bool  # whether its neighbours become one phase, inside which a guard then touches zero
+    word: str  # what is inserted or removed
+
+
+# ------------------------------------------------------------------------------------------------------ smooth branches
+
+
+def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) -> list[Special]:
+    """Folds, period doublings and Neimark–Sacker bifurcations between two neighbouring cycles, in order."""
+    length = float(tangent @ (b.u - a.u))
+    found: list[tuple[float, Special]] = []
+
+    def place(s: float) -> Place | None:
+        return a if s == 0 else curve.along(a, tangent, s)
+
+    end = curve.tangent(b, tangent)
+    if tangent[-1] * end[-1] < 0 and max(abs(tangent[-1]), abs(end[-1])) > LEVEL:
+
+        def turning(at: Place) -> float:
+            return float(curve.tangent(at, tangent)[-1])
+
+        s, at = _root(place, turning, length, turning(a), turning(b))
+        if at is not None:
+            found.append((s, Special(FOLD, curve, at)))
+    before, after = multipliers_of(a.images), multipliers_of(b.images)
+    for name, test in ((DOUBLING, doubling), (TORUS, pairing)):
+        values = test(before), test(after)
+        if np.all(np.isfinite(values)) and values[0] * values[1] < 0:
+            s, at = _root(place, lambda at, test=test: test(multipliers_of(at.images)), length, *values)
+            if at is not None:
+                which = critical_multiplier(multipliers_of(at.images), name)
+                if which is not None:
+                    found.append((s, Special(name, curve, at, multiplier=complex(which))))
+    return [special for _, special in sorted(found, key=lambda pair: pair[0])]
+
+
+def doubling(values: Complex[np.ndarray, " m"]) -> float:
+    """A number that changes its sign where a multiplier passes -1."""
+    return float(np.prod(values + 1).real)
+
+
+def pairing(values: Complex[np.ndarray, " m"]) -> float:
+    """A number that changes its sign where a pair of conjugate multipliers passes the unit circle."""
+    upper = values[values.imag > REAL * np.maximum(np.abs(values), REAL)]
+    return float(np.prod(np.abs(upper) - 1)) if len(upper) else np.nan
+
+
+def critical_multiplier(values: Complex[np.ndarray, " m"], name: str) -> complex | None:
+    """The multiplier that passes the unit circle."""
+    chosen = values.real < 0 if name == DOUBLING else values.imag > REAL * np.abs(values)
+    if not np.any(chosen):
+        return None
+    candidates = values[chosen]
+    return complex(candidates[np.argmin(np.abs(np.abs(candidates) - 1))])
+
+
+def _root(place: Callable[[float], Place | None], test: Callable[[Place], float], length: float, low, high):
+    """The distance along a step at which a test function vanishes, and the cycle there."""
+    from scipy.optimize import brentq
+
+    class Lost(Exception):
+        pass
+
+    def value(s: float) -> float:
+        if s in (0.0, length):
+            return low if s == 0 else high
+        at = place(s)
+        found = np.nan if at is None else test(at)
+        if not np.isfinite(found):
+            raise Lost
+        return found
+
+    try:
+        s = float(brentq(value, 0.0, length, xtol=1e-13, rtol=1e-13))
+    except Lost:
+        return 0.0, None
+    return s, place(s)
+
+
+# ------------------------------------------------------------------------------------------------- changes of the modes
+
+
+def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | None:
+    """How the longer sequence loses phases and becomes the shorter; none if it takes more than one change."""
+    longer, shorter = tuple(longer), tuple(shorter)
+    count = len(longer)
+
+    def alike(a: Mode, b: Mode) -> bool:
+        return a[:2] == b[:2]
+
+    if len(shorter) == 1 and shorter[0].ending == AT_SECTION:
+        # Without any event the section stands in for one.
+        extra = [i for i in range(count) if not alike(longer[i], shorter[0])]
+        return Change(extra[0], True, _inserted(longer[extra[0]])) if count == 2 and len(extra) == 1 else None
+    for i in range(count):
+        before, after = longer[i - 1], longer[(i + 1) % count]
+        if count - len(shorter) == 2 and alike(before, after) and count > 2:
+            kept = [mode for j, mode in enumerate(longer) if j not in (i, (i - 1) % count)]
+            if same_modes(tuple(kept), shorter):
+                return Change(i, True, _inserted(longer[i]))
+        if count - len(shorter) == 1:
+            kept = longer[:i] + longer[i + 1 :]
+            if same_modes(kept, shorter):
+                split = alike(longer[i], after) and longer[i].ending != after.ending
+                split = split or (alike(longer[i], after) and longer[i].status == Status.DETACH)
+                return Change(i, split, "impact" if split else _inserted(longer[i]))
+    return None
+
+
+def _inserted(mode: Mode) -> str:
+    return {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}[Status(mode.status)]
+
+
+def grazing_of(curve: Curve, guess: Place, lowest: int = 4) -> Grazing | None:
+    """The cycle next to a guess on which a guard touches zero: the nearest such guard's."""
+    for touch in sorted(touches(curve, guess), key=lambda touch: abs(touch.value))[:lowest]:
+        found = grazing_near(curve, guess, touch)
+        if found is not None:
+            return found
+    return None
+
+
+def vanishing(curve: Curve, guess: Place, phase: int) -> Special | None:
+    """The cycle next to a guess on which a phase has shrunk to nothing."""
+    u, normal = guess.u.copy(), np.zeros_like(guess.u)
+    place_of = len(curve.of_state) + phase
+    u[place_of], normal[place_of] = 0.0, 1.0
+    place = curve.corrected(u, normal)
+    return None if place is None else Special("", curve, place, row=normal)
+
+
+def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> str:
+    """What to call a change of the modes."""
+    what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}"
+    if grazing is None:
+        return what or "contact modes change"
+    mode = grazing.place.phases.modes[grazing.touch.phase]
+    how = NAMES[Status(mode.status), grazing.touch.guard]
+    return f"{how}: {what}" if what else how
+
+
+def without(phases: Phases, change: Change, shorter: Sequence[Mode]) -> Phases | None:
+    """The phases with the vanishing one taken out."""
+    count, i = len(phases.modes), change.phase
+    y, h = phases.y, phases.h
+    if len(shorter) == 1 and shorter[0].ending == AT_SECTION:
+        return None
+    if not change.merges or count - len(shorter) == 1:
+        keep = [j for j in range(count) if j != i]
+        h = h.copy()
+        if change.merges:
+            following = (i + 1) % count
+            y = y.copy()
+            y[following], h[following] = y[i], h[i] + h[following]
+        return Phases(tuple(phases.modes[j] for j in keep), y[keep], h[keep])
+    before, following = (i - 1) % count, (i + 1) % count
+    y, h = y.copy(), h.copy()
+    y[following], h[following] = y[before], h[before] + h[i] + h[following]
+    keep = [j for j in range(count) if j not in (i, before)]
+    return Phases(tuple(phases.modes[j] for j in keep), y[keep], h[keep])

@@ -1,0 +1,119 @@
+"""Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reference
+from reference import cycles
+
+import fivjax as fj
+
+REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
+
+
+def paper(belt_speed: float, mu: float) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), belt_speed=belt_speed, load=fj.ConstantLoad(100.0))
+
+
+def benchmark_a(belt_speed: float) -> fj.Scene:
+    structure = fj.Structure(np.eye(2), np.diag([0.1, 0.0]), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    return fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), belt_speed, fj.ConstantLoad(1.0))
+
+
+def specials(branch) -> list[str]:
+    return [name for name in branch.special.values if name]
+
+
+@pytest.fixture(scope="module")
+def branch():
+    """From the stable cycle at μ = 0.2 down over its fold, and up again along the unstable one."""
+    scene = paper(1.0, 0.2)
+    return fj.continue_cycle(scene, "mu", (0.16, 0.21), start=fj.limit_cycle(scene), derivatives=True)
+
+
+def test_the_branch_passes_its_fold_and_names_what_happens_on_the_way(branch):
+    """The unstable cycle loses its lift-off, then its slip back; each is said, and both ends say why they are."""
+    assert set(specials(branch)) == {
+        "fold",
+        "grazing of N: lift-off removed",
+        "edge of the friction cone: slip removed",
+    }
+    assert branch.begins == branch.ends == "The bound mu = 0.21 is reached."
+    np.testing.assert_allclose(branch.parameter.values[[0, -1]], 0.21, rtol=1e-14)
+    fold = int(np.argmax(branch.special.values == "fold"))
+    assert not branch.stable.values[:fold].any() and branch.stable.values[fold + 1 :].all()
+    assert branch.word.values[0] == "stick – slide"
+    assert branch.word.values[-1] == "stick – slide – detach – slide – slide back"
+
+
+def test_the_fold_is_where_a_multiplier_is_one(branch):
+    fold = branch.isel(point=int(np.argmax(branch.special.values == "fold")))
+    assert abs(complex(fold.multipliers[0]) - 1) < 1e-9
+    assert float(fold.parameter) == pytest.approx(float(branch.parameter.min()), abs=1e-15)
+
+
+def test_special_points_have_the_derivatives_that_scaling_demands(branch):
+    """Forces, speeds and displacements scale together: no border in μ moves with load and belt speed by the same factor."""
+    for i in np.flatnonzero(branch.special.values != ""):
+        slope = branch.d_special.isel(point=i)
+        assert float(slope.sel(of="force")) * 100.0 == pytest.approx(-float(slope.sel(of="belt_speed")), rel=1e-6)
+        stiffer = {name: branch.attrs and float(slope.sel(of=name)) for name in ("m1", "m2", "c1", "c2", "k1", "k2")}
+        values = dict(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3)
+        # Time is measured anew: masses by s², dampers by s, and the belt by 1/s.
+        change = sum(share * values[n] * stiffer[n] for n, share in zip(values, (2, 2, 1, 1, 0, 0), strict=True))
+        assert change == pytest.approx(float(slope.sel(of="belt_speed")), rel=1e-5)
+
+
+def test_cycle_at_gives_the_cycle_back(branch):
+    for i in (0, len(branch.point) // 2, len(branch.point) - 1):
+        cycle = fj.cycle_at(branch, i)
+        assert cycle.residual < 1e-10 and cycle.stable == bool(branch.stable[i])
+        assert cycle.period == pytest.approx(float(branch.period[i]), rel=1e-11)
+        np.testing.assert_allclose(abs(cycle.multipliers[1]), abs(branch.multipliers.values[i, 0]), rtol=1e-6)
+    with pytest.raises(ValueError, match="`i` be the place of one of its points"):
+        fj.cycle_at(branch, 10**6)
+
+
+@pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
+def test_no_cycle_is_born_below_the_fold(branch):
+    """An independent solver started on the fold's cycle: 1e-4 above it goes on for ever, 1e-4 below it fades."""
+    place = int(np.argmax(branch.special.values == "fold"))
+    deviation = fj.cycle_at(branch, place).deviation
+    scenes = [
+        reference.paper_scene(mu=float(branch.parameter[place]) + by, belt_speed=1.0, deviation=(1.02 * deviation))
+        for by in (1e-4, -1e-4)
+    ]
+    for scene in scenes:
+        scene["deviation"] = (scene["deviation"][:3], scene["deviation"][3:])
+    assert list(reference.fate(scenes).fate) == ["sustained", "slides"]
+
+
+def test_what_is_no_parameter_or_no_bound_is_refused():
+    scene = paper(1.0, 0.2)
+    with pytest.raises(ValueError, match="parameter"):
+        fj.continue_cycle(scene, "p", (0.0, 1.0))
+    with pytest.raises(ValueError, match="must hold the scene's own mu"):
+        fj.continue_cycle(scene, "mu", (0.3, 0.4))
+    with pytest.raises(ValueError, match="pair of numbers"):
+        fj.continue_cycle(scene, "mu", 0.3)
+
+
+@pytest.mark.slow
+def test_benchmark_a_s_unstable_branch_runs_from_the_hopf_point_to_the_grazing():
+    """Both ends have values of their own: a closed form, and a root that an ODE solver found."""
+    known = cycles.sliding_cycle(1.5)
+    scene = benchmark_a(1.5)
+    branch = fj.continue_cycle(scene, "belt_speed", (1.0, 2.0), ([known["lowest"], 0, 0, 0], 1), derivatives=True)
+    assert specials(branch) == ["amplitude meets the sliding equilibrium", "grazing of slip: stick inserted"]
+    hopf, grazing = (branch.isel(point=int(i)) for i in np.flatnonzero(branch.special.values != ""))
+    assert float(hopf.parameter) == pytest.approx(0.5 * np.log(10.0), abs=1e-12)
+    assert float(grazing.parameter) == pytest.approx(REFERENCE["benchmark_a"]["grazing_speed"], abs=1e-9)
+    # v = ln(N Δμ d / c) / d
+    assert float(hopf.d_special.sel(of="force")) == pytest.approx(0.5, rel=1e-7)
+    assert float(hopf.d_special.sel(of="mu_static")) == pytest.approx(1.0, rel=1e-7)
+    assert float(hopf.d_special.sel(of="decay")) == pytest.approx(0.25 - 0.25 * np.log(10.0), rel=1e-7)
+    # Beyond the grazing it is the stick–slip cycle, which goes back.
+    assert branch.stable.values[-1] and float(branch.parameter[-1]) == 1.0
+    assert branch.word.values[-1] == "stick – slide"
