@@ -59,7 +59,7 @@ def test_special_points_have_the_derivatives_that_scaling_demands(branch):
     for i in np.flatnonzero(branch.special.values != ""):
         slope = branch.d_special.isel(point=i)
         assert float(slope.sel(of="force")) * 100.0 == pytest.approx(-float(slope.sel(of="belt_speed")), rel=1e-6)
-        stiffer = {name: branch.attrs and float(slope.sel(of=name)) for name in ("m1", "m2", "c1", "c2", "k1", "k2")}
+        stiffer = {name: float(slope.sel(of=name)) for name in ("m1", "m2", "c1", "c2", "k1", "k2")}
         values = dict(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3)
         # Time is measured anew: masses by s², dampers by s, and the belt by 1/s.
         change = sum(share * values[n] * stiffer[n] for n, share in zip(values, (2, 2, 1, 1, 0, 0), strict=True))
@@ -71,7 +71,7 @@ def test_cycle_at_gives_the_cycle_back(branch):
         cycle = fj.cycle_at(branch, i)
         assert cycle.residual < 1e-10 and cycle.stable == bool(branch.stable[i])
         assert cycle.period == pytest.approx(float(branch.period[i]), rel=1e-11)
-        np.testing.assert_allclose(abs(cycle.multipliers[1]), abs(branch.multipliers.values[i, 0]), rtol=1e-6)
+        assert np.min(np.abs(cycle.multipliers - branch.multipliers.values[i, 0])) < 1e-7
     with pytest.raises(ValueError, match="`i` be the place of one of its points"):
         fj.cycle_at(branch, 10**6)
 

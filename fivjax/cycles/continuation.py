@@ -24,12 +24,12 @@ from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_loa
 from .following import Point, follow_branch, seen
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
 from .pseudo_arclength import Curve, Family
-from .real_motion import crossings_of, on_section
 from .search import NoLimitCycle, limit_cycle
 from .section_map import Point as SectionPoint
 from .section_map import return_with_jacobian, sliding_state
-from .special_derivatives import special_derivatives
+from .special_derivatives import derivatives_of_special_points
 from .special_points import MEETS_SLIDING
+from .verification import crossings_of, on_section
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -110,7 +110,7 @@ def continue_cycle(
     first = seen(family, curve, place)
     down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
     along = [*reversed(down.points), first, *up.points]
-    slopes = special_derivatives(family, along) if derivatives else None
+    slopes = derivatives_of_special_points(family, along) if derivatives else None
     return labelled(_dataset(xr, family, along, slopes), final, parameter=parameter).assign_attrs(
         parameter=parameter, begins=down.ending, ends=up.ending
     )
@@ -132,7 +132,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
         value = float(row["parameter"])
     except (AttributeError, KeyError, IndexError, ValueError):
         raise ValueError(
-            f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, but is {i!r}."
+            f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, "
+            f"but is {i!r}."
         ) from None
     scene = Scene.from_dataset(branch).replace(**{name: value})
     stepper = EventExact()

@@ -10,8 +10,8 @@ from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from .multiple_shooting import AT_SECTION, Phases
 from .pseudo_arclength import Curve, Family, Place, multipliers_of
-from .real_motion import Real, on_section, real_motion
 from .special_points import MEETS_SLIDING, Special, between, change_between, grazing_of, name_of, vanishing, without
+from .verification import Real, on_section, real_motion
 
 # Lengths of steps, in the curve's own units (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
@@ -61,9 +61,7 @@ def is_real(family: Family, place: Place) -> bool:
     return real is not None and real.has_the_modes_of(place.phases)
 
 
-def follow_branch(
-    family: Family, start: Point, sense: float, bounds: tuple[float, float], most: int
-) -> Followed:
+def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[float, float], most: int) -> Followed:
     """The branch from a cycle on, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
     curve, here = start.curve, start
     tangent = curve.tangent(here.place, None)
@@ -74,13 +72,15 @@ def follow_branch(
         # Not past the equilibrium, where a cycle has shrunk to nothing.
         step = min(step, 0.5 * _smallness(curve, here.place))
         following = curve.along(here.place, tangent, step)
-        turned = None if following is None else curve.tangent(following, tangent)
-        if following is None or turned @ tangent < STRAIGHT:
-            if step > 4 * SHORTEST and (following is None or step > 1e-3):
-                step *= 0.5
-                continue
-            if following is None:
+        if following is None:
+            if step <= 4 * SHORTEST:
                 return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))
+            step *= 0.5
+            continue
+        turned = curve.tangent(following, tangent)
+        if turned @ tangent < STRAIGHT and step > 1e-3:
+            step *= 0.5
+            continue
         beyond = not bounds[0] <= following.parameter <= bounds[1]
         last = seen(family, curve, following)
         if last.real is None or not last.real.has_the_modes_of(following.phases):
@@ -236,8 +236,9 @@ def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent,
         if not special.name:
             special = special._replace(name=name_of(None, change, removed=False))
         away = longer.tangent(first, None)
-        index = None if change is None else len(longer.of_state) + change.phase
-        if index is not None and abs(away[index]) > 1e-6 and not (change.merges and change.word == "impact"):
+        vanishes = change is not None and change.word != "impact"
+        index = len(longer.of_state) + change.phase if change is not None else 0
+        if vanishes and abs(away[index]) > 1e-6:
             away = away * np.sign(away[index])
         else:
             away = _outward(family, longer, first, away, special.place)

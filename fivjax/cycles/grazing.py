@@ -1,8 +1,8 @@
 r"""Where a cycle's sequence of contact modes ends: a guard that just touches zero inside a phase.
 
 Of the two sequences that meet there, the one with fewer phases goes on smoothly beyond. On it the place is a simple root of the
-cycle's equations together with $g = 0$ and $\dot g = 0$ at one instant of one phase: Newton's method locates it to rounding, and
-the implicit function theorem differentiates it.
+cycle's equations together with $g = 0$ and $\dot g = 0$ at one instant of one phase: Newton's method locates it to rounding,
+and the implicit function theorem differentiates it.
 """
 
 from typing import NamedTuple

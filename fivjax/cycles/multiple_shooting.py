@@ -161,7 +161,9 @@ def _image(stepper, mechanics: Mechanics, y: State, h, status, pointing, ending,
     guards = jnp.append(physics.guards(mechanics, contact, none, end), -end[velocity])
     ended = jnp.arange(2) == ending
     _, after = physics.transition(mechanics, contact, none, end, ended, none)
-    after = jnp.where(ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after))
+    after = jnp.where(
+        ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after)
+    )
     return after, jnp.sum(jnp.where(jnp.arange(3) == ending, guards, 0.0))
 
 

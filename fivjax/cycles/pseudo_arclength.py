@@ -81,9 +81,7 @@ class Curve:
         sizes = np.where(sizes > 0, sizes, 1.0)
         return residuals / sizes, rows / sizes[:, None], found, phases, parameter
 
-    def corrected(
-        self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
-    ) -> Place | None:
+    def corrected(self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None) -> Place | None:
         """The cycle next to a guess: in the plane through the guess with this normal, or the nearest, without one."""
         target, last = u.copy(), np.inf
         for iteration in range(MOST_ITERATIONS):

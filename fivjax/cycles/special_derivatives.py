@@ -2,8 +2,8 @@ r"""Derivatives of where a special point lies, in all parameters of the scene, b
 
 A special point is a root of the cycle's equations $F(u, λ; θ) = 0$ together with one more. At a grazing that is the smallest
 value of a guard, at the vanishing of a phase its duration: one linear system. A fold has a vector $l$ with $l^T ∂F/∂u = 0$, so
-$dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit circle, $|m|(λ, θ) = 1$, and its derivatives along the family
-of cycles are differences of values that are good to rounding.
+$dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit circle, $|m|(λ, θ) = 1$, and its derivatives along the
+family of cycles are differences of values that are good to rounding.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier
 APART = 1e-6
 
 
-def special_derivatives(
+def derivatives_of_special_points(
     family: Family, points: list[Point]
 ) -> tuple[list[str], Float[np.ndarray, "point of"]]:
     """Names of the parameters, and the derivatives for each point; not a number where there are none."""

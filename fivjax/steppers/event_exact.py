@@ -146,7 +146,6 @@ class EventExact(AbstractStepper):
         states, _ = _series(mechanics, contact, load, y, self.order_, unit)
         return jnp.stack(states), unit
 
-
     def in_one_mode(self, mechanics: Mechanics, contact: Contact, y: State, h: Float[Array, ""]) -> State:
         """The motion in one contact mode for a time `h` (s, of either sign), whatever its guards say; under no load."""
         unit = _time_unit(mechanics)
