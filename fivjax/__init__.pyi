@@ -38,6 +38,8 @@ from .model.friction import ExponentialDecay as ExponentialDecay
 from .model.load import AbstractLoad as AbstractLoad
 from .model.load import ConstantLoad as ConstantLoad
 from .model.load import Pulse as Pulse
+from .model.reduction import Reduction as Reduction
+from .model.reduction import craig_bampton as craig_bampton
 from .model.scene import Scene as Scene
 from .model.scene import painleve_friction as painleve_friction
 from .model.scene import sliding_equilibrium as sliding_equilibrium

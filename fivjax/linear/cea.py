@@ -4,16 +4,23 @@ Everything that these questions need is at hand here; design by gradient is in `
 """
 
 from .charts import chart as chart
+from .complex_modes import ComplexModes as ComplexModes
+from .complex_modes import complex_modes as complex_modes
 from .critical import StabilityLimit as StabilityLimit
 from .critical import critical_friction as critical_friction
 from .critical import critical_slope as critical_slope
 from .critical import friction_slope as friction_slope
 from .critical import stability_limit as stability_limit
+from .eigenvalue_derivatives import eigenvalue_derivatives as eigenvalue_derivatives
+from .eigenvalue_derivatives import shape_basis as shape_basis
 from .mode_coupling import Coalescence as Coalescence
 from .mode_coupling import coalescence as coalescence
 from .mode_curves import modes as modes
 from .outcomes import Mechanism as Mechanism
 from .outcomes import StabilityOutcome as StabilityOutcome
+from .pencil import Pencil as Pencil
+from .pencil import friction_derivative as friction_derivative
+from .pencil import sliding_pencil as sliding_pencil
 from .routh_hurwitz import margin as margin
 from .sensitivities import Sensitivity as Sensitivity
 from .sensitivities import sensitivity as sensitivity

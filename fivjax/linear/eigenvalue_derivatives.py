@@ -1,0 +1,96 @@
+r"""How complex modes move: derivatives of eigenvalues by left and right eigenvectors, and a basis that they share.
+
+$\frac{dλ}{dp} = -\frac{y^H (λ^2 M' + λ C' + K')\, x}{y^H (2λ M + C)\, x}$ with $P(λ)x = 0$ and $y^H P(λ) = 0$, for any real
+matrices, at the cost of one sparse factorisation for each mode.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..foundation import arguments
+from .complex_modes import ComplexModes
+from .pencil import Pencil
+
+# How far from the eigenvalue the matrix is factorised: close enough to settle in two steps, and far enough not to be singular.
+APART = 1e-8
+# Left and right eigenvectors that are this close to right angles belong to equal eigenvalues, up to rounding.
+RIGHT_ANGLE = 1e-6
+
+
+def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], which=None) -> dict[str, np.ndarray]:
+    """dλ/dp of modes by each parameter, from how it changes the matrices.
+
+        change = {"speed": fj.cea.Pencil(0 * M, dC, dK)}
+        slopes = fj.cea.eigenvalue_derivatives(modes, change, which=modes.unstable)
+        slopes["speed"].real        # of the growth rates, in 1/s per unit of the parameter
+
+    **Arguments:**
+
+    - `modes`: of a pencil.
+    - `changes`: by parameter, the derivatives of M, C and K as a `Pencil`; `friction_derivative` gives that of the friction of
+      a structure whose contacts slide.
+    - `which`: places of the modes; all unless given.
+
+    **Returns:** by parameter, complex, one for each mode. NaN for modes with equal eigenvalues, which have no derivative of
+    their own.
+
+    **Raises:** `ValueError` for changes of another size.
+    """
+    arguments.instance("modes", modes, ComplexModes, "ComplexModes, as fj.cea.complex_modes gives them")
+    for name, change in changes.items():
+        arguments.instance(f"changes[{name!r}]", change, Pencil, "a Pencil of the derivatives of M, C and K")
+        if change.size != modes.pencil.size:
+            raise ValueError(
+                f"Argument `changes[{name!r}]` must have {modes.pencil.size} rows to go with the modes, but has {change.size}."
+            )
+    which = np.arange(modes.eigenvalues.size) if which is None else np.atleast_1d(which)
+    found = {name: np.full(which.size, np.nan, complex) for name in changes}
+    for k, place in enumerate(which):
+        value = modes.eigenvalues[place]
+        right, left = eigenvectors(modes.pencil, value)
+        slope = left.conj() @ (modes.pencil.slope(value) @ right)
+        size = np.linalg.norm(left) * np.linalg.norm(modes.pencil.slope(value) @ right)
+        if abs(slope) < RIGHT_ANGLE * size:
+            continue
+        for name, change in changes.items():
+            found[name][k] = -(left.conj() @ (change.at(value) @ right)) / slope
+    return found
+
+
+def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray]:
+    """Right and left eigenvector of the eigenvalue nearest to a value, by inverse iteration with one factorisation."""
+    from scipy.sparse.linalg import splu
+
+    factors = splu(pencil.at(value * (1 + APART)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
+    found = []
+    for transposition in ("N", "H"):
+        vector = np.random.default_rng(0).standard_normal(pencil.size) + 0j
+        for _ in range(3):
+            vector = factors.solve(vector / np.linalg.norm(vector), trans=transposition)
+        found.append(vector / np.linalg.norm(vector))
+    return found[0], found[1]
+
+
+def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> np.ndarray:
+    """A real basis of few columns that holds the shapes of the modes of several working points, for `pencil.projected`.
+
+        points = [fj.cea.complex_modes(brake(speed), up_to=3000.0) for speed in (6.0, 20.0, 60.0)]
+        basis = fj.cea.shape_basis(brake(6.0), *points)
+        fj.cea.complex_modes(brake(12.0).projected(basis))      # at any speed between, in no time
+
+    The leading left singular vectors of all real and imaginary parts, with equal kinetic energy for each mode.
+
+    **Arguments:** `pencil`, whose mass weighs; `modes`, of pencils of the same coordinates; `coordinates`, the most columns.
+
+    **Returns:** `(n, m)`, with m at most `coordinates`.
+    """
+    arguments.real_number("coordinates", coordinates, minimum=1)
+    if not modes or any(found.shapes.shape[0] != pencil.size for found in modes):
+        raise ValueError(f"Argument `modes` must hold modes of pencils with {pencil.size} coordinates, at least one.")
+    weight = np.sqrt(np.abs(pencil.mass.diagonal()))
+    weight = np.where(weight > 0, weight, np.max(weight) * 1e-8)[:, None]
+    shapes = np.hstack([found.shapes for found in modes]) * weight
+    shapes = shapes / np.linalg.norm(shapes, axis=0)
+    columns, sizes, _ = np.linalg.svd(np.hstack([shapes.real, shapes.imag]), full_matrices=False)
+    return (columns / weight)[:, : min(int(coordinates), int(np.sum(sizes > 1e-12 * sizes[0])))]

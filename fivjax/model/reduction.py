@@ -1,0 +1,204 @@
+r"""Craig–Bampton reduction: a structure of many thousand degrees of freedom by its contacts and a few modes.
+
+The displacements are written as $q = T z$. Among the columns of $T$ are the static shapes that each coordinate at a contact
+causes while the others are held, the modes of the structure with all of these held, up to a frequency, and the static answer
+to the load. (Craig, Bampton, AIAA Journal 6, 1968.) What is static is exact; the error of frequencies is reported.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..foundation import arguments
+from .contact_coordinates import transformation
+from .contact_point import ContactPoint
+from .sparse_structure import SparseStructure
+from .structure import Structure
+from .structure_checks import lowest_modes
+
+# Modes are asked for in lots that grow, until one lies above the frequency.
+FIRST_LOT = 20
+# A static shape that modes make up to this share adds nothing but rounding.
+NEW_SHAPE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Reduction:
+    """A reduced structure, the way back to the full one, and how well its frequencies are kept.
+
+    - `structure`: the reduced `fj.Structure`; its contacts are at coordinates of their own.
+    - `basis`: `(n, m)`, displacements of the full structure for each reduced coordinate: `q = basis @ z`.
+    - `frequencies`: of the full structure, free of contact and undamped, up to the frequency asked for, in Hz.
+    - `reduced_frequencies`: those of the reduced structure beside them, in Hz.
+    """
+
+    structure: Structure
+    basis: np.ndarray
+    frequencies: np.ndarray
+    reduced_frequencies: np.ndarray
+
+    @property
+    def errors(self) -> np.ndarray:
+        """How much higher each kept frequency is, relative to the full structure's; 0 for rigid-body modes."""
+        rigid = self.frequencies <= 1e-3 * np.max(self.frequencies, initial=0.0)
+        return np.where(rigid, 0.0, self.reduced_frequencies / np.where(rigid, 1.0, self.frequencies) - 1.0)
+
+    def __repr__(self) -> str:
+        n, m = self.basis.shape
+        lines = [f"Reduction from {n} to {m} coordinates; {self.frequencies.size} frequencies kept:"]
+        rows = zip(self.frequencies, self.reduced_frequencies, self.errors, strict=True)
+        lines += [f"  {full:12.6g} Hz   reduced {less:12.6g} Hz   {error:9.1e}" for full, less, error in rows]
+        return "\n".join(lines)
+
+
+def craig_bampton(
+    structure: SparseStructure,
+    up_to: float,
+    *,
+    keep: Sequence[tuple[int, int] | int] = (),
+    damping_ratio: float = 0.0,
+) -> Reduction:
+    """A structure reduced onto its contacts, its load and its modes up to a frequency.
+
+        reduction = fj.craig_bampton(big, up_to=6000.0)
+        print(reduction)
+        scene = fj.Scene(reduction.structure, fj.Coulomb(0.4), belt_speed=2.0)
+
+    Twice the highest frequency of interest is a common choice. The frequencies of the full structure are computed, too, and
+    compared.
+
+    **Arguments:**
+
+    - `structure`: as `fj.read_structure` gives it, with at least one contact.
+    - `up_to`: the frequency in Hz up to which modes with held contacts are kept.
+    - `keep`: further coordinates to keep, by node and direction (or by index where there are no labels).
+    - `damping_ratio`: damping to add, the same share of critical in each mode of the free reduced structure.
+
+    **Returns:** a `Reduction`.
+
+    **Raises:** `ValueError` for a structure without contacts, not symmetric, or loose where its contacts are held.
+    """
+    from scipy.sparse.linalg import splu
+
+    arguments.instance("structure", structure, SparseStructure, "a SparseStructure, as fj.read_structure gives it")
+    arguments.real_number("up_to", up_to, above=0)
+    arguments.real_number("damping_ratio", damping_ratio, minimum=0)
+    if not structure.normal_directions.shape[1]:
+        raise ValueError("The structure has no contacts to reduce it onto. Give `contacts` to `read_structure`.")
+    if not structure.checks.symmetric:
+        worst = max(structure.checks.asymmetry, key=lambda name: structure.checks.asymmetry[name])
+        raise ValueError(
+            f"The {worst} matrix is not symmetric, and a structure in contact must be. Give the matrices without friction "
+            f"or gyroscopic terms; `fj.cea.Pencil` takes the others."
+        )
+    directions = np.hstack([structure.tangential_directions, structure.normal_directions])
+    kept = np.any(directions != 0, axis=1)
+    kept[[_index(structure, place) for place in keep]] = True
+    inner, outer = np.flatnonzero(~kept), np.flatnonzero(kept)
+    stiffness, mass = structure.stiffness, structure.mass
+    held = stiffness[inner][:, inner].tocsc()
+    columns = [np.eye(structure.size)[:, outer]]
+    squares = np.zeros(0)
+    if inner.size:
+        squares, modes = _modes_up_to(held, mass[inner][:, inner], up_to)
+        try:
+            factors = splu(held)
+        except RuntimeError:
+            factors = None
+        if factors is None or np.any(squares < 1e-9 * np.max(squares, initial=0.0)):
+            raise ValueError(
+                "With its contacts held, the structure still has a part that moves freely, so that static shapes do not "
+                "exist. Hold it in the finite-element model, or name nodes of that part with `keep`."
+            )
+        columns[0][inner] = -factors.solve(stiffness[inner][:, outer].toarray())
+        shape = factors.solve(structure.load_direction[inner])
+        if np.any(shape):
+            # What the modes do not hold of it already, in their measure.
+            rest = shape - modes @ (modes.T @ (mass[inner][:, inner] @ shape))
+            if rest @ held @ rest > NEW_SHAPE**2 * (shape @ held @ shape):
+                norm = np.sqrt(rest @ mass[inner][:, inner] @ rest)
+                modes = np.column_stack([modes, rest / norm])
+        columns.append(np.zeros((structure.size, modes.shape[1])))
+        columns[1][inner] = modes
+    basis = np.hstack(columns)
+    reduced, basis = _structure(structure, basis, outer, len(squares))
+    return _compared(structure, _damped(reduced, damping_ratio), basis, up_to)
+
+
+def _modes_up_to(stiffness, mass, frequency: float) -> tuple[np.ndarray, np.ndarray]:
+    limit, count = (2 * np.pi * frequency) ** 2, FIRST_LOT
+    while True:
+        squares, modes = lowest_modes(stiffness, mass, count)
+        if squares.size < count or squares[-1] > limit:
+            return squares[squares <= limit], modes[:, squares <= limit]
+        count *= 2
+
+
+def _structure(full: SparseStructure, basis: np.ndarray, outer: np.ndarray, modes: int) -> tuple[Structure, np.ndarray]:
+    names = [full.coordinates[place] for place in outer]
+    names += [f"mode {number + 1}" for number in range(modes)]
+    names += ["load"] * (basis.shape[1] - len(names))
+
+    def seen_through(basis: np.ndarray, contacts: list[ContactPoint]) -> Structure:
+        turned = [basis.T @ (matrix @ basis) for matrix in (full.mass, full.damping, full.stiffness)]
+        mass, damping, stiffness = (0.5 * (matrix + matrix.T) for matrix in turned)
+        load = basis.T @ full.load_direction
+        return Structure(mass, damping, stiffness, load, contacts=contacts, coordinates=names)
+
+    count = full.normal_directions.shape[1]
+    tangential, normal = basis.T @ full.tangential_directions, basis.T @ full.normal_directions
+    raw = seen_through(basis, [ContactPoint(tangential[:, i], normal[:, i]) for i in range(count)])
+    # Contacts at coordinates of their own: what else takes structures asks for that.
+    turn, places = transformation(raw)
+    basis = basis @ turn
+    for i in range(count):
+        suffix = f" {i}" if count > 1 else ""
+        names[places[i]], names[places[count + i]] = f"tangential{suffix}", f"normal{suffix}"
+    contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
+    return seen_through(basis, contacts), basis
+
+
+def _damped(structure: Structure, ratio: float) -> Structure:
+    if ratio == 0:
+        return structure
+    from scipy.linalg import eigh
+
+    mass, damping, stiffness = (np.asarray(matrix) for matrix in structure.matrices[:3])
+    squares, modes = eigh(stiffness, mass)
+    shapes = mass @ modes
+    added = (shapes * (2 * ratio * np.sqrt(np.maximum(squares, 0.0)))) @ shapes.T
+    return Structure(
+        mass,
+        damping + 0.5 * (added + added.T),
+        stiffness,
+        structure.load_direction,
+        contacts=structure.contacts,
+        coordinates=structure.coordinates,
+    )
+
+
+def _compared(full: SparseStructure, reduced: Structure, basis: np.ndarray, up_to: float) -> Reduction:
+    from scipy.linalg import eigh
+
+    squares, _ = _modes_up_to(full.stiffness, full.mass, up_to)
+    less = eigh(np.asarray(reduced.stiffness), np.asarray(reduced.mass), eigvals_only=True)[: len(squares)]
+    squares = squares[: len(less)]
+    return Reduction(
+        structure=reduced,
+        basis=basis,
+        frequencies=np.sqrt(np.maximum(squares, 0.0)) / (2 * np.pi),
+        reduced_frequencies=np.sqrt(np.maximum(less, 0.0)) / (2 * np.pi),
+    )
+
+
+def _index(structure: SparseStructure, place) -> int:
+    if isinstance(place, int | np.integer):
+        if not 0 <= place < structure.size:
+            raise ValueError(f"Argument `keep` must hold indices below {structure.size}, but holds {place}.")
+        return int(place)
+    if structure.labels is None or tuple(place) not in structure.labels:
+        raise ValueError(
+            f"Argument `keep` must hold coordinates of the structure by node and direction, but holds {place!r}."
+        )
+    return structure.labels.index(tuple(place))
