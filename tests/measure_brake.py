@@ -63,7 +63,7 @@ def reference(pencil: fj.cea.Pencil, frequencies, modes: int = 60) -> tuple[np.n
     found, residuals = [], []
     for frequency in frequencies:
         # Two modes may be near one another: each is followed to its end, and the one that grows is taken.
-        near = np.flatnonzero(np.abs(guesses.imag / (2 * np.pi) - frequency) < 0.012 * frequency)
+        near = np.flatnonzero(np.abs(guesses.imag / (2 * np.pi) - frequency) < 0.02 * frequency)
         ends = [newton(pencil, guesses[place], basis @ vectors[:n, place]) for place in near]
         value, residual = max(ends, key=lambda end: end[0].real)
         found.append(value)

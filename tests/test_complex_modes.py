@@ -8,8 +8,8 @@ import pytest
 from scipy import linalg, sparse
 
 import fivjax as fj
-from fivjax.linear import complex_modes
-from fivjax.linear.complex_modes import AT_ONCE, DENSE, near
+from fivjax.linear import mode_search
+from fivjax.linear.mode_search import AT_ONCE, DENSE, near
 
 DATA = Path(os.environ.get("FIVJAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -63,7 +63,7 @@ def all_eigenvalues(pencil: fj.cea.Pencil) -> np.ndarray:
 
 def test_a_band_of_a_large_pencil_holds_all_its_modes(monkeypatch):
     """Shift and invert with several shifts finds what a dense solver finds, each once, with residuals of rounding."""
-    monkeypatch.setattr(complex_modes, "DENSE", 50)
+    monkeypatch.setattr(mode_search, "DENSE", 50)
     pencil = random_pencil(90)
     wanted = all_eigenvalues(pencil)
     band = np.sort(wanted.imag[wanted.imag > 0])[2 * AT_ONCE] + 1e-3

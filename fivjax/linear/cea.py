@@ -4,18 +4,18 @@ Everything that these questions need is at hand here; design by gradient is in `
 """
 
 from .charts import chart as chart
-from .complex_modes import ComplexModes as ComplexModes
-from .complex_modes import complex_modes as complex_modes
 from .critical import StabilityLimit as StabilityLimit
 from .critical import critical_friction as critical_friction
 from .critical import critical_slope as critical_slope
 from .critical import friction_slope as friction_slope
 from .critical import stability_limit as stability_limit
-from .eigenvalue_derivatives import eigenvalue_derivatives as eigenvalue_derivatives
-from .eigenvalue_derivatives import shape_basis as shape_basis
+from .left_eigenvectors import eigenvalue_derivatives as eigenvalue_derivatives
+from .left_eigenvectors import shape_basis as shape_basis
 from .mode_coupling import Coalescence as Coalescence
 from .mode_coupling import coalescence as coalescence
 from .mode_curves import modes as modes
+from .mode_search import ComplexModes as ComplexModes
+from .mode_search import complex_modes as complex_modes
 from .outcomes import Mechanism as Mechanism
 from .outcomes import StabilityOutcome as StabilityOutcome
 from .pencil import Pencil as Pencil

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..foundation import arguments
-from .complex_modes import ComplexModes
+from .mode_search import ComplexModes
 from .pencil import Pencil
 
 # How far from the eigenvalue the matrix is factorised: close enough to settle in two steps, and far enough not to be singular.
