@@ -19,7 +19,9 @@ from PIL import Image
 FOLDER = Path(__file__).parent
 PAGES = FOLDER.parent / "docs" / "notebooks"
 WIDTH = 1100
-EXPLORER = "![The explorer: sliders, response, status, energy, phase plane and map](../../notebooks/pictures/explorer.png)"
+EXPLORER = (
+    "![The explorer: sliders, response, status, energy, phase plane and map](../../notebooks/pictures/explorer.png)"
+)
 
 
 def smaller(encoded: str) -> str:
@@ -41,7 +43,9 @@ def kept(output):
     if "image/png" in data:
         return nbformat.v4.new_output("display_data", {"image/png": smaller(data["image/png"])})
     if "text/html" in data:
-        shrunk = re.sub(r"(data:image/png;base64,)([^'\"]+)", lambda m: m.group(1) + smaller(m.group(2)), data["text/html"])
+        shrunk = re.sub(
+            r"(data:image/png;base64,)([^'\"]+)", lambda m: m.group(1) + smaller(m.group(2)), data["text/html"]
+        )
         return nbformat.v4.new_output("display_data", {"text/html": shrunk})
     return output
 

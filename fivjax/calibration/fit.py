@@ -75,6 +75,13 @@ def calibrate(
     uncertainties are not known, and the outcome says so.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for names, bounds or channels that do not fit the scene.
+
+    **Example:**
+
+        >>> data = fj.read_recording("decay.csv", "kick", offset=(0.0, 0.2))
+        >>> fit = fj.calibrate(scene, data, free=["mu", "c1", "k1"], starts=2, progress=False)  # doctest: +SLOW
+        >>> fit.outcome.name
+        'CONVERGED'
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_several_contacts(scene.structure, "`calibrate`")

@@ -7,7 +7,13 @@ from jaxtyping import Array, Float, Int
 
 
 class Status(enum.IntEnum):
-    """The paper's codes."""
+    """The paper's codes.
+
+    **Example:**
+
+        >>> [status.name for status in fj.Status]
+        ['STICK', 'SLIDE', 'DETACH']
+    """
 
     STICK = 0
     SLIDE = 1

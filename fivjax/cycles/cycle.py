@@ -25,6 +25,12 @@ class LimitCycle(eqx.Module):
 
     The section is where the tangential velocity rises through zero. Multipliers belong to small deviations, per period; one of
     a periodic motion's is 1, for a deviation along the cycle.
+
+    **Example:**
+
+        >>> cycle = fj.limit_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
+        >>> [phase.status.name for phase in cycle.word]
+        ['SLIDE', 'SLIDE', 'STICK', 'SLIDE', 'DETACH']
     """
 
     scene: Scene  # under its final load

@@ -47,6 +47,13 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
     **Returns:** `CycleDerivatives`.
 
     **Raises:** `TypeError` for anything but a `LimitCycle`; `ValueError` for a torus, or a name that is no parameter.
+
+    **Example:**
+
+        >>> cycle = fj.limit_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
+        >>> slopes = fj.cycle_derivatives(cycle, ["mu", "k1"])
+        >>> slopes.amplitude["mu"] > 0
+        True
     """
     arguments.instance("cycle", cycle, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
     if cycle.kind != "periodic":

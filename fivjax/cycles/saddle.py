@@ -40,6 +40,12 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
 
     **Raises:** `NoLimitCycle` (a `ValueError`) where there is no limit cycle, or where what attracts on the boundary is not
     periodic; `ValueError` for a scene without sliding equilibrium or beyond Painlevé's limit.
+
+    **Example:**
+
+        >>> saddle = fj.saddle_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
+        >>> saddle.unstable_directions
+        1
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_several_contacts(scene.structure, "`saddle_cycle`")

@@ -41,7 +41,16 @@ TORUS_AFTER = 8
 
 
 class NoLimitCycle(ValueError):
-    """No limit cycle was met."""
+    """No limit cycle was met.
+
+    **Example:**
+
+        >>> try:  # doctest: +SLOW
+        ...     fj.limit_cycle(scene.replace(belt_speed=1.0, mu=0.1))
+        ... except fj.NoLimitCycle:
+        ...     print("none was met")
+        none was met
+    """
 
 
 @in_double_precision
@@ -59,6 +68,12 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
 
     **Raises:** `NoLimitCycle` (a `ValueError`) where none is met; `ValueError` for a scene without sliding equilibrium, or
     beyond Painlevé's limit.
+
+    **Example:**
+
+        >>> cycle = fj.limit_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
+        >>> round(float(cycle.frequency), 4), round(float(cycle.amplitude), 5)  # Hz, m/s
+        (67.5928, 1.11209)
     """
     _check(scene)
     stepper = EventExact()
@@ -88,6 +103,12 @@ def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
     in m and m/s, or trajectories). More than one cycle may coexist; there may be others that no trajectory came to.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
+
+    **Example:**
+
+        >>> cycles = fj.limit_cycles(scene.replace(belt_speed=1.0))  # doctest: +SLOW
+        >>> cycles[0].kind
+        'periodic'
     """
     _check(scene)
     stepper = EventExact()

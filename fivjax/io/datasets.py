@@ -64,6 +64,10 @@ def save(result, path: str | Path) -> Path:
 
     **Raises:** `TypeError` for what is no result, `ValueError` for a path that cannot be written, `OSError` where the disk
     is full.
+
+    **Example:**
+
+        >>> path = fj.save(run, "run.nc")
     """
     dataset = _as_dataset(result)
     path = check_writable(path)
@@ -80,6 +84,13 @@ def open(path: str | Path) -> "xr.Dataset":
     for everyone, also without fivjax. The scene that it came from is `fj.Scene.from_dataset(fj.open(path))`.
 
     **Raises:** `ValueError` for a path without a file, or a file that is no NetCDF.
+
+    **Example:**
+
+        >>> path = fj.save(run, "run.nc")
+        >>> again = fj.Trajectory.from_dataset(fj.open("run.nc"))
+        >>> bool(np.all(again.velocity == run.velocity))
+        True
     """
     import xarray as xr
 

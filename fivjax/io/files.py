@@ -30,6 +30,10 @@ def save_figure(figure, path: str | Path, **options) -> Path:
     """Write a matplotlib figure; the file appears under its name only when it is whole.
 
     **Raises:** `ValueError` for a path that cannot be written, `OSError` where the disk is full.
+
+    **Example:**
+
+        >>> path = fj.save_figure(fj.plot.response(run), "response.png")
     """
     path = check_writable(path)
     options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}

@@ -54,6 +54,12 @@ def read_recording(
     - `units`: by the file's names; they go before the file's own. Without either, SI.
 
     **Raises:** `ValueError` naming the file with the line, or the variable, that cannot be used.
+
+    **Example:**
+
+        >>> data = fj.read_recording("decay.csv", "kick", offset=(0.0, 0.2))
+        >>> [(channel.quantity, channel.coordinate) for channel in data.channels]
+        [('acceleration', 0), ('acceleration', 1)]
     """
     path = Path(path)
     readers = {".csv": _csv, ".txt": _csv, ".npy": _numpy, ".npz": _numpy, ".wav": _wav, ".mat": _matlab}

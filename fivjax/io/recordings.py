@@ -58,6 +58,10 @@ class Recording(eqx.Module):
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for signals that are not finite, not evenly sampled, of unequal
     length or shorter than 16 samples, and for names that mean nothing.
+
+    **Example:**
+
+        >>> data = fj.Recording(run.t, {"acceleration 0": run.acceleration[:, 0]}, "kick", p=1.2)
     """
 
     t: Float[np.ndarray, " T"]

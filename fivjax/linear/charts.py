@@ -49,6 +49,10 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     unique one.
 
     **Raises:** `ValueError` for anything but two axes, unknown names, and values that the structure or scene refuses.
+
+    **Example:**
+
+        >>> chart = fj.cea.chart(structure, mu=np.linspace(0.0, 0.5, 11), k1=np.linspace(90e3, 110e3, 5))
     """
     import xarray as xr
 

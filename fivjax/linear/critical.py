@@ -73,6 +73,11 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     derivative is NaN then. `stability_limit` says the outcome and the mechanism by name.
 
     **Arguments:** `structure`; `direction`, +1 for a belt that moves along the tangential coordinate, -1 against it.
+
+    **Example:**
+
+        >>> round(float(fj.cea.critical_friction(structure)), 10)
+        0.2282253477
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
@@ -94,6 +99,12 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         limit.mu, limit.frequency, limit.outcome, limit.mechanism
 
     Arguments and method as in `critical_friction`.
+
+    **Example:**
+
+        >>> limit = fj.cea.stability_limit(structure)
+        >>> round(float(limit.frequency), 2), limit.mechanism.value  # Hz
+        (67.92, 'flutter')
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
@@ -122,6 +133,11 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     a slope.
 
     **Raises:** `ValueError` for a belt at rest.
+
+    **Example:**
+
+        >>> falling = fj.Scene(structure, fj.ExponentialDecay(0.2, 0.1, decay=0.5), belt_speed=0.5, load=fj.ConstantLoad(100.0))
+        >>> slope = fj.cea.critical_slope(falling)
     """
     scene = as_scene(_a_scene(scene), None, 1)
     return _critical_slope(scene)
@@ -129,7 +145,14 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
 
 @returning_numpy
 def friction_slope(scene: Scene) -> Float[Array, ""]:
-    """The slope dμ/dv of the scene's friction law at its belt speed, in s/m."""
+    """The slope dμ/dv of the scene's friction law at its belt speed, in s/m.
+
+    **Example:**
+
+        >>> falling = fj.Scene(structure, fj.ExponentialDecay(0.2, 0.1, decay=0.5), belt_speed=0.5, load=fj.ConstantLoad(100.0))
+        >>> round(float(fj.cea.friction_slope(falling)), 4)  # s/m
+        -0.0389
+    """
     scene = as_scene(_a_scene(scene), None, 1)
     return jax.grad(lambda speed: scene.friction(speed))(jnp.abs(scene.belt_speed))
 

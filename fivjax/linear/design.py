@@ -123,6 +123,10 @@ def lower_growth_rate(
     """Lower the worst growth rate over a range of friction `mu` (an array), as `raise_critical_friction` raises μ_crit.
 
     Growth rates are in 1/s. `target` is the growth rate to stay below; -1 demands a decay of at least 1/s.
+
+    **Example:**
+
+        >>> better = fj.design.lower_growth_rate(structure, {"k1": (98e3, 102e3)}, mu=0.25, steps=5)  # doctest: +SLOW
     """
     frictions = arguments.axis("mu", mu)
     arguments.real_number("mu", frictions[0], minimum=0)

@@ -121,6 +121,10 @@ def search_critical_friction(
 
     **Raises:** `ValueError` for a start that is not positive or lies above `highest`, and for Routh–Hurwitz without
     any damping.
+
+    **Example:**
+
+        >>> found = fj.design.search_critical_friction(structure, start=0.1)  # doctest: +SLOW
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     arguments.real_number("start", start, above=0)

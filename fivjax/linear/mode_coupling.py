@@ -69,6 +69,11 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
 
     **Returns:** a `Coalescence`. Where no two undamped modes meet its outcome is "never unstable" and its numbers are
     NaN; where the damped point is lost on the way (heavy damping) it is "undecided".
+
+    **Example:**
+
+        >>> round(float(fj.cea.coalescence(structure).mu), 5)
+        0.22636
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     arguments.instance("damped", damped, bool, "True or False")

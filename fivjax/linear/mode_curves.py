@@ -38,6 +38,10 @@ def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     `partner` (the other one) and `shape` (complex displacements over `coordinate`, normal one included, the largest
     scaled to 1). NaN where there is no steady sliding. Along `mu`, and with constant friction, also the numbers of
     `stability_limit` and `coalescence`: `mu_crit`, `frequency_crit` (Hz) and `mu_coalescence` (undamped).
+
+    **Example:**
+
+        >>> modes = fj.cea.modes(structure, mu=np.linspace(0.0, 0.5, 101))
     """
     scene, axes = with_axes(system, direction, parameters, count=1)
     ((name, values),) = axes.items()

@@ -62,6 +62,11 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     along the tangential coordinate, -1 against it.
 
     **Raises:** `ValueError` for a negative `mu`, or for more than 32 coordinates.
+
+    **Example:**
+
+        >>> bool(fj.cea.margin(structure, 0.2) > 0), bool(fj.cea.margin(structure, 0.3) > 0)
+        (True, False)
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     arguments.real_number("mu", mu, minimum=0)

@@ -63,6 +63,10 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     damping: NaN.
 
     **Raises:** `ValueError` for a structure that is never or always unstable: there is nothing to differentiate.
+
+    **Example:**
+
+        >>> found = fj.cea.sensitivity(structure)
     """
     import xarray as xr
 

@@ -33,6 +33,11 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
     belt that moves along the tangential coordinate, -1 against it.
 
     **Raises:** `ValueError` for a scene that has no steady sliding, or where friction is missing or given twice.
+
+    **Example:**
+
+        >>> fj.cea.linearisation(structure, 0.2).shape
+        (4, 4)
     """
     return _matrix(_checked(system, mu, direction))
 
@@ -60,6 +65,11 @@ def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Co
     result. Differentiable where the eigenvalues are distinct; near a coalescence the derivative grows without bound. In
     a process without double precision, differentiate `growth_rate` instead (JAX cannot carry complex double precision
     through its backward pass there).
+
+    **Example:**
+
+        >>> (abs(fj.cea.eigenvalues(structure, 0.2).imag) / (2 * np.pi)).round(1)  # Hz, in pairs
+        array([67.4, 67.4, 68.5, 68.5])
     """
     if mu is not None and np.ndim(mu) > 0:
         arguments.instance("system", system, Structure, "a Structure where `mu` is an array")
@@ -98,5 +108,10 @@ def growth_rate(system: Structure | Scene, mu=None, *, direction: int = 1) -> Fl
 
     Arguments as in `linearisation`. Differentiable in everything (through the eigenvalues, so the derivative grows
     without bound towards a coalescence), in any process; see `margin` for a measure that is smooth there.
+
+    **Example:**
+
+        >>> bool(fj.cea.growth_rate(structure, 0.3) > 0)
+        True
     """
     return _growth_rate(_checked(system, mu, direction))

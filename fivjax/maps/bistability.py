@@ -73,6 +73,12 @@ def bistability_map(
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, values that the scene refuses, and a `resume` file that belongs to another run.
+
+    **Example:**
+
+        >>> m = fj.bistability_map(scene, mu=[0.1, 0.15, 0.2, 0.227], p=[1.0, 1.2, 1.5, 2.0, 3.0])  # doctest: +SLOW
+        >>> m["verdict"].sel(mu=0.2).values
+        array([0, 0, 0, 1, 1], dtype=int8)
     """
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)

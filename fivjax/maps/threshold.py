@@ -71,6 +71,12 @@ def critical_perturbation(
     state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
 
     **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
+
+    **Example:**
+
+        >>> found = fj.critical_perturbation(scene, belt_speed=[1.0, 3.0])  # doctest: +SLOW
+        >>> found["p_crit"].values.round(6)
+        array([1.107206, 1.190282])
     """
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)

@@ -74,6 +74,13 @@ def tradeoff(
 
     **Raises:** `TypeError` or `ValueError` for methods that are none, times and counts that are not positive, and a load
     without a pulse where the boundary is asked for.
+
+    **Example:**
+
+        >>> methods = {"event-exact": fj.EventExact()}
+        >>> trade = fj.tradeoff(  # doctest: +SLOW
+        ...     scene, methods, t1=0.2, trajectories=4, precisions=("float64",), boundary=False, progress=False
+        ... )
     """
     methods = default_methods() if methods is None else methods
     _check(scene, methods, t1, trajectories, precisions, boundary)

@@ -19,6 +19,12 @@ def belt_oscillator(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3, theta
     `theta` in rad.
 
     **Raises:** `ValueError` for masses that are not positive, negative dampers or springs, or a non-finite value.
+
+    **Example:**
+
+        >>> stiffer = fj.belt_oscillator(k1=104e3)
+        >>> stiffer.coordinates
+        ('x2', 'y1', 'y2')
     """
     arguments.real_number("m1", m1, above=0)
     arguments.real_number("m2", m2, above=0)

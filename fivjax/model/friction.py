@@ -35,6 +35,13 @@ class AbstractFriction(eqx.Module):
     A scene checks this where values are known, at slip speeds from 0 to 1e6 m/s, and holds the law's numbers in double
     precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes by
     the same name.
+
+    **Example:**
+
+        >>> isinstance(scene.friction, fj.AbstractFriction)
+        True
+
+    `docs/extending.md` has a law of one's own.
     """
 
     # Constant friction makes every status linear; exact methods rest on that.
@@ -113,6 +120,12 @@ class Coulomb(AbstractFriction):
     (both without unit).
 
     **Raises:** `ValueError` if a coefficient is negative or not finite, or if `mu_static` is below `mu`.
+
+    **Example:**
+
+        >>> law = fj.Coulomb(mu=0.3, mu_static=0.4)
+        >>> bool(law.constant)
+        True
     """
 
     mu: Float[Array, ""]
@@ -148,6 +161,12 @@ class ExponentialDecay(AbstractFriction):
     **Arguments:** `mu_static` $\mu_s$ and `mu_dynamic` $\mu_d$ without unit, `decay` $d$ in s/m.
 
     **Raises:** `ValueError` if a value is negative or not finite, or if `mu_static` is below `mu_dynamic`.
+
+    **Example:**
+
+        >>> law = fj.ExponentialDecay(mu_static=0.2, mu_dynamic=0.1, decay=0.5)
+        >>> float(law.static), bool(law.constant)
+        (0.2, False)
     """
 
     mu_static: Float[Array, ""]

@@ -25,6 +25,13 @@ class AbstractLoad(eqx.Module):
 
     A scene checks this where values are known, and holds the load's numbers in double precision. Fields are the load's
     parameters; what `replace` and maps change must be a field that the constructor takes by the same name.
+
+    **Example:**
+
+        >>> isinstance(scene.load, fj.AbstractLoad)
+        True
+
+    `docs/extending.md` has a load of one's own.
     """
 
     # Before any jump: the load whose sliding equilibrium a run starts from.
@@ -79,6 +86,10 @@ class ConstantLoad(AbstractLoad):
     """A load `force` (N) that never changes.
 
     **Raises:** `ValueError` if it is negative or not finite.
+
+    **Example:**
+
+        >>> quiet = fj.Scene(structure, fj.Coulomb(0.2), belt_speed=3.0, load=fj.ConstantLoad(100.0))
     """
 
     force: Float[Array, ""]
@@ -112,6 +123,12 @@ class Pulse(AbstractLoad):
     **Arguments:** `force` in N, the factor `p` without unit, `duration` and `start` in s.
 
     **Raises:** `ValueError` if any of them is negative or not finite.
+
+    **Example:**
+
+        >>> kick = fj.Pulse(force=100.0, p=1.2)
+        >>> [float(instant) for instant in kick.jumps]  # s
+        [0.0, 0.1]
     """
 
     force: Float[Array, ""]

@@ -37,6 +37,12 @@ class Scene(eqx.Module):
     - `impact_law`: "coulomb", "frictionless" or "reset" (see `contact.impact`).
 
     **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
+
+    **Example:**
+
+        >>> scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=3.0, load=fj.Pulse(force=100.0, p=1.2))
+        >>> float(scene.replace(mu=0.2, k1=98e3).parameters["mu"])
+        0.2
     """
 
     structure: Structure
@@ -164,6 +170,11 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
 
     **Raises:** `ValueError` where there is no such state: a belt at rest, a singular sliding stiffness, or a normal
     force that would have to pull.
+
+    **Example:**
+
+        >>> fj.sliding_equilibrium(scene).round(6)  # x2, y1 and y2, which is closed
+        array([ 0.000217, -0.000988,  0.      ])
     """
     if is_known(scene.belt_speed) and float(scene.belt_speed) == 0:
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
@@ -209,6 +220,11 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
 
     For the belt oscillator this is $(m_2 + m_1 \cos^2θ)/(m_1 \sinθ \cosθ)$: 108.49 at θ = 0.01. Infinite where the
     mass matrix does not couple the two contact coordinates.
+
+    **Example:**
+
+        >>> round(float(fj.painleve_friction(structure)), 2)
+        108.49
     """
     return _painleve_friction(structure)
 

@@ -116,6 +116,12 @@ class Structure(eqx.Module):
     **Raises:** `ValueError` or `TypeError`, as a sentence, for a wrong shape, a non-finite entry, an unsymmetric or
     indefinite matrix, an index out of range, directions that follow from one another, or names that are not as many as
     the coordinates.
+
+    **Example:**
+
+        >>> block = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+        >>> block.size
+        2
     """
 
     # The one truth: matrices, or what they follow from. Everything else is read from here.

@@ -32,6 +32,10 @@ def show(result, **options) -> Figure:
     **Returns:** a matplotlib figure.
 
     **Raises:** `TypeError` for anything that has no picture, `ValueError` for a dataset with more axes than a picture has.
+
+    **Example:**
+
+        >>> figure = fj.show(run)
     """
     import xarray as xr
 

@@ -48,6 +48,10 @@ def explorer(
 
     **Raises:** `ImportError` where ipywidgets or anywidget is missing, `ValueError` for unknown parameters or a map without
     two axes.
+
+    **Example:**
+
+        >>> explorer = fj.explorer(scene, t1=0.5)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_several_contacts(scene.structure, "`explorer`")

@@ -48,6 +48,12 @@ def reproduce(
     `summary` says in a sentence how much agrees.
 
     **Raises:** `ValueError` for a figure that the paper does not have, or a folder that cannot be written, before any work.
+
+    **Example:**
+
+        >>> made = fj.reproduce(3, progress=False)["3"]  # doctest: +SLOW
+        >>> print(made.findings[0].what)
+        μ_crit
     """
     names = _names(figure)
     if out is not None:

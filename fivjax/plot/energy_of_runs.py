@@ -98,6 +98,10 @@ def balance(run: Trajectory, *, figure: Figure | None = None) -> Figure:
     """Every line of the ledger, cumulated, with the mechanical energy; below, the residual of the balance.
 
     **Raises:** `ValueError` for a run without a ledger.
+
+    **Example:**
+
+        >>> figure = fj.plot.energy.balance(run)
     """
     energy = ledger(run)
     figure = new_figure(figure, 8.0, 5.4)

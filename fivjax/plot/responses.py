@@ -35,6 +35,10 @@ def response(
     tangential one unless given.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity.
+
+    **Example:**
+
+        >>> figure = fj.plot.response(run, "velocity")
     """
     check_run(run)
     figure = new_figure(figure, 8.0, 3.6)
@@ -52,7 +56,12 @@ def response(
 def phase_plane(
     runs: Trajectory | Mapping[str, Trajectory], last: float = 0.5, *, figure: Figure | None = None
 ) -> Figure:
-    """Tangential velocity over displacement for the `last` seconds of one run or of several by label (Fig. 17)."""
+    """Tangential velocity over displacement for the `last` seconds of one run or of several by label (Fig. 17).
+
+    **Example:**
+
+        >>> figure = fj.plot.phase_plane(run)
+    """
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
     figure = new_figure(figure, 5.6, 4.6)
@@ -77,6 +86,10 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
     seen in a long run.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for a `zoom` that is not positive.
+
+    **Example:**
+
+        >>> figure = fj.plot.perturbation(run)
     """
     check_run(run)
     if zoom is not None:
@@ -112,7 +125,12 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
 def comparison(
     runs: Mapping[str, Trajectory], quantity: str = "acceleration", *, figure: Figure | None = None
 ) -> Figure:
-    """The tangential response of several runs by label, each in a row of its own, on one scale (Fig. 9)."""
+    """The tangential response of several runs by label, each in a row of its own, on one scale (Fig. 9).
+
+    **Example:**
+
+        >>> figure = fj.plot.comparison({"p = 1.2": run})
+    """
     runs = dict(runs) if isinstance(runs, Mapping) else runs
     check_runs(runs)
     figure = new_figure(figure, 8.0, 1.2 + 1.9 * len(runs))

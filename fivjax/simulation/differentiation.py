@@ -105,6 +105,10 @@ def derivatives(
     **Returns:** `Derivatives`.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for an unknown name, and whatever `simulate` refuses.
+
+    **Example:**
+
+        >>> found = fj.derivatives(lambda run: run.displacement[-1, 0], scene, ["mu", "k1"], t1=0.4)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_several_contacts(scene.structure, "`derivatives`")

@@ -4,7 +4,13 @@ import enum
 
 
 class Ending(enum.IntEnum):
-    """How a single trajectory ended; the negative codes are those of `Verdict`, and `ENDING` has a sentence for each."""
+    """How a single trajectory ended; the negative codes are those of `Verdict`, and `ENDING` has a sentence for each.
+
+    **Example:**
+
+        >>> fj.Ending(int(run.outcome)).name
+        'FINISHED'
+    """
 
     FINISHED = 0
     NOT_FINITE = -2

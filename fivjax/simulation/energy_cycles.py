@@ -52,6 +52,12 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
     cycle ends are found to within their own error.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+
+    **Example:**
+
+        >>> cycles = fj.energy_per_cycle(run)
+        >>> cycles.sizes["cycle"]
+        25
     """
     _check(run)
     found, _ = _marks(run, _crossings)
@@ -94,6 +100,12 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     within their own error.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
+
+    **Example:**
+
+        >>> events = fj.energy_per_event(run)
+        >>> round(float(events["event_time"][0]), 4), int(events["status_after"][0])
+        (0.2491, 2)
     """
     _check(run)
     found, before = _marks(run, _events)

@@ -42,7 +42,15 @@ LEAST_ROWS, MOST_REPEATED = 64, 4**8
 
 
 class Trajectory(eqx.Module):
-    """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size."""
+    """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size.
+
+    **Example:**
+
+        >>> float(run.t[-1]), run.velocity.shape
+        (0.4, (401, 3))
+        >>> sorted(set(run.status.tolist()))  # it has slid and detached
+        [1, 2]
+    """
 
     t: Float[Returned, " T"]  # s
     displacement: Float[Returned, "T n"]  # m
@@ -144,6 +152,12 @@ def simulate(
     **Raises:** `ValueError` for times that are not positive, a `dt_save` below the step of a method that takes the step it
     is told (`WhereSwitched`), a start below the belt or of the wrong shape, no sliding equilibrium to start from, or
     friction beyond Painlevé's limit; `TypeError` under reverse derivatives without double precision.
+
+    **Example:**
+
+        >>> run = fj.simulate(scene.replace(p=1.5), t1=0.4, dt_save=1e-3, energy=True)
+        >>> run.displacement.shape, run.meaning
+        ((401, 3), 'reached its end')
     """
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")

@@ -36,7 +36,13 @@ class StepperState(eqx.Module):
 
 
 def vector_field(t: Float[Array, ""], y: State, args: Scene) -> State:
-    """Rates of the state at one instant, in the status that its forces demand; the field for `diffrax.ODETerm`."""
+    """Rates of the state at one instant, in the status that its forces demand; the field for `diffrax.ODETerm`.
+
+    **Example:**
+
+        >>> import diffrax
+        >>> term = diffrax.ODETerm(fj.vector_field)  # for a plain `diffrax.diffeqsolve`, with the scene as `args`
+    """
     mechanics, load = Mechanics(args), args.load(t)
     contact = physics.status_from_forces(mechanics, load, y)
     return rates(mechanics, contact, load, y)
@@ -84,7 +90,13 @@ class Within(NamedTuple):
 
 
 class AbstractStepper(diffrax.AbstractSolver[StepperState]):
-    """A diffrax solver that knows the contact. `simulate` and the maps call its `advance`, diffrax its `step`."""
+    """A diffrax solver that knows the contact. `simulate` and the maps call its `advance`, diffrax its `step`.
+
+    **Example:**
+
+        >>> isinstance(fj.EventExact(), fj.AbstractStepper)
+        True
+    """
 
     # No advance is longer, in s.
     dt: eqx.AbstractVar[float]

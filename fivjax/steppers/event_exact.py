@@ -44,6 +44,10 @@ class EventExact(AbstractStepper):
     far one advance reaches; `dt`, a longest advance in s (none by default).
 
     **Raises:** `ValueError` for an order below 4, or a tolerance or `dt` that is not positive.
+
+    **Example:**
+
+        >>> run = fj.simulate(scene, 0.4, 1e-3, fj.EventExact(order=20, tolerance=1e-17))  # doctest: +SLOW
     """
 
     order_: int = eqx.field(static=True)

@@ -31,6 +31,11 @@ class WhereSwitched(AbstractStepper):
 
     **Raises:** `TypeError` for a solver that is not an explicit Runge–Kutta method, `ValueError` for a step that is
     not positive.
+
+    **Example:**
+
+        >>> import diffrax
+        >>> run = fj.simulate(scene, 0.4, 1e-3, fj.WhereSwitched(diffrax.Tsit5(), dt=5e-5))  # doctest: +SLOW
     """
 
     solver: diffrax.AbstractERK

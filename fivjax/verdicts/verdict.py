@@ -6,7 +6,13 @@ from ..simulation.ending import Ending
 
 
 class Verdict(enum.IntEnum):
-    """The codes in a map. `MEANING` has a sentence for each."""
+    """The codes in a map. `MEANING` has a sentence for each.
+
+    **Example:**
+
+        >>> fj.Verdict(1).name, int(fj.Verdict.UNDECIDED)
+        ('LIMIT_CYCLE', -1)
+    """
 
     SLIDING = 0
     LIMIT_CYCLE = 1
