@@ -33,12 +33,15 @@ def smaller(encoded: str) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def kept(output):
-    """An output as the page has it; None where it is left out."""
+def kept(output, source: str):
+    """An output of a cell as the page has it; None where it is left out."""
     if output.get("name") == "stderr":
         return None
     data = output.get("data", {})
     if any("widget" in kind for kind in data):
+        # What is no explorer is a progress bar.
+        if "fj.explorer" not in source:
+            return None
         return nbformat.v4.new_output("display_data", {"text/markdown": EXPLORER})
     if "image/png" in data:
         return nbformat.v4.new_output("display_data", {"image/png": smaller(data["image/png"])})
@@ -58,7 +61,7 @@ def page(name: str):
         cell["id"] = f"cell-{number}"
         cell.metadata.clear()
         if cell.cell_type == "code":
-            cell.outputs = [output for output in map(kept, cell.outputs) if output is not None]
+            cell.outputs = [found for output in cell.outputs if (found := kept(output, cell.source)) is not None]
             for output in cell.outputs:
                 if "execution_count" in output:
                     output["execution_count"] = cell.execution_count

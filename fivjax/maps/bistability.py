@@ -78,7 +78,7 @@ def bistability_map(
 
         >>> m = fj.bistability_map(scene, mu=[0.1, 0.15, 0.2, 0.227], p=[1.0, 1.2, 1.5, 2.0, 3.0])  # doctest: +SLOW
         >>> m["verdict"].sel(mu=0.2).values
-        array([0, 0, 0, 1, 1], dtype=int8)
+        array([0, 0, 1, 1, 1], dtype=int8)
     """
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)

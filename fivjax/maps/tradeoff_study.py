@@ -79,7 +79,7 @@ def tradeoff(
 
         >>> methods = {"event-exact": fj.EventExact()}
         >>> trade = fj.tradeoff(  # doctest: +SLOW
-        ...     scene, methods, t1=0.2, trajectories=4, precisions=("float64",), boundary=False, progress=False
+        ...     scene, methods=methods, t1=0.2, trajectories=4, precisions=("float64",), boundary=False, progress=False
         ... )
     """
     methods = default_methods() if methods is None else methods

@@ -53,7 +53,7 @@ def reproduce(
 
         >>> made = fj.reproduce(3, progress=False)["3"]  # doctest: +SLOW
         >>> print(made.findings[0].what)
-        μ_crit
+        μ_coupling
     """
     names = _names(figure)
     if out is not None:
