@@ -1,7 +1,6 @@
 """The notebooks run from top to bottom at a small size, and are stored without what they show."""
 
 import os
-import re
 import sys
 from pathlib import Path
 
@@ -79,20 +78,6 @@ def test_notebook_runs(path, compiled, monkeypatch):
         if out.get("name") == "stderr" and "Warning" in out["text"]
     ]
     assert warned == []
-
-
-@pytest.mark.slow
-def test_the_guide_runs(tmp_path, monkeypatch, capsys):
-    """Every snippet of the guide, one after the other, as a reader would type them."""
-    monkeypatch.chdir(tmp_path)
-    guide = (FOLDER / "GUIDE.md").read_text(encoding="utf-8")
-    names: dict = {}
-    for snippet in re.findall(r"```python\n(.*?)```", guide, re.DOTALL):
-        exec(compile(snippet, "GUIDE.md", "exec"), names)
-    said = capsys.readouterr().out
-    assert "LIMIT_CYCLE - stays on an orbit" in said
-    assert "0.22822534" in said
-    assert {"map.nc", "map.png", "map.part"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_all_five_are_here():
