@@ -1,0 +1,178 @@
+r"""The kick after which a motion neither returns to sliding nor comes to the limit cycle, and its derivatives.
+
+The motion after the critical kick stays on the border between the two, and comes to what attracts there: a saddle cycle $x_s$
+of the section's return map, with one multiplier $Λ$ outside the unit circle. With $l$ its left eigenvector, and $x_N$ the
+$N$-th crossing of the section after a kick $p$,
+
+$$ F_N(p, θ) = l^T (x_N(p, θ) - x_s(θ)) = 0 $$
+
+is the critical kick, ever more exactly as $N$ grows: what is left out is of second order in the distance, and its effect on
+$p$ shrinks with $1 / F_N'$. One trajectory gives $F_N$ and its derivative in $p$ for every $N$; Newton's method takes the $N$
+that is best. At the root $dp/dθ = -F_{N,θ} / F_{N,p}$, where the derivative of the trajectory runs through every event on the
+way from the kick to the saddle, and $l^T x_{s,θ} = l^T P_θ / (1 - Λ)$.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..contact import Contact
+from ..foundation.precision import in_double_precision
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from .closing import Closed, close
+from .kicked import MOST_CROSSINGS, Crossings, directions_of, kicked, returned
+from .section_map import Point
+
+# Trajectories that Newton's method may take, and where it has converged, relative to p.
+MOST_TRAJECTORIES = 12
+EXACT = 1e-13
+# A trajectory is near the saddle within this share of the saddle's size.
+NEAR = 0.3
+# Points of the section in one period of a saddle, at most, and places that are tried.
+MOST_POINTS, TRIED = 6, 8
+
+
+class Critical(NamedTuple):
+    """A critical kick."""
+
+    p: float
+    d_p: dict[str, float]  # by parameter
+    trajectories: int  # that Newton's method took
+    saddle: Closed
+
+
+class Saddle(NamedTuple):
+    """A saddle cycle with what Newton's method wants of it."""
+
+    closed: Closed
+    multiplier: float
+    left: Float[np.ndarray, " state"]  # the multiplier's left eigenvector, in weighted coordinates of unit length
+
+
+def saddle_of(closed: Closed, weights: Float[np.ndarray, " state"]) -> Saddle | None:
+    """A cycle as a saddle, if exactly one of its multipliers lies outside the unit circle."""
+    scaled = weights[:, None] * closed.jacobian / weights
+    if not np.all(np.isfinite(scaled)):
+        return None
+    values, left = np.linalg.eig(scaled.T)
+    outside = np.flatnonzero(np.abs(values) > 1 + 1e-9)
+    if len(outside) != 1 or abs(values[outside[0]].imag) > 0:
+        return None
+    vector = left[:, outside[0]].real
+    return Saddle(closed, float(values[outside[0]].real), vector / np.linalg.norm(vector))
+
+
+def saddle_passed(scene: Scene, stepper: EventExact, path: Crossings) -> Saddle | None:
+    """The saddle cycle that a trajectory passes: near where it repeats best."""
+    weights = np.asarray(scene.structure.weights)
+    y = weights * path.y[: path.count]
+    sizes = np.linalg.norm(y, axis=-1)
+    tried = []
+    for count in range(1, MOST_POINTS + 1):
+        if len(y) <= count + 1:
+            continue
+        back = np.linalg.norm(y[count:] - y[:-count], axis=-1) / sizes[:-count]
+        # Pure sliding that fades repeats well, too.
+        back = np.where(path.events[count : path.count] > path.events[: path.count - count], back, np.inf)
+        lowest = (back[1:-1] <= back[:-2]) & (back[1:-1] <= back[2:])
+        places = np.flatnonzero(lowest) + 1
+        tried += [(back[place] * (1 + 0.5 * (count - 1)), count, int(place)) for place in places]
+    for back, count, place in sorted(tried)[:TRIED]:
+        if not back < 0.2:
+            break
+        contact = Contact(jnp.asarray(path.status[place], jnp.int32), jnp.asarray(path.direction[place]))
+        closed = close(scene, stepper, Point(jnp.asarray(path.y[place]), contact), count)
+        found = None if closed is None else saddle_of(closed, weights)
+        if found is not None:
+            apart = np.linalg.norm(weights * np.asarray(found.closed.point.y) - y[place]) / sizes[place]
+            if apart < 0.5:
+                return found
+    return None
+
+
+class Approach(NamedTuple):
+    """What a trajectory tells at each of its crossings near the saddle."""
+
+    place: np.ndarray
+    distance: np.ndarray  # from the saddle, relative to its size
+    value: np.ndarray  # F_N
+    slope: np.ndarray  # its derivative in p
+
+
+def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"], which: int = 0) -> Approach:
+    """`F_N` along a trajectory, with the derivative along one direction."""
+    target = weights * np.asarray(saddle.closed.point.y)
+    away = weights * path.y[: path.count] - target
+    distance = np.linalg.norm(away, axis=-1) / np.linalg.norm(target)
+    status = path.status[: path.count] == int(saddle.closed.point.contact.status)
+    # Up to where it is closest: what comes later has left, and may have come back another way.
+    closest = int(np.argmin(np.where(status, distance, np.inf)))
+    place = np.flatnonzero((distance < NEAR) & status & (np.arange(path.count) <= closest))
+    slopes = (weights * path.y_parameter[which, : path.count]) @ saddle.left
+    return Approach(place, distance[place], (away @ saddle.left)[place], slopes[place])
+
+
+@in_double_precision
+def critical_kick(
+    scene: Scene, bracket: tuple[float, float], names: tuple[str, ...], saddle: Saddle | None = None
+) -> Critical | None:
+    """The critical kick inside a bracket by Newton's method, with its derivatives; none where no saddle is passed.
+
+    **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters;
+    `saddle`, if it is known.
+    """
+    stepper, weights = EventExact(), np.asarray(scene.structure.weights)
+    low, high = bracket
+    along_p = directions_of(scene, ("p",))
+    # From the side that slides: all that repeats on the way there, with events, is the saddle.
+    p, count, best, crossings = low, 0, np.inf, MOST_CROSSINGS
+    for _ in range(MOST_TRAJECTORIES):
+        path = kicked(scene.replace(p=p), stepper, along_p, crossings)
+        count += 1
+        if saddle is None:
+            saddle = saddle_passed(scene, stepper, path)
+            if saddle is None:
+                return None
+        near = approach(path, saddle, weights)
+        if not len(near.place):
+            return None
+        size = np.linalg.norm(weights * np.asarray(saddle.closed.point.y))
+        with np.errstate(all="ignore"):
+            error = near.distance**2 * size / np.abs(near.slope)
+        chosen = int(np.nanargmin(error))
+        step = -near.value[chosen] / near.slope[chosen]
+        if not low - (high - low) <= p + step <= high + (high - low):
+            return None
+        if abs(step) <= EXACT * p or (best < 1e-11 * p and abs(step) >= 0.5 * best):
+            slopes = _derivatives(scene.replace(p=p), stepper, names, saddle, weights, int(near.place[-1]) + 1)
+            return Critical(p, slopes, count, saddle.closed)
+        # The next one stays longer, but not twice as long.
+        crossings = min(2 * int(near.place[-1]) + 32, MOST_CROSSINGS)
+        p, best = p + step, abs(step)
+    return None
+
+
+def _derivatives(
+    scene: Scene,
+    stepper: EventExact,
+    names: tuple[str, ...],
+    saddle: Saddle,
+    weights: Float[np.ndarray, " state"],
+    crossings: int,
+) -> dict[str, float]:
+    every = ("p", *names)
+    # One number of directions, so that one program is compiled.
+    filled = every + ("p",) * (-len(every) % 16)
+    directions = directions_of(scene, filled)
+    path = kicked(scene, stepper, directions, crossings)
+    near = approach(path, saddle, weights)
+    with np.errstate(all="ignore"):
+        error = near.distance / np.abs(near.slope)
+    place = int(near.place[np.nanargmin(error)])
+    of_saddle = returned(scene, stepper, directions, saddle.closed.point, saddle.closed.crossings)
+    moved = (weights * of_saddle.y_parameter[:, saddle.closed.crossings - 1]) @ saddle.left / (1 - saddle.multiplier)
+    value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
+    return {name: float(-value[k] / value[0]) for k, name in enumerate(every) if name != "p"}

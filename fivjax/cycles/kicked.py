@@ -1,0 +1,128 @@
+"""The motion after a kick, and how the place where it crosses the section depends on every parameter of the scene."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact
+from ..foundation.compiling import compiled
+from ..model.load import Pulse
+from ..model.scene import Scene
+from ..steppers.core import Segment, follow
+from ..steppers.event_exact import EventExact
+from .multiple_shooting import parameter_direction
+from .section_map import MOST_SEGMENTS, Point, longest_return, mechanics_about_sliding
+
+# Crossings of the section that are kept, at most.
+MOST_CROSSINGS = 1024
+
+
+class Crossings(NamedTuple):
+    """The crossings of the section after a kick, in order; rows beyond `count` are empty."""
+
+    y: Float[np.ndarray, "k state"]  # deviations from sliding
+    y_parameter: Float[np.ndarray, "d k state"]  # and their derivatives along directions in the parameters
+    status: Int[np.ndarray, " k"]
+    direction: Float[np.ndarray, " k"]
+    events: Int[np.ndarray, " k"]  # contact events up to there
+    count: int
+
+
+class _Record(NamedTuple):
+    y: Float[Array, "k state"]
+    contact: Contact
+    events: Int[Array, " k"]
+    count: Int[Array, ""]
+    happened: Int[Array, ""]
+
+
+def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
+    """The scene's derivatives in several of its parameters, stacked along a first axis."""
+    each = [parameter_direction(scene, name) for name in names]
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
+
+
+def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
+    """Crossings after the kick of the scene's load, from steady sliding on; as many as asked for, if there are."""
+    start = Point(jnp.zeros(2 * scene.structure.size), Contact(jnp.asarray(1, jnp.int32), jnp.sign(scene.belt_speed)))
+    return _cut(_kicked(scene, stepper, directions, start, jnp.asarray(crossings, jnp.int32), MOST_CROSSINGS))
+
+
+def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:
+    """Crossings from a point of the section on, without a kick."""
+    quiet = scene.replace(p=1.0, duration=0.0)
+    return _cut(_kicked(quiet, stepper, directions, point, jnp.asarray(crossings, jnp.int32), MOST_CROSSINGS))
+
+
+def _cut(found) -> Crossings:
+    y, y_parameter, status, direction, events, count = (np.asarray(part) for part in found)
+    return Crossings(y, y_parameter, status, direction, events, int(count))
+
+
+@compiled
+def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, crossings, most: int):
+    def of(scene: Scene) -> tuple[Float[Array, "k state"], _Record]:
+        load = scene.load
+        assert isinstance(load, Pulse)
+        mechanics = mechanics_about_sliding(scene)
+        # Loads are deviations, too.
+        more = (load.p - 1.0) * load.force
+        begin = physics.status_from_forces(mechanics, more, start.y)
+        quiet = load.duration <= 0
+        begin = jax.tree.map(lambda a, b: jnp.where(quiet, a, b), start.contact, begin)
+        after = follow(
+            stepper, mechanics, begin, more, start.y, load.duration, most=64 * MOST_SEGMENTS, kind="lax"
+        )
+        empty = _Record(
+            jnp.full((most, len(start.y)), jnp.nan),
+            Contact(jnp.zeros(most, jnp.int32), jnp.ones(most)),
+            jnp.zeros(most, jnp.int32),
+            jnp.zeros((), jnp.int32),
+            jnp.zeros((), jnp.int32),
+        )
+        found = follow(
+            stepper,
+            mechanics,
+            after.contact,
+            jnp.zeros_like(more),
+            after.y,
+            longest_return(scene) * crossings,
+            total=empty,
+            observe=_recorded,
+            until=lambda total: total.count >= crossings,
+            at_section=True,
+            most=64 * MOST_SEGMENTS,
+            kind="lax",
+        ).total
+        return found.y, found
+
+    def along(direction: Scene):
+        _, tangent, found = jax.jvp(of, (scene,), (direction,), has_aux=True)
+        return tangent, found
+
+    tangents, found = jax.vmap(along, out_axes=(0, None))(directions)
+    return found.y, tangents, found.contact.status, found.contact.direction, found.events, found.count
+
+
+def _recorded(total: _Record, segment: Segment) -> _Record:
+    after = segment.after
+    crossed: Bool[Array, ""] = after.rise.happened
+    happened = total.happened + jnp.any(after.ended)
+    # What is written beyond the end is dropped.
+    place = jnp.where(crossed, total.count, len(total.events))
+    return _Record(
+        total.y.at[place].set(after.y, mode="drop"),
+        Contact(
+            total.contact.status.at[place].set(after.contact.status, mode="drop"),
+            total.contact.direction.at[place].set(after.contact.direction, mode="drop"),
+        ),
+        total.events.at[place].set(happened, mode="drop"),
+        total.count + crossed,
+        happened,
+    )
+
+
