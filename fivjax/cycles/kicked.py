@@ -74,9 +74,7 @@ def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, 
         begin = physics.status_from_forces(mechanics, more, start.y)
         quiet = load.duration <= 0
         begin = jax.tree.map(lambda a, b: jnp.where(quiet, a, b), start.contact, begin)
-        after = follow(
-            stepper, mechanics, begin, more, start.y, load.duration, most=64 * MOST_SEGMENTS, kind="lax"
-        )
+        after = follow(stepper, mechanics, begin, more, start.y, load.duration, most=64 * MOST_SEGMENTS, kind="lax")
         empty = _Record(
             jnp.full((most, len(start.y)), jnp.nan),
             Contact(jnp.zeros(most, jnp.int32), jnp.ones(most)),
@@ -124,5 +122,3 @@ def _recorded(total: _Record, segment: Segment) -> _Record:
         total.count + crossed,
         happened,
     )
-
-

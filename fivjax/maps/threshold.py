@@ -18,6 +18,7 @@ from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .axes import add_linear_limit, check_run, checked_axes
+from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings
 from .engine import run_to_verdict
 
@@ -37,6 +38,7 @@ def critical_perturbation(
     memory: float = 2e9,
     progress: bool | None = None,
     energy: bool = False,
+    derivatives: bool = False,
     **axis,
 ) -> xr.Dataset:
     """The smallest kick that leads to the limit cycle, along one or several axes; all of them bracketed in batch.
@@ -55,6 +57,7 @@ def critical_perturbation(
     - `tolerance`: the width of the bracket at which to stop.
     - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
     - `energy`: whether to add the energies of the critical kick.
+    - `derivatives`: whether to compute p_crit to rounding, and differentiate it in every parameter.
 
     **Returns:** a dataset over the axes with
 
@@ -70,6 +73,13 @@ def critical_perturbation(
     With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J: what the sliding
     state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
 
+    With `derivatives`, p_crit is found to rounding by Newton's method where the bracket's motion passes a saddle cycle, and
+    proved anew 1e-9 on either side; then there are also
+
+    - `kind`: "manifold" where the critical kick lands on the stable manifold of a saddle cycle, else "none";
+    - `d_p_crit` over `parameter`, per unit of each; NaN where there is none, and `why_none` says why in a sentence;
+    - `newton_trajectories`: how many trajectories Newton's method took.
+
     **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
 
     **Example:**
@@ -81,6 +91,11 @@ def critical_perturbation(
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)
     arguments.truth("energy", energy)
+    arguments.truth("derivatives", derivatives)
+    if derivatives and not isinstance(method, EventExact):
+        raise ValueError(
+            "Argument `derivatives` needs the method EventExact(), whose trajectories are exact through events."
+        )
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
     if "p" in axis:
         raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
@@ -114,6 +129,9 @@ def critical_perturbation(
         unknown = np.full(around.shape, Verdict.UNDECIDED)
         coarse, _ = _narrowed(run, coarse_method, columns, around, unknown, tolerance)
         stepping = np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
+    answers = {}
+    if derivatives:
+        fine, answers = with_derivatives(scene, functools.partial(_verdicts, run, method), columns, fine)
     # From the lower end on there is nothing to slide below.
     width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
     dataset = xr.Dataset(
@@ -130,6 +148,11 @@ def critical_perturbation(
         },
         coords=axes,
     )
+    if derivatives:
+        slopes = answers.pop("d_p_crit")
+        dataset["d_p_crit"] = ((*axes, "parameter"), slopes.reshape(*shape, -1))
+        dataset = dataset.assign_coords(parameter=list(differentiable(scene)))
+        dataset = dataset.assign({name: (tuple(axes), values.reshape(shape)) for name, values in answers.items()})
     if energy:
         for name, values in _energies_of_the_kick(run, method, scene, {**columns, "p": fine.middle}).items():
             dataset[name] = (tuple(axes), values.reshape(shape))

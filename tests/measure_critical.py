@@ -1,0 +1,126 @@
+"""Critical kicks by Newton's method and their derivatives, against an independent event-exact solver.
+
+    python tests/measure_critical.py [table2] [random] [derivatives] [cost]
+
+`table2`: the kicks of Table 2, by Newton's method and by bisection with the independent solver. `random`: the same for ten
+random structures. `derivatives`: all of them at two points of each kind against differences of the independent solver's kicks.
+`cost`: how long the derivatives take, in trajectories.
+"""
+
+import argparse
+import time
+
+import numpy as np
+import reference
+
+import fivjax as fj
+from fivjax.cycles.critical_kick import critical_kick
+from fivjax.maps.critical_derivatives import differentiable
+
+SPEEDS = (0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0)
+
+
+def paper(belt_speed: float, **others) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(**others), fj.Coulomb(0.227), belt_speed=belt_speed, load=fj.Pulse(p=1.2))
+
+
+def bisected(scene: fj.Scene, low: float, high: float, width: float = 2e-13) -> tuple[float, float]:
+    """The change from sliding to anything else between two kicks, by the independent solver."""
+    while high - low > width * high:
+        tried = np.linspace(low, high, 18)[1:-1]
+        fates = reference.fate([{**reference.of_scene(scene), "p": p} for p in tried], threads=2).fate
+        first = int(np.argmax(fates != "slides")) if np.any(fates != "slides") else len(tried)
+        new = (low if first == 0 else tried[first - 1]), (high if first == len(tried) else tried[first])
+        if new == (low, high):
+            break
+        low, high = new
+    return low, high
+
+
+def compared(name: str, scene: fj.Scene, found) -> None:
+    p = float(found.p_crit)
+    if not np.isfinite(p):
+        print(f"  {name}: no number; {found.why_none.values}")
+        return
+    low, high = bisected(scene, p - 1e-6, p + 1e-6)
+    apart = 0.0 if low <= p <= high else min(abs(p - low), abs(p - high))
+    kind, took = str(found.kind.values), int(found.newton_trajectories)
+    print(
+        f"  {name}: p_crit {p:.12f} ({kind}, {took} trajectories), off the reference's bracket by {apart:.1e} {found.why_none.values}"
+    )
+
+
+def table2() -> None:
+    found = fj.critical_perturbation(
+        paper(1.0), belt_speed=SPEEDS, p_range=(1.0, 1.3), derivatives=True, progress=False
+    )
+    for row, speed in enumerate(SPEEDS):
+        compared(f"v = {speed:g}", paper(speed), found.isel(belt_speed=row))
+        print(f"      dp/dv = {float(found.d_p_crit.sel(parameter='belt_speed')[row]):.12f}")
+
+
+def random() -> None:
+    draw, done = np.random.default_rng(3), 0
+    while done < 10:
+        share = draw.uniform(0.7, 1.4, 6)
+        parameters = dict(zip(("m1", "m2", "c1", "c2", "k1", "k2"), (0.53, 0.045, 1, 1, 100e3, 101e3), strict=True))
+        structure = fj.belt_oscillator(**{k: x * s for (k, x), s in zip(parameters.items(), share, strict=True)})
+        limit = float(fj.cea.critical_friction(structure))
+        if not 0.02 < limit < 0.8:
+            continue
+        scene = fj.Scene(
+            structure, fj.Coulomb(draw.uniform(0.7, 0.98) * limit), draw.uniform(0.5, 5.0), fj.Pulse(p=1.2)
+        )
+        found = fj.critical_perturbation(scene, p_range=(1.0, 9.0), p_step=0.05, derivatives=True, progress=False).isel(
+            belt_speed=0
+        )
+        if np.isfinite(found.p_crit_low):
+            done += 1
+            compared(f"structure {done}", scene, found)
+
+
+def derivatives() -> None:
+    for speed in (1.0, 5.0):
+        scene = paper(speed)
+        found = fj.critical_perturbation(scene, p_range=(1.0, 1.3), derivatives=True, progress=False).isel(belt_speed=0)
+        p = float(found.p_crit)
+        for name in differentiable(scene):
+            value, slope = float(scene.parameters[name]), float(found.d_p_crit.sel(parameter=name))
+            by = 1e-6 * abs(value) if value else 1e-6
+            kicks = []
+            for side in (-by, by):
+                if value + side < 0:
+                    kicks.append(np.nan)
+                    continue
+                guess = p + slope * side
+                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 1e-8, guess + 1e-8)))
+            difference = (kicks[1] - (p if np.isnan(kicks[0]) else kicks[0])) / (by if np.isnan(kicks[0]) else 2 * by)
+            print(
+                f"  v = {speed:g} {name:12s} {slope: .9e}  differences {difference: .9e}  apart {slope - difference: .1e}"
+            )
+
+
+def cost() -> None:
+    for speed in (1.0, 5.0):
+        scene = paper(speed)
+        bracket = (1.107205, 1.107207) if speed == 1.0 else (1.190282, 1.190284)
+        names = differentiable(scene)
+        critical_kick(scene, bracket, names)
+        began = time.perf_counter()
+        found = critical_kick(scene, bracket, names)
+        took = time.perf_counter() - began
+        began = time.perf_counter()
+        for _ in range(5):
+            fj.simulate(scene.replace(p=found.p), t1=10.0, dt_save=10.0)
+        one = (time.perf_counter() - began) / 5
+        print(
+            f"  v = {speed:g}: {took:.2f} s for p_crit and {len(names)} derivatives; a trajectory of 10 s takes {one:.3f} s"
+        )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", default=["table2", "random", "derivatives", "cost"])
+    for what in parser.parse_args().what:
+        print(what, flush=True)
+        {"table2": table2, "random": random, "derivatives": derivatives, "cost": cost}[what]()
