@@ -17,7 +17,7 @@ checker.checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 sys.modules["checker"] = checker
 
 ROOMS = ["foundation", "model", "contact", "steppers", "linear", "simulation", "cycles"]
-PROOFS = ["verdicts." + name for name in ("capture", "recurrence", "sliding_proof", "sticking_proof", "verdict")]
+PROOFS = ["verdicts." + name for name in ("capture", "sliding_proof", "sticking_proof", "verdict")]
 with install_import_hook(["fivjax." + name for name in ROOMS + PROOFS], "checker.checked"):
     for name in [*ROOMS, "verdicts"]:
         room = importlib.import_module("fivjax." + name)

@@ -9,8 +9,6 @@ import pytest
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.linear.linearisation import linear_sliding
-from fivjax.steppers.section import Resolution, rise_between
-from fivjax.verdicts.recurrence import new_recurrence, observe
 from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
 
 
@@ -91,83 +89,6 @@ def test_no_proof_above_the_stability_limit():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.25), 3.0, fj.ConstantLoad(100.0))
     q0 = fj.sliding_equilibrium(scene)
     assert not proved(scene, q0 + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
-
-
-def fed(states, tolerance=1e-7, span=16, floor=1e-5, events=True, decay=1.0):
-    """When an orbit counts as returned that sees these crossing states, one a second, each entered by a step whose velocity
-    rises through zero.
-    """
-    with jax.enable_x64(True):
-        resolution = Resolution(jnp.asarray(tolerance), jnp.asarray(span), jnp.asarray(floor))
-        step = jax.jit(
-            lambda memory, before, after, changed, t: observe(
-                memory,
-                jnp.ones(4),
-                jnp.zeros(4),
-                rise_between(before, after, 0),
-                changed,
-                jnp.abs(after[2]),
-                t,
-                decay,
-                resolution,
-            )
-        )
-        memory, when = new_recurrence(jnp.zeros(4)), None
-        for count, state in enumerate(states):
-            after = jnp.asarray(state, float).at[2].set(0.0)
-            memory = step(memory, after.at[2].set(-1.0), after, jnp.asarray(events), 1.0 * count)
-            memory = step(memory, after.at[2].set(0.5), after.at[2].set(-0.5), jnp.asarray(False), count + 0.5)
-            if when is None and bool(memory.returned):
-                when = count
-        return when
-
-
-def test_a_periodic_orbit_is_seen_to_return():
-    """Periods one and five: the same states again and again."""
-    assert fed([[1.0, 2.0, 0, 3.0]] * 40) is not None
-    cycle = [[np.cos(k), 1 + np.sin(k), 0, 0.3 * k] for k in range(5)]
-    assert fed(cycle * 12) is not None
-
-
-def test_a_torus_is_seen_to_return():
-    """Quasi-periodic: never the same twice, but it comes back again and again."""
-    angle = 2 * np.pi * np.arange(400) * (np.sqrt(5) - 1) / 28
-    assert fed(np.stack([3 + 0.3 * np.cos(angle), 0.3 * np.sin(angle), 0 * angle, 0 * angle], axis=1)) is not None
-
-
-@pytest.mark.parametrize("rate", [1.05, 1.01, 1.001, 0.999, 0.99])
-def test_leaving_an_unstable_cycle_slowly_is_no_return(rate):
-    """Close to an earlier state for dozens of periods, drifting off all the while: not a limit cycle, not yet."""
-    distance = 1e-3 * rate ** np.arange(200)
-    distance = distance if rate > 1 else 0.2 * rate ** np.arange(200)
-    states = np.stack([3 + distance, 1 - distance, 0 * distance, 0 * distance], axis=1)
-    assert fed(states) is None
-
-
-def test_a_spiral_out_of_an_unstable_cycle_is_no_return():
-    """It goes away and comes back close, turn after turn, but a little further out each time."""
-    k = np.arange(300)
-    radius = 1e-3 * 1.02**k
-    radius = radius[radius < 1.0]
-    angle = 2 * np.pi * np.arange(len(radius)) / 7.0
-    states = np.stack([3 + radius * np.cos(angle), radius * np.sin(angle), 0 * angle, 0 * angle], axis=1)
-    assert fed(states) is None
-
-
-def test_what_decays_slowly_comes_back_loosely_and_is_no_limit_cycle():
-    """A beat of an amplitude that nothing sustains: it counts only if the structure's damping would have ended it long ago."""
-    k = np.arange(400)
-    angle, size, scatter = 2 * np.pi * k / 7.0, np.exp(-1e-4 * k), 1e-3 * np.random.default_rng(7).normal(size=400)
-    states = size[:, None] * np.stack(
-        [3 + 0.3 * np.cos(angle) + scatter, 0.3 * np.sin(angle), 0 * angle, 0 * angle], axis=1
-    )
-    assert fed(states, decay=1e-4) is None
-    assert fed(states, decay=1.0) is not None
-
-
-def test_without_contact_events_nothing_is_a_limit_cycle():
-    """An undamped sliding oscillation returns too; it is no squeal."""
-    assert fed([[1.0, 2.0, 0, 3.0]] * 60, events=False) is None
 
 
 def test_impacts_that_die_out_in_a_structure_hardly_damped_are_no_limit_cycle():

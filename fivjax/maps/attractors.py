@@ -71,7 +71,7 @@ def search(
     running, moving = np.arange(len(own)), np.ones(len(own), bool)
     trajectories = rounds.begun(batch, shared, own, each, np.tile(nominating.RELEASES, len(groups)))
     if near is not None:
-        starts = [_about(maps, state) for state in near]
+        starts = [_about(maps, state)[:members] for state in near]
         trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.structure.normal)
     most, size = max(nominating.TESTS), 2 * maps.structure.size
     deviations = np.full((most, len(own), size), np.nan)
@@ -88,12 +88,12 @@ def search(
 
     while len(running) and looks < most:
         report(0)
-        trajectories.tree[1].recurrence.peak[:] = 0.0
+        trajectories.tree[1].peak[:] = 0.0
         rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
         _, now = trajectories.tree
         recent = slice(looks, looks + nominating.SEEN)
         deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
-        peaks[recent, running], times[recent, running] = now.recurrence.peak, now.t
+        peaks[recent, running], times[recent, running] = now.peak, now.t
         # As of the last of these looks: enough to tell whether there were any since the looks before.
         events[recent, running] = now.events
         looks += nominating.SEEN
@@ -114,7 +114,7 @@ def search(
 
 def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int) -> None:
     """Cycles where members are by now; those that are captured by them need not be followed any further."""
-    latest = np.array(now.recurrence.latest)
+    latest = np.array(now.crossing)
     usable = moving[running] & np.all(np.isfinite(latest), axis=1) & (now.events > 0)
     at = section_of(now)
 

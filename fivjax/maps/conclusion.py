@@ -18,7 +18,7 @@ GROWTH = 1e9
 
 def look(setting: Setting, now: Progress, reached: Bool[Array, ""]) -> tuple[Progress, Bool[Array, ""]]:
     """A look at how near the trajectory is to the known torus, and whether it has `reached` it by now."""
-    crossing = setting.scene.structure.weights * now.recurrence.latest
+    crossing = setting.scene.structure.weights * now.crossing
     approach, reached_now = attractors.approached(now.approach, setting.attractor, crossing)
     return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
 

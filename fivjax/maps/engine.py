@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import equinox as eqx
 import jax
 import numpy as np
 from tqdm.auto import tqdm
@@ -28,8 +27,6 @@ from .sharing import HISTORY, Batch, bytes_per_trajectory, grouped, in_bulk
 SIDE_BY_SIDE = 16
 # What a trajectory that shares nothing costs, in trajectories that stand side by side.
 COST_OF_STANDING_ALONE = 4
-# Trajectories taken from a grid are not that close to a boundary; so many times fewer crossings have to stay the same.
-NOT_LINGERING = 4
 # Steps that a trajectory may take: 10⁵ cycles with their events, and some hours of work for a map of them.
 MOST_STEPS = 2**21
 # How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
@@ -46,7 +43,6 @@ def run_to_verdict(
     max_steps: int = MOST_STEPS,
     progress: bool | None,
     label: str,
-    lingering: bool = False,
     known: Verdicts | None = None,
     keep: Callable[[Verdicts], None] | None = None,
     energy: bool = False,
@@ -54,8 +50,7 @@ def run_to_verdict(
 ) -> Verdicts:
     """Follow one trajectory for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
-    `lingering` says that the trajectories were chosen to lie so close to a boundary that they stay with an unstable cycle
-    for long: then one has to return for longer before it counts. `energy` asks for the ledger of each at its end.
+    `energy` asks for the ledger of each at its end.
 
     `known` is what an earlier run of the same trajectories has finished; those are not run again. `keep` is handed
     everything that is finished, every few seconds and at the end.
@@ -64,9 +59,6 @@ def run_to_verdict(
 
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
-    resolution = method.resolution
-    if not lingering:
-        resolution = eqx.tree_at(lambda r: r.span, resolution, np.asarray(resolution.span) // NOT_LINGERING)
     total = len(next(iter(values.values())))
     verdicts = not_run(total, energy) if known is None else jax.tree.map(np.array, known)
     already = int(np.sum(~verdicts.pending))
@@ -104,7 +96,6 @@ def run_to_verdict(
     batch = Batch(
         scene=scene,
         method=method if energy else in_bulk(method, scene),
-        resolution=resolution,
         names=tuple(name for name in values if name not in HISTORY),
         history=tuple(name for name in values if name in HISTORY),
         energy=energy,

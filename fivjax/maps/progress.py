@@ -20,9 +20,7 @@ from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
-from ..verdicts import recurrence
 from ..verdicts.ensemble import Approach, Attractor
-from ..verdicts.recurrence import Recurrence
 from ..verdicts.sliding_proof import SlidingModes
 from ..verdicts.sticking_proof import StickingDrift
 from ..verdicts.verdict import Verdict
@@ -37,7 +35,8 @@ class Progress(eqx.Module):
     t: Float[Array, ""]
     y: State  # as a deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
     contact: Contact
-    recurrence: Recurrence
+    crossing: State  # the last crossing of the section under the final load; NaN before the first
+    peak: Float[Array, ""]  # largest tangential speed since it was last set to zero, m/s
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
     approach: Approach
@@ -50,7 +49,6 @@ class Setting(eqx.Module):
 
     scene: Scene
     method: AbstractStepper | Windowed
-    resolution: recurrence.Resolution
     mechanics: Mechanics  # see `mechanics_about_sliding`
     prepared: Any  # the method's own, see `AbstractStepper.prepare`
     modes: SlidingModes
@@ -81,7 +79,8 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
         t=jnp.zeros((), y.dtype),
         y=y,
         contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
-        recurrence=recurrence.new_recurrence(y),
+        crossing=jnp.full_like(y, jnp.nan),
+        peak=jnp.zeros((), y.dtype),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
         approach=attractors.no_approach(y),
@@ -112,7 +111,7 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
 
 def step(setting: Setting, now: Progress) -> Progress:
     """One step further, which ends at the next event at the latest."""
-    scene, structure, method = setting.scene, setting.scene.structure, setting.method
+    scene, method = setting.scene, setting.method
     # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
     longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
     t = next_step_end(scene.load, now.t, longest)
@@ -122,23 +121,13 @@ def step(setting: Setting, now: Progress) -> Progress:
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
     # What comes back under the kick's load says nothing of the motion after it.
-    rise = rise._replace(happened=rise.happened & jnp.all(scene.load.jumps <= now.t))
-    memory = recurrence.observe(
-        now.recurrence,
-        structure.weights,
-        jnp.zeros_like(y),
-        rise,
-        changed,
-        peak,
-        t,
-        setting.modes.slowest_decay,
-        setting.resolution,
-    )
+    crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
     return Progress(
         t=t,
         y=y,
         contact=contact,
-        recurrence=memory,
+        crossing=jnp.where(crossed, rise.at, now.crossing),
+        peak=jnp.maximum(now.peak, peak),
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
         approach=now.approach,

@@ -130,7 +130,7 @@ class Basins:
 
         Not only those that repeat to the last digits are asked: a motion that closes in slowly is near its cycle long before.
         """
-        asking = np.flatnonzero(np.all(np.isfinite(np.array(now.recurrence.latest)), axis=1) & (now.events > 0))
+        asking = np.flatnonzero(np.all(np.isfinite(np.array(now.crossing)), axis=1) & (now.events > 0))
         if not len(asking) or self.maps is None:
             return
         at = attractors.section_of(now).rows(asking)
@@ -144,7 +144,7 @@ class Basins:
         chosen = asking[without][first]
         for start in range(0, len(groups), ENSEMBLES):
             part = slice(start, start + ENSEMBLES)
-            follower, near = Follower(_begun, _follow), np.array(now.recurrence.latest)[chosen[part]]
+            follower, near = Follower(_begun, _follow), np.array(now.crossing)[chosen[part]]
             given = columns[pending[chosen[part]]]
             found = attractors.search(
                 self.batch, self.shared, self.maps, follower, groups[part], given, report, near=near
@@ -158,7 +158,7 @@ class Basins:
         """The place in `cycles` of the cycle that each trajectory is captured by, or -1."""
         if self.maps is None or not self.cycles:
             return np.full(len(pending), -1)
-        latest = np.array(now.recurrence.latest)
+        latest = np.array(now.crossing)
         usable = undecided & np.all(np.isfinite(latest), axis=1)
         rows_of: dict[int, list[int]] = {}
         for row in np.flatnonzero(usable):
@@ -207,9 +207,7 @@ def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Fl
     follow_block = _follow_block_of_many if batch.many else _follow_block
 
     def function(*block):
-        return follow_block(
-            batch.scene, batch.method, batch.resolution, batch.names, batch.history, np.int32(looks), *block
-        )
+        return follow_block(batch.scene, batch.method, batch.names, batch.history, np.int32(looks), *block)
 
     in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True)
 
@@ -229,9 +227,7 @@ def _begin_block(scene, names, history, energy: bool, shared: Flattened, traject
     return flatten((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
 
 
-def _followed(
-    scene, method, resolution, names, history, looks, shared: Flattened, trajectories: Flattened
-) -> Flattened:
+def _followed(scene, method, names, history, looks, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
     everything = shared.tree
 
@@ -245,7 +241,6 @@ def _followed(
                 setting = Setting(
                     with_values(scene_of_group, history, row),
                     method,
-                    resolution,
                     shared.mechanics,
                     shared.prepared,
                     shared.modes,

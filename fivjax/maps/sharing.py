@@ -20,7 +20,6 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.propagation import MATRIX_ROWS
-from ..steppers.section import Resolution
 from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
 from ..verdicts.ensemble import Attractor
@@ -51,7 +50,6 @@ class Batch(NamedTuple):
 
     scene: Scene
     method: AbstractStepper | Windowed
-    resolution: Resolution
     names: tuple[str, ...]  # parameters that make groups
     history: tuple[str, ...]  # those of the load's history
     energy: bool

@@ -182,7 +182,7 @@ def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarr
 def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> np.ndarray:
     """Verdicts for every row of the columns at its own values of p (rows, kicks)."""
     values = {name: np.repeat(column, p.shape[1]) for name, column in columns.items()}
-    found = run(values={**values, "p": p.ravel()}, method=method, label=label, lingering=label != "scan")
+    found = run(values={**values, "p": p.ravel()}, method=method, label=label)
     return found.verdict.reshape(p.shape)
 
 

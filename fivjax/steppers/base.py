@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..model.scene import Scene
-from .section import Resolution, Rise, rise_between
+from .section import Rise, rise_between
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
@@ -105,11 +105,6 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     # Whether it finds out itself how far an advance may reach; if not, `dt` is its step, and decides its error.
     chooses_its_steps: ClassVar[bool] = True
     term_structure: ClassVar = diffrax.ODETerm
-
-    @property
-    @abc.abstractmethod
-    def resolution(self) -> Resolution:
-        """What orbits computed by this method are good for, see `orbit`."""
 
     @abc.abstractmethod
     def prepare(self, mechanics: Mechanics):

@@ -24,7 +24,6 @@ from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
-from .section import Resolution
 
 MOST_ROOT_STEPS = 60
 
@@ -68,12 +67,6 @@ class EventExact(AbstractStepper):
 
     def order(self, terms) -> int:
         return self.order_
-
-    @property
-    def resolution(self) -> Resolution:
-        # Next to the critical perturbation an unstable cycle is left at some 5 % a period: sixty periods without a drift
-        # of 1e-8 mean that it was met to 1e-9, or that the orbit is another.
-        return Resolution(jnp.asarray(1e-8), jnp.asarray(64), jnp.asarray(1e-5))
 
     def prepare(self, mechanics: Mechanics) -> Mechanics:
         return mechanics

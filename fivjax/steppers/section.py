@@ -2,19 +2,10 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from ..contact import State
-
-
-class Resolution(eqx.Module):
-    """What a method's crossing states are good for."""
-
-    tight: Float[Array, ""]  # crossings this close, relative to the orbit's size, are the same
-    span: Int[Array, ""]  # crossings over which they have to stay the same
-    floor: Float[Array, ""]  # excursions below this may be the method's own error
 
 
 class Rise(NamedTuple):

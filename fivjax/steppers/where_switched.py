@@ -11,7 +11,6 @@ from ..contact import Contact, Mechanics, State
 from ..foundation import arguments
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between, rates
-from .section import Resolution
 
 
 class WhereSwitched(AbstractStepper):
@@ -57,11 +56,6 @@ class WhereSwitched(AbstractStepper):
     def order(self, terms) -> int | None:
         # Of the smooth motion between events.
         return self.solver.order(terms)
-
-    @property
-    def resolution(self) -> Resolution:
-        # Events come up to a step late, so crossings scatter by a few per cent and only many of them say something.
-        return Resolution(jnp.asarray(0.02), jnp.asarray(256), jnp.asarray(0.05))
 
     def prepare(self, mechanics: Mechanics) -> Mechanics:
         return mechanics

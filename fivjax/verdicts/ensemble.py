@@ -18,10 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import State
-from .recurrence import DECAYED, SUSTAINED
 
 # Loads that the ensemble is released from, in final loads.
-RELEASES = np.linspace(1.5, 6.0, 16)
+RELEASES = np.linspace(1.5, 6.0, 8)
 # Crossing states that a trajectory keeps: an ensemble is followed for as many looks at a time.
 SEEN = 4
 # When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
@@ -31,10 +30,14 @@ EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Of its states, so many have to be where others were.
 MOSTLY = 0.9
 # Members that have to meet.
-LEAST_MEMBERS = 5
+LEAST_MEMBERS = 3
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
 KEPT = 256
 # Sets that so few balls of the size `REACHED` cover are periodic, or drift: no tori.
+# In between the two stretches, a vibration that nothing sustains would have decayed by so much at least ...
+DECAYED = 0.2
+# ... and theirs has changed in size by no more than this share of that.
+SUSTAINED = 0.1
 LEAST_SPREAD = 6
 # A torus' mean size, in the first and in the last third of the looks of late, is the same but for this share.
 KEEPS_SIZE = 0.02

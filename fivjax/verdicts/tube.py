@@ -14,7 +14,7 @@ RADIUS = 0.04
 # Starts in it: one in four displaced outwards, one in four inwards, the others at random.
 STARTS = 16
 # Crossings in a row within half the tube, within so many crossings.
-HOME, LEAST_LOOKS, MOST_LOOKS = 16, 64, 384
+HOME, LEAST_LOOKS, MOST_LOOKS = 16, 32, 384
 
 
 def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
