@@ -23,7 +23,10 @@ from .section import ReturnMaps, Section
 from .sharing import Batch
 
 # Looks at an ensemble after which cycles are computed from where its members are.
-NEWTON_AT = (24, 64, 128, 256, 512)
+NEWTON_AT = (24, 64, 128, 256)
+# Looks in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone. What
+# takes longer is left to the trajectories that meet it.
+BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 # Returns over which a torus' mean period is taken.
 MEAN_OVER = 64
 # Mean periods from each start in which its peak is sought.
@@ -73,7 +76,11 @@ def search(
     if near is not None:
         starts = [_about(maps, state)[:members] for state in near]
         trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.structure.normal)
-    most, size = max(nominating.TESTS), 2 * maps.structure.size
+    if near is None:
+        tests, within = nominating.TESTS, BACK_WITHIN
+    else:
+        tests, within = nominating.TESTS_ALONE, BACK_WITHIN_ALONE
+    most, size = max(tests), 2 * maps.structure.size
     deviations = np.full((most, len(own), size), np.nan)
     peaks, times, events = (np.full((most, len(own)), np.nan) for _ in range(3))
     decay = shared.tree.modes.slowest_decay
@@ -100,11 +107,11 @@ def search(
         moving[running] = now.verdict == Verdict.UNDECIDED
         if looks in NEWTON_AT:
             _add_cycles(maps, own, running, moving, now, found, members)
-        if looks in nominating.TESTS:
+        if looks in tests:
             open_ = np.unique(running[moving[running]] // members)
             sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
             if sets:
-                _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, report)
+                _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, within, report)
                 done = [k for k, _ in sets if found[k].torus is not None]
                 moving[np.isin(np.arange(len(own)) // members, done)] = False
         left = moving[running]
@@ -149,7 +156,9 @@ def section_of(now) -> Section:
     return Section(np.array(now.y), np.array(now.contact.status), np.array(now.contact.direction))
 
 
-def _add_tori(batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, report) -> None:
+def _add_tori(
+    batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, within: int, report
+) -> None:
     """Which of the sets that ensembles have met on (with the group's place) are tori."""
     structure, weights = maps.structure, maps.weights
     starts = [_about(maps, states[:: len(states) // tube.STARTS] / weights) for _, (states, _) in sets]
@@ -158,11 +167,10 @@ def _add_tori(batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns
     each = np.repeat(np.stack([columns[k] for k, _ in sets]), count, axis=0)
     y = np.concatenate(starts) / weights
     trajectories = _at(rounds.begun(batch, shared, own, each, np.ones(len(own))), y, structure.normal)
-    running, ok = np.arange(len(own)), np.ones(len(sets), bool)
-    home = np.zeros(len(sets), bool)
+    running, ok, home = np.arange(len(own)), np.ones(len(sets), bool), np.zeros(len(own), bool)
     last = Section(np.zeros_like(y), np.zeros(len(y), np.int32), np.ones(len(y)))
     ends = np.full((tube.HOME, len(own), y.shape[1]), np.nan)
-    for looks in range(nominating.SEEN, tube.MOST_LOOKS + 1, nominating.SEEN):
+    for looks in range(nominating.SEEN, within + 1, nominating.SEEN):
         report(0)
         rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
         _, now = trajectories.tree
@@ -170,16 +178,16 @@ def _add_tori(batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns
         ends[-nominating.SEEN :, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
         # One that slides, or fails, has not come back.
         ok[np.unique(running[now.verdict != Verdict.UNDECIDED] // count)] = False
-        if looks % tube.HOME == 0 and looks >= tube.LEAST_LOOKS:
-            for k in np.unique(running // count):
-                home[k] = tube.all_home(sets[k][1][0], ends[:, k * count : (k + 1) * count])
+        for k in np.unique(running // count) if looks >= tube.HOME else ():
+            mine = running[running // count == k]
+            home[mine] = tube.home(sets[k][1][0], ends[:, mine])
         for whole, part in zip(last, section_of(now), strict=True):
             whole[running] = part
-        left = (ok & ~home)[running // count]
+        left = ok[running // count] & ~home[running]
         running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
         if not len(running):
             break
-    tori = np.flatnonzero(home & ok)
+    tori = np.flatnonzero(np.all(home.reshape(-1, count), axis=1) & ok)
     if not len(tori):
         return
     rows = (count * tori[:, None] + np.arange(count)).ravel()

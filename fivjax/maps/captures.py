@@ -18,7 +18,7 @@ NEARLY = 0.1
 MOST_CROSSINGS = 8
 NEWTON_STEPS = 12
 # Points of the section that a group nominates at a time.
-NOMINATED = 4
+NOMINATED = 2
 # The same cycle: a state this close to one of its own, relative to their size.
 SAME = 1e-6
 # How well crossings are known that tell which trajectories to ask, relative to the cycle's size.

@@ -17,7 +17,7 @@ from ..verdicts.verdict import Verdict
 from . import attractors
 from .attractors import Attractors, Follower
 from .blocks import in_blocks
-from .captures import Cycle, captured, stable_cycles
+from .captures import Cycle, captured, distinct, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, released, step
@@ -102,7 +102,6 @@ class Basins:
         self.maps: ReturnMaps | None = None
         self.cycles: list[Cycle] = []
         self.of_group: dict[int, list[int]] = {}  # places in `cycles`
-        self.of_trajectory: dict[int, list[int]] = {}  # those that it nominated alone
         self.torus = shared.tree.attractor  # views: what is written here is written there
         self.torus_period = np.full(len(distinct), np.nan)
 
@@ -126,25 +125,26 @@ class Basins:
                 self.torus_period[g] = one.torus.period
 
     def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, report) -> None:
-        """Computes cycles from where trajectories are, each for itself; and a torus of their group.
-
-        Not only those that repeat to the last digits are asked: a motion that closes in slowly is near its cycle long before.
-        """
-        asking = np.flatnonzero(np.all(np.isfinite(np.array(now.crossing)), axis=1) & (now.events > 0))
-        if not len(asking) or self.maps is None:
+        """Finds attractors from where a few trajectories of each group are that have taken long."""
+        latest = np.array(now.crossing)
+        asks = np.all(np.isfinite(latest), axis=1) & (now.events > 0)
+        if not np.any(asks) or self.maps is None:
             return
-        at = attractors.section_of(now).rows(asking)
-        own = self.group[pending[asking]]
-        for _, rows, cycle in stable_cycles(self.maps, own, at):
-            for row in rows:
-                self.of_trajectory.setdefault(int(pending[asking[row]]), []).append(len(self.cycles))
-            self.cycles.append(cycle)
-        without = np.array([t not in self.of_trajectory for t in pending[asking]]) & (self.torus.amplitude[own] == 0)
-        groups, first = np.unique(own[without], return_index=True)
-        chosen = asking[without][first]
+        group = self.group[pending]
+        picked = distinct(self.maps.weights * np.where(asks[:, None], latest, 0.0), group, asks)
+        led_to_one = np.zeros(len(picked), bool)
+        for g, rows, cycle in stable_cycles(self.maps, group[picked], attractors.section_of(now).rows(picked)):
+            led_to_one[rows] = True
+            mine = self.of_group[g]
+            if not any(attractors.same_cycle(self.maps, cycle, self.cycles[place]) for place in mine):
+                mine.append(len(self.cycles))
+                self.cycles.append(cycle)
+        alone = picked[~led_to_one & (self.torus.amplitude[group[picked]] == 0)]
+        groups, first = np.unique(group[alone], return_index=True)
+        chosen = alone[first]
         for start in range(0, len(groups), ENSEMBLES):
             part = slice(start, start + ENSEMBLES)
-            follower, near = Follower(_begun, _follow), np.array(now.crossing)[chosen[part]]
+            follower, near = Follower(_begun, _follow), latest[chosen[part]]
             given = columns[pending[chosen[part]]]
             found = attractors.search(
                 self.batch, self.shared, self.maps, follower, groups[part], given, report, near=near
@@ -161,9 +161,6 @@ class Basins:
         latest = np.array(now.crossing)
         usable = undecided & np.all(np.isfinite(latest), axis=1)
         rows_of: dict[int, list[int]] = {}
-        for row in np.flatnonzero(usable):
-            for place in self.of_trajectory.get(int(pending[row]), []):
-                rows_of.setdefault(place, []).append(row)
         rows = np.flatnonzero(usable)
         rows = rows[np.argsort(self.group[pending[rows]], kind="stable")]
         mine = self.group[pending[rows]]

@@ -23,14 +23,13 @@ from ..contact import State
 RELEASES = np.linspace(1.5, 6.0, 8)
 # Crossing states that a trajectory keeps: an ensemble is followed for as many looks at a time.
 SEEN = 4
-# When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for.
-TESTS = (64, 96, 128, 256, 512)
+# When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for. Second, of an
+# ensemble about a motion that has asked for an attractor of its own: it may be one that closes in slowly.
+TESTS, TESTS_ALONE = (64, 96, 128), (64, 96, 128, 256, 512)
 # The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
 EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Of its states, so many have to be where others were.
 MOSTLY = 0.9
-# Members that have to meet.
-LEAST_MEMBERS = 3
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
 KEPT = 256
 # Sets that so few balls of the size `REACHED` cover are periodic, or drift: no tori.
@@ -89,7 +88,7 @@ def no_approach(y: State) -> Approach:
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
     """Crossing states and the amplitude (m/s) of what the ensemble has met on, if it has and if that may be a torus.
 
-    Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago.
+    Members have met when nine in ten of their crossing states of late are close to states that they were in some time ago.
     In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
     1/s); theirs has changed in size by no more than a tenth of that.
     """
@@ -97,19 +96,15 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     earlier, later = (slice(*(round(looks * share) for share in stretch)) for stretch in (EARLIER, LATER))
     if not np.all(np.isfinite(ensemble.deviations[earlier.start :, ensemble.moving])):
         return None
-    members = []
-    for member in np.flatnonzero(ensemble.moving):
-        others = ensemble.moving & (np.arange(len(ensemble.moving)) != member)
-        known = ensemble.deviations[earlier, others].reshape(-1, ensemble.deviations.shape[-1])
-        # A vibration that grows from nothing meets on its growing mode long before its first event.
-        eventful = ensemble.events[later, member][-1] > ensemble.events[later, member][0]
-        if (
-            len(known)
-            and eventful
-            and np.mean(_distance(known, ensemble.deviations[later, member]) <= REACHED) >= MOSTLY
-        ):
-            members.append(member)
-    if len(members) < LEAST_MEMBERS:
+    known = ensemble.deviations[earlier, ensemble.moving].reshape(-1, ensemble.deviations.shape[-1])
+    # A vibration that grows from nothing meets on its growing mode long before its first event.
+    eventful = ensemble.moving & (ensemble.events[later.stop - 1] > ensemble.events[later.start])
+    members = [
+        member
+        for member in np.flatnonzero(eventful)
+        if np.mean(_distance(known, ensemble.deviations[later, member]) <= REACHED) >= MOSTLY
+    ]
+    if not members:
         return None
     lasting = decay * (np.mean(ensemble.times[later, members]) - np.mean(ensemble.times[earlier, members]))
     sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]

@@ -7,14 +7,14 @@ Next to a slow fade, and next to the ghost of a fold, nothing comes back: what i
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 # The tube's radius, relative to the mean size of the states.
 RADIUS = 0.04
 # Starts in it: one in four displaced outwards, one in four inwards, the others at random.
 STARTS = 16
-# Crossings in a row within half the tube, within so many crossings.
-HOME, LEAST_LOOKS, MOST_LOOKS = 16, 32, 384
+# Crossings in a row within half the tube.
+HOME = 16
 
 
 def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
@@ -39,11 +39,12 @@ def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate:
     return found
 
 
-def all_home(states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"]) -> bool:
-    """Whether all of the last crossing states of all starts lie within half the tube."""
-    if not np.all(np.isfinite(ends)):
-        return False
+def home(states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"]) -> Bool[np.ndarray, " m"]:
+    """Which starts are back: all of their last crossing states lie within half the tube."""
     size = np.mean(np.linalg.norm(states, axis=-1))
-    points = ends.reshape(-1, ends.shape[-1])
+    points = np.where(np.isfinite(ends), ends, np.inf).reshape(-1, ends.shape[-1])
+    finite = np.all(np.isfinite(points), axis=-1)
+    points = np.where(finite[:, None], points, 0.0)
     apart = np.sum(points**2, axis=-1)[:, None] - 2 * points @ states.T + np.sum(states**2, axis=-1)
-    return bool(np.max(np.min(apart, axis=1)) <= (0.5 * RADIUS * size) ** 2)
+    inside = finite & (np.min(apart, axis=1) <= (0.5 * RADIUS * size) ** 2)
+    return np.all(inside.reshape(ends.shape[:-1]), axis=0)
