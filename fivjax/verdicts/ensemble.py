@@ -30,14 +30,15 @@ TESTS, TESTS_ALONE = (64, 96, 128), (64, 96, 128, 256, 512)
 EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Of its states, so many have to be where others were.
 MOSTLY = 0.9
+# Members that have to meet.
+LEAST_MEMBERS = 3
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
 KEPT = 256
 # Sets that so few balls of the size `REACHED` cover are periodic, or drift: no tori.
-# In between the two stretches, a vibration that nothing sustains would have decayed by so much at least ...
-DECAYED = 0.2
-# ... and theirs has changed in size by no more than this share of that.
-SUSTAINED = 0.1
 LEAST_SPREAD = 6
+# Between the two stretches a vibration that nothing sustains would have decayed by so much at least, and theirs has changed in
+# size by no more than this share of that.
+DECAYED, SUSTAINED = 0.2, 0.1
 # A torus' mean size, in the first and in the last third of the looks of late, is the same but for this share.
 KEEPS_SIZE = 0.02
 # This close, relative to the own distance from equilibrium, it is the same limit cycle.
@@ -88,7 +89,7 @@ def no_approach(y: State) -> Approach:
 def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
     """Crossing states and the amplitude (m/s) of what the ensemble has met on, if it has and if that may be a torus.
 
-    Members have met when nine in ten of their crossing states of late are close to states that they were in some time ago.
+    Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago.
     In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
     1/s); theirs has changed in size by no more than a tenth of that.
     """
@@ -96,15 +97,15 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     earlier, later = (slice(*(round(looks * share) for share in stretch)) for stretch in (EARLIER, LATER))
     if not np.all(np.isfinite(ensemble.deviations[earlier.start :, ensemble.moving])):
         return None
-    known = ensemble.deviations[earlier, ensemble.moving].reshape(-1, ensemble.deviations.shape[-1])
     # A vibration that grows from nothing meets on its growing mode long before its first event.
     eventful = ensemble.moving & (ensemble.events[later.stop - 1] > ensemble.events[later.start])
-    members = [
-        member
-        for member in np.flatnonzero(eventful)
-        if np.mean(_distance(known, ensemble.deviations[later, member]) <= REACHED) >= MOSTLY
-    ]
-    if not members:
+    members = []
+    for member in np.flatnonzero(eventful):
+        others = ensemble.moving & (np.arange(len(ensemble.moving)) != member)
+        known = ensemble.deviations[earlier, others].reshape(-1, ensemble.deviations.shape[-1])
+        if len(known) and np.mean(_distance(known, ensemble.deviations[later, member]) <= REACHED) >= MOSTLY:
+            members.append(member)
+    if len(members) < LEAST_MEMBERS:
         return None
     lasting = decay * (np.mean(ensemble.times[later, members]) - np.mean(ensemble.times[earlier, members]))
     sizes = [np.mean(np.linalg.norm(ensemble.deviations[part][:, members], axis=-1)) for part in (earlier, later)]
