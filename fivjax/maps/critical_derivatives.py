@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..cycles.critical_kick import Critical, critical_kick
+from ..cycles.stable_manifold import Critical, critical_kick
 from ..model.scene import Scene
 from ..verdicts.verdict import Verdict
 from .crossing import Crossing

@@ -23,7 +23,7 @@ from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .closing import Closed, close
-from .kicked import MOST_CROSSINGS, Crossings, directions_of, kicked, returned
+from .kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned
 from .section_map import Point
 
 # Trajectories that Newton's method may take, and where it has converged, relative to p.
@@ -128,10 +128,9 @@ def critical_kick(
     low, high = bracket
     along_p = directions_of(scene, ("p",))
     # From the side that slides: all that repeats on the way there, with events, is the saddle.
-    p, count, best, crossings = low, 0, np.inf, MOST_CROSSINGS
-    for _ in range(MOST_TRAJECTORIES):
+    p, best, crossings = low, np.inf, MOST_CROSSINGS
+    for taken in range(1, MOST_TRAJECTORIES + 1):
         path = kicked(scene.replace(p=p), stepper, along_p, crossings)
-        count += 1
         if saddle is None:
             saddle = saddle_passed(scene, stepper, path)
             if saddle is None:
@@ -148,7 +147,7 @@ def critical_kick(
             return None
         if abs(step) <= EXACT * p or (best < 1e-11 * p and abs(step) >= 0.5 * best):
             slopes = _derivatives(scene.replace(p=p), stepper, names, saddle, weights, int(near.place[-1]) + 1)
-            return Critical(p, slopes, count, saddle.closed)
+            return Critical(p, slopes, taken, saddle.closed)
         # The next one stays longer, but not twice as long.
         crossings = min(2 * int(near.place[-1]) + 32, MOST_CROSSINGS)
         p, best = p + step, abs(step)
