@@ -14,6 +14,7 @@ from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
 from .gradients import with_own_gradient
 from .outcomes import CODES, Mechanism, StabilityOutcome
+from .several_contacts import critical_friction_of_several, first_limit_of_several, one_contact
 from .system import as_scene, check_direction
 
 
@@ -41,7 +42,7 @@ class StabilityLimit(eqx.Module):
 
 def bare(structure: Structure) -> Structure:
     """The structure without the memory of how it was made: one compiled program serves every builder."""
-    return Structure(*structure.matrices, structure.tangential, structure.normal)
+    return Structure(*structure.matrices, contacts=structure.contacts)
 
 
 def _is_a_limit(value):
@@ -54,6 +55,7 @@ def _friction_limit(structure, direction):
 
 
 _critical_friction = compiled(with_own_gradient(_friction_limit, _is_a_limit))
+_critical_friction_of_several = compiled(with_own_gradient(critical_friction_of_several, _is_a_limit))
 
 
 @returning_numpy
@@ -72,6 +74,9 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     **Returns:** `inf` where the structure is never unstable, 0 where it is unstable at the slightest friction; the
     derivative is NaN then. `stability_limit` says the outcome and the mechanism by name.
 
+    Several contacts slide under one μ. Their limit is looked for among 400 coefficients up to 2 and then closed in on: a
+    narrower unstable window may be missed, and "never" means up to 2. Undamped, it has no derivative there.
+
     **Arguments:** `structure`; `direction`, +1 for a belt that moves along the tangential coordinate, -1 against it.
 
     **Example:**
@@ -81,6 +86,8 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
+    if not one_contact(structure):
+        return _critical_friction_of_several(bare(structure), jnp.full(len(structure.contacts), float(direction)))
     return _critical_friction(bare(structure), jnp.asarray(float(direction)))
 
 
@@ -89,6 +96,12 @@ def _stability_limit(structure, direction):
     loop, scale = friction_loop(structure, direction)
     limit = first_limit(loop)
     return StabilityLimit(mu=limit.gain, frequency=limit.omega * scale / (2 * jnp.pi), code=limit.code)
+
+
+@compiled
+def _stability_limit_of_several(structure, direction):
+    mu, omega, code = first_limit_of_several(structure, direction)
+    return StabilityLimit(mu=mu, frequency=omega / (2 * jnp.pi), code=code)
 
 
 @returning_numpy
@@ -108,6 +121,8 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
+    if not one_contact(structure):
+        return _stability_limit_of_several(bare(structure), jnp.full(len(structure.contacts), float(direction)))
     return _stability_limit(bare(structure), jnp.asarray(float(direction)))
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from ..foundation.precision import in_double_precision
 from ..io.datasets import labelled
 from ..model.scene import Scene
-from ..model.sliding import sliding_coordinates
 from ..model.structure import Structure
 from .critical import stability_limit
 from .mode_coupling import coalescence
 from .mode_following import HALVINGS, LOOKS, Sampler, matched
+from .several_contacts import free_coordinates, one_contact
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -63,32 +63,31 @@ def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 def _limits(scene: Scene) -> dict:
     direction = 1 if scene.belt_speed > 0 else -1
     limit = stability_limit(scene.structure, direction=direction)
-    meeting = coalescence(scene.structure, direction=direction)
     said = {"outcome": limit.outcome.value, "mechanism": limit.mechanism.value}
-    return {
+    found = {
         "mu_crit": ((), limit.mu, {"long_name": "critical friction", "units": "1", **said}),
         "frequency_crit": ((), limit.frequency, {"long_name": "frequency at the critical friction", "units": "Hz"}),
-        "mu_coalescence": (
-            (),
-            meeting.mu,
-            {"long_name": "friction at the coalescence of the undamped modes", "units": "1"},
-        ),
     }
+    if one_contact(scene.structure):
+        meeting = coalescence(scene.structure, direction=direction).mu
+        long_name = "friction at the coalescence of the undamped modes"
+        found["mu_coalescence"] = ((), meeting, {"long_name": long_name, "units": "1"})
+    return found
 
 
 def _modes_dataset(scene: Scene, name: str, values: np.ndarray, followed: list) -> "xr.Dataset":
     import xarray as xr
 
     structure = scene.structure
-    n, m = structure.size, structure.size - 1
-    keep = sliding_coordinates(n, structure.normal)
+    n, keep = structure.size, free_coordinates(structure)
+    m = len(keep)
     eigenvalue, partner = np.full((2, len(values), m), np.nan, complex)
     shape = np.full((len(values), m, n), np.nan, complex)
     for k, sample in enumerate(followed):
         if sample is not None:
             eigenvalue[k], partner[k] = sample.eigenvalue, sample.partner
+            shape[k] = 0
             shape[k][:, keep] = sample.shape
-            shape[k][:, structure.normal] = 0
     size = np.abs(eigenvalue)
     ratio = -np.real(eigenvalue) / np.where(size > 0, size, 1.0)
     variables = {

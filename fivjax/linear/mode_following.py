@@ -7,8 +7,8 @@ import numpy as np
 
 from ..foundation.compiling import compiled
 from ..foundation.precision import real
-from ..model.scene import Scene, steady_sliding
-from .linearisation import linear_sliding
+from ..model.scene import Scene
+from .several_contacts import sliding_motion
 from .spectrum import POINTS_AT_ONCE
 
 # How often an interval of an axis is halved to tell two modes apart; beyond, they have met. Modes that are one and the
@@ -54,10 +54,9 @@ class Sampler:
 def _matrices(scene, name, values):
     def at(value):
         point = scene.replace(**{name: value})
-        matrix = linear_sliding(point).matrix
-        _, normal_force = steady_sliding(point, point.load.final)
+        matrix, normal_forces = sliding_motion(point)
         # An unloaded structure presses with nothing, and its equilibrium need not exist: its linear motion does.
-        exists = jnp.all(jnp.isfinite(matrix)) & ~(normal_force < 0)
+        exists = jnp.all(jnp.isfinite(matrix)) & ~jnp.any(normal_forces < 0)
         return matrix, exists
 
     return jax.lax.map(at, values, batch_size=POINTS_AT_ONCE)

@@ -129,8 +129,7 @@ def _named_parameters(structure: Structure):
         return Structure(
             **matrices,
             load_direction=structure.load_direction,
-            tangential=structure.tangential,
-            normal=structure.normal,
+            contacts=structure.contacts,
         )
 
     return values, build

@@ -15,7 +15,7 @@ from ..foundation.precision import is_known, real, returning_numpy
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.structure import Structure
 from .gradients import with_own_gradient
-from .linearisation import linear_sliding
+from .several_contacts import one_contact, sliding_motion
 from .system import as_scene, check_direction
 
 # Few enough that LAPACK calls on two parts of a batch do not wait for each other (see `foundation.linear_solve`).
@@ -27,7 +27,8 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
     """State matrix A of small motions about steady sliding, ż = A z: the Jacobian of `contact`, by autodiff.
 
     z holds the deviations of the displacements (m) without the normal coordinate, then their velocities (m/s);
-    m = 2(n - 1).
+    m = 2(n - 1). Of several contacts all normal coordinates are left out, and displacements are those of
+    `fj.in_contact_coordinates`.
 
     **Arguments:** `system`, a scene, or a structure with constant friction `mu`; `direction`, for a structure, +1 for a
     belt that moves along the tangential coordinate, -1 against it.
@@ -42,7 +43,7 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
     return _matrix(_checked(system, mu, direction))
 
 
-_matrix = compiled(lambda scene: linear_sliding(scene).matrix)
+_matrix = compiled(lambda scene: sliding_motion(scene)[0])
 
 
 def _checked(system, mu, direction) -> Scene:
@@ -50,13 +51,28 @@ def _checked(system, mu, direction) -> Scene:
         arguments.real_number("mu", mu, minimum=0)
     scene = as_scene(system, mu, direction)
     if isinstance(system, Scene):
-        sliding_equilibrium(scene)
+        _check_sliding(scene)
     return scene
+
+
+def _check_sliding(scene: Scene) -> None:
+    if one_contact(scene.structure):
+        sliding_equilibrium(scene)
+        return
+    forces = _forces(scene)
+    if is_known(forces) and not np.all(np.asarray(forces) >= 0):
+        raise ValueError(
+            f"There is no steady sliding: the normal forces would be {np.asarray(forces).round(3).tolist()} N. Change the "
+            f"load, its direction or the friction."
+        )
+
+
+_forces = compiled(lambda scene: sliding_motion(scene)[1])
 
 
 @returning_numpy
 def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Complex[Array, "... m"]:
-    """The 2(n - 1) eigenvalues of steady sliding, in 1/s, sorted by frequency.
+    """The 2(n - 1) eigenvalues of steady sliding, in 1/s, sorted by frequency; 2(n - c) where c contacts slide.
 
     Order: by |Im λ|, then by Re λ, then Im λ; so the two of a conjugate pair are neighbours, the one with negative
     imaginary part first.
@@ -90,7 +106,7 @@ def _check_frictions(mu) -> None:
 
 @compiled
 def _eigenvalues(scene):
-    found = jnp.linalg.eigvals(linear_sliding(scene).matrix)
+    found = jnp.linalg.eigvals(sliding_motion(scene)[0])
     return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
 
 
@@ -99,7 +115,7 @@ def _eigenvalues_over(structure, mu, direction):
     return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
 
 
-_growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(linear_sliding(scene).matrix).real)))
+_growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(sliding_motion(scene)[0]).real)))
 
 
 @returning_numpy

@@ -1,0 +1,160 @@
+r"""Steady sliding of several contacts at once: its state matrix, and the friction at which it becomes unstable.
+
+All contacts slide under one coefficient, or one each. With contacts at coordinates the normal rows and columns go and each
+tangential row loses σμ times its own normal row, as in Eq. 3; friction that falls with speed adds a damper at each contact.
+
+The feedback of one contact is of rank one, and all its limits are found at once (`crossings`). That of several is not: here
+the growth rate is looked at for many coefficients, and the first limit is closed in on. An unstable window narrower than the
+distance between two of them can be missed.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..model.contact_coordinates import in_contact_coordinates
+from ..model.scene import Scene, steady_sliding
+from ..model.structure import Structure
+from .gradients import significant_growth
+from .linearisation import linear_sliding, state_matrix
+from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
+
+# Coefficients that are looked at for a limit, without unit: beyond 2 no surfaces in use are.
+LARGEST, LOOKS = 2.0, 400
+# Halvings of the distance between two looks: to the last digit.
+HALVINGS = 50
+
+
+def one_contact(structure: Structure) -> bool:
+    """Whether it has one contact at two coordinates, of which more is known than of several."""
+    return len(structure.contacts) == 1 and structure.contacts_at_coordinates
+
+
+def free_coordinates(structure: Structure) -> np.ndarray:
+    """The coordinates that closed contacts leave free, of a structure with contacts at coordinates."""
+    return np.setdiff1d(np.arange(structure.size), _places(structure)[1])
+
+
+def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:
+    """The state matrix of a scene's steady sliding, and its normal forces in N; not finite where there is none."""
+    if one_contact(scene.structure):
+        _, normal_force = steady_sliding(scene, scene.load.final)
+        return linear_sliding(scene).matrix, normal_force[None]
+    count = len(scene.structure.contacts)
+    speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), (count,))
+    friction = jnp.broadcast_to(jnp.sign(scene.belt_speed) * scene.friction(speed), (count,))
+    forces = sliding_forces(scene.structure, friction, scene.load.final)
+    if scene.friction.constant:
+        slopes = jnp.zeros_like(friction)
+    else:
+        _, slopes = jax.jvp(lambda v: scene.friction(v), (speed,), (jnp.ones_like(speed),))
+        slopes = forces * slopes
+    return sliding_state(scene.structure, friction, slopes), forces
+
+
+def sliding_forces(structure: Structure, friction: Float[Array, " c"], force) -> Float[Array, " c"]:
+    """The normal forces of steady sliding under a load, in N."""
+    structure = in_contact_coordinates(structure)
+    _, normal = _places(structure)
+    free = free_coordinates(structure)
+    *_, stiffness, load = structure.matrices
+    rows = _with_friction(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)[free]
+    displacements = jnp.linalg.solve(rows[:, free], rows[:, -1] * force)
+    return stiffness[normal][:, free] @ displacements - load[normal] * force
+
+
+def _places(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
+    contacts = structure.contacts
+    return np.array([contact.tangential for contact in contacts]), np.array([contact.normal for contact in contacts])
+
+
+def _with_friction(structure: Structure, matrix, friction):
+    """Rows of the structure, each tangential one less σμ times its own normal row."""
+    tangential, normal = _places(structure)
+    return matrix.at[tangential].add(-friction[:, None] * matrix[normal])
+
+
+def sliding_state(
+    structure: Structure, friction: Float[Array, " c"], slopes: Float[Array, " c"]
+) -> Float[Array, "m m"]:
+    """A of ż = A z with z = (x, ẋ), x the coordinates that closed contacts leave free.
+
+    `friction` is σμ of each contact, `slopes` what friction that varies with speed adds to its damping, N dμ/dv in N·s/m.
+    """
+    structure = in_contact_coordinates(structure)
+    tangential, _ = _places(structure)
+    free = np.ix_(free_coordinates(structure), free_coordinates(structure))
+
+    def sliding(matrix):
+        return _with_friction(structure, matrix, friction)[free]
+
+    mass, damping, stiffness = structure.matrices[:3]
+    damping = damping.at[tangential, tangential].add(slopes)
+    return state_matrix(sliding(mass), sliding(damping), sliding(stiffness))
+
+
+def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
+    # In units of the structure's own frequencies, as `significant_growth` wants them.
+    matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
+    scale = _time_scale(structure)
+    half = matrix.shape[0] // 2
+    units = jnp.concatenate([jnp.ones(half), jnp.full(half, scale)])
+    return significant_growth(matrix * units / units[:, None] / scale)
+
+
+def _time_scale(structure: Structure) -> Float[Array, ""]:
+    squares = jnp.diagonal(structure.stiffness) / jnp.diagonal(structure.mass)
+    mean = jax.lax.stop_gradient(jnp.mean(squares))
+    return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+
+
+def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
+    """Friction, frequency (rad/s) and code of the first limit up to `LARGEST`; infinite friction where there is none."""
+    looks = jnp.linspace(0.0, LARGEST, LOOKS + 1)
+    unstable = jax.lax.map(lambda mu: _growth(structure, mu, direction) > 0, looks, batch_size=50)
+    place = jnp.argmax(unstable)
+    found, always = jnp.any(unstable), unstable[0] | unstable[1] & _nearly_at_zero(structure, direction)
+
+    def halved(_, ends):
+        low, high = ends
+        middle = 0.5 * (low + high)
+        above = _growth(structure, middle, direction) > 0
+        return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+    ends = (looks[jnp.maximum(place - 1, 0)], looks[place])
+    low, high = jax.lax.fori_loop(0, HALVINGS, halved, ends)
+    mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
+    values = jnp.linalg.eigvals(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
+    omega = jnp.abs(values[jnp.argmax(values.real)].imag)
+    undamped = jnp.all(structure.damping == 0)
+    flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
+    code = jnp.where(omega > 1e-6 * _time_scale(structure), flutter, DIVERGENCE)
+    code = jnp.where(always, ALWAYS, jnp.where(found, code, NEVER))
+    return mu, jnp.where(found & ~always, omega, jnp.nan), code
+
+
+def _nearly_at_zero(structure: Structure, direction):
+    return _growth(structure, jnp.asarray(1e-9), direction) > 0
+
+
+@jax.custom_jvp
+def critical_friction_of_several(structure: Structure, direction: Float[Array, " c"]) -> Float[Array, ""]:
+    """The friction at the first limit; its derivative is implicit, that of the growth rate by left and right eigenvectors."""
+    return first_limit_of_several(structure, direction)[0]
+
+
+@critical_friction_of_several.defjvp
+def _(primals, tangents):
+    structure, direction = primals
+    mu = critical_friction_of_several(structure, direction)
+    usable = jnp.isfinite(mu) & (mu > 0)
+    at = jnp.where(usable, mu, 0.1)
+
+    def growth(structure, mu):
+        matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
+        return jnp.max(jnp.linalg.eigvals(matrix).real)
+
+    _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))
+    _, along_mu = jax.jvp(lambda m: growth(structure, m), (at,), (jnp.ones_like(at),))
+    return mu, jnp.where(usable, -along_structure / along_mu, jnp.nan)

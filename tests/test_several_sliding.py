@@ -1,0 +1,81 @@
+"""Linear theory of several sliding contacts: eigenvalues, critical friction and its derivatives."""
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+import fivjax as fj
+
+
+def coupled(coupling: float = 0.0, stretch: float = 1.0) -> fj.Structure:
+    """Two paper oscillators, the second with stiffer springs, joined along the belt and vertically; N/m."""
+    one, other = fj.belt_oscillator(), fj.belt_oscillator(k1=stretch * 100e3)
+    matrices = [np.asarray(linalg.block_diag(a, b)) for a, b in zip(one.matrices[:3], other.matrices[:3], strict=True)]
+    for place in (0, 1):
+        joint = np.eye(6)[place] - np.eye(6)[3 + place]
+        matrices[2] = matrices[2] + coupling * np.outer(joint, joint)
+    # Held a little in all directions, so that a spring may also be made softer.
+    matrices[2] = matrices[2] + 0.05 * coupling * np.eye(6)
+    contacts = [fj.ContactPoint(one.tangential, one.normal), fj.ContactPoint(3 + one.tangential, 3 + one.normal)]
+    return fj.Structure(*matrices, np.tile(one.load_direction, 2), contacts=contacts)
+
+
+def test_two_copies_are_two_copies():
+    """Uncoupled oscillators lose stability where one does, at its frequency, and have its eigenvalues twice."""
+    one, pair = fj.belt_oscillator(), coupled()
+    limit, wanted = fj.cea.stability_limit(pair), fj.cea.stability_limit(one)
+    assert limit.mu == pytest.approx(wanted.mu, rel=1e-9)
+    assert limit.frequency == pytest.approx(wanted.frequency, rel=1e-6)
+    assert limit.mechanism is fj.cea.Mechanism.FLUTTER
+    both, single = (np.sort(fj.cea.eigenvalues(system, 0.15).imag) for system in (pair, one))
+    np.testing.assert_allclose(both, np.repeat(single, 2), rtol=1e-9)
+
+
+def test_critical_friction_is_where_growth_begins_and_moves_as_differences_say():
+    """Of coupled contacts: growth on one side only, and the sensitivities are those of differences."""
+    pair = coupled(2e4, 1.05)
+    mu = fj.cea.critical_friction(pair)
+    assert fj.cea.growth_rate(pair, 0.999 * mu) < 0 < fj.cea.growth_rate(pair, 1.001 * mu)
+    slopes = fj.cea.sensitivity(pair)
+    for name, i, j in (("stiffness", 1, 1), ("mass", 0, 1), ("stiffness", 1, 4)):
+        ends = []
+        for sign in (1, -1):
+            matrices = dict(zip(("mass", "damping", "stiffness"), map(np.array, pair.matrices[:3]), strict=True))
+            step = 1e-5 * matrices[name][i, i]
+            matrices[name][i, j] += sign * step
+            matrices[name][j, i] = matrices[name][i, j]
+            moved = fj.Structure(**matrices, load_direction=pair.load_direction, contacts=pair.contacts)
+            ends.append(float(fj.cea.critical_friction(moved)))
+        assert slopes[f"{name}[{i},{j}]"] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
+
+
+def test_falling_friction_and_vectors():
+    """A scene whose friction falls with speed, and contacts by vectors instead of coordinates: the same eigenvalues."""
+    one, pair = fj.belt_oscillator(), coupled()
+    law, load = fj.ExponentialDecay(0.3, 0.1, 0.5), fj.ConstantLoad(100.0)
+    assert fj.cea.growth_rate(fj.Scene(pair, law, 3.0, load)) == pytest.approx(
+        fj.cea.growth_rate(fj.Scene(one, law, 3.0, load)), rel=1e-9
+    )
+    # The same structure seen from turned coordinates.
+    pair = coupled(2e4, 1.05)
+    turn = linalg.block_diag(*[linalg.expm(0.4 * np.array([[0, 1, 0], [-1, 0, 1], [0, -1, 0]]))] * 2)
+    matrices = [0.5 * (m + m.T) for m in (turn.T @ np.asarray(m) @ turn for m in pair.matrices[:3])]
+    contacts = [
+        fj.ContactPoint(turn.T @ pair.tangential_directions[:, i], turn.T @ pair.normal_directions[:, i])
+        for i in (0, 1)
+    ]
+    turned = fj.Structure(*matrices, turn.T @ np.asarray(pair.load_direction), contacts=contacts)
+    np.testing.assert_allclose(
+        fj.cea.eigenvalues(fj.Scene(turned, fj.Coulomb(0.3), 3.0, load)), fj.cea.eigenvalues(pair, 0.3), rtol=1e-8
+    )
+
+
+def test_modes_along_friction_and_what_has_no_steady_sliding():
+    """Curves of modes have as many modes as coordinates are free; a load that lifts a contact off is refused."""
+    modes = fj.cea.modes(coupled(2e4, 1.05), mu=np.linspace(0.0, 0.3, 4))
+    assert modes.sizes["mode"] == 4
+    assert 0 < modes["mu_crit"] < 0.3
+    assert np.all(modes["shape"].sel(coordinate=[2, 5]) == 0)
+    lifted = fj.Scene(coupled(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad(-100.0))
+    with pytest.raises(ValueError, match="There is no steady sliding: the normal forces would be"):
+        fj.cea.growth_rate(lifted)
