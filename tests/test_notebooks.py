@@ -41,11 +41,19 @@ MUST_SHOW = {
     "04_speed_and_accuracy": ["good to  1e-09: event-exact", "image/png"],
     "05_calibration": ["converged", "standard deviations away"],
     "06_limit_cycles": ["1.11209 m/s", "unstable in 1 direction", "0.5859 m/s", "image/png"],
+    "08_your_own_structure": ["0.1779 at 76.5 Hz: flutter", "0 rigid-body modes", "found at 0.0807", "image/png"],
 }
 
 
 # Compiled for minutes, however small: figures of the paper, five methods with all their parts, a fit.
-SLOW = ("02_paper", "03_linear_theory", "04_speed_and_accuracy", "05_calibration", "06_limit_cycles")
+SLOW = (
+    "02_paper",
+    "03_linear_theory",
+    "04_speed_and_accuracy",
+    "05_calibration",
+    "06_limit_cycles",
+    "08_your_own_structure",
+)
 
 
 @pytest.mark.parametrize(

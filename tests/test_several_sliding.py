@@ -76,6 +76,8 @@ def test_modes_along_friction_and_what_has_no_steady_sliding():
     assert modes.sizes["mode"] == 4
     assert 0 < modes["mu_crit"] < 0.3
     assert np.all(modes["shape"].sel(coordinate=[2, 5]) == 0)
-    lifted = fj.Scene(coupled(), fj.Coulomb(0.2), 3.0, fj.ConstantLoad(-100.0))
+    pair = coupled(2e4, 1.05)
+    upwards = fj.Structure(*pair.matrices[:3], -np.asarray(pair.load_direction), contacts=pair.contacts)
+    lifted = fj.Scene(upwards, fj.Coulomb(0.2), 3.0, fj.ConstantLoad(100.0))
     with pytest.raises(ValueError, match="There is no steady sliding: the normal forces would be"):
         fj.cea.growth_rate(lifted)
