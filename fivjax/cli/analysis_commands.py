@@ -23,10 +23,21 @@ class Cea:
     out: Path = Path("cea")
     """files to write, without suffix"""
     overwrite: Overwrite = False
+    structure: Path | None = None
+    """file of a finite-element code to take the structure from, instead of the oscillator; `fj.read_structure` says which"""
+    units: str | None = None
+    """units of that file, such as mm-t-s"""
+    contact: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NODE:ALONG:AWAY[:AGAINST] …")] = ()
+    """its contacts, such as `17:x:-z`, or `17:x:-z:903` against another node"""
+    up_to: float = 3000.0
+    """frequency up to which its modes are kept (Hz)"""
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
 
     def run(self) -> None:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
+        if self.structure is not None:
+            self._of_file(self.structure, data, picture)
+            return
         scene = self.scene.scene()
         # Lines through one point are an empty picture.
         dataset = fj.cea.modes(scene, **dict([axis(self.x, least=2)]))
@@ -40,6 +51,32 @@ class Cea:
             print(fj.cea.sensitivity(scene.structure, direction=direction))
         else:
             print(f"  constant friction: {limit.outcome.value}")
+
+    def _of_file(self, path: Path, data: Path, picture: Path) -> None:
+        try:
+            big = fj.read_structure(path, units=self.units, contacts=[node_contact(text) for text in self.contact])
+            reduction = fj.craig_bampton(big, self.up_to)
+        except ValueError as error:
+            sentence = str(error).replace("Argument `units`", "Option `--units`")
+            raise ValueError(sentence.replace("Give `contacts` to `read_structure`", "Give `--contact`")) from None
+        print(big.checks, reduction, sep="\n")
+        direction = 1 if self.scene.belt_speed >= 0 else -1
+        dataset = fj.cea.modes(reduction.structure, direction=direction, **dict([axis(self.x, least=2)]))
+        fj.save(dataset, data)
+        fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
+        say(data, picture)
+        limit = fj.cea.stability_limit(reduction.structure, direction=direction)
+        found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
+        print(f"  critical friction: {limit.outcome.value}{found}")
+
+
+def node_contact(text: str) -> "fj.NodeContact":
+    """A contact from `17:x:-z` or `17:x:-z:903`."""
+    parts = text.split(":")
+    if len(parts) not in (3, 4) or not all(parts[place].isdecimal() for place in (0, 3)[: len(parts) - 2]):
+        raise ValueError(f"Option `--contact` must be NODE:ALONG:AWAY or NODE:ALONG:AWAY:AGAINST, but is {text!r}.")
+    along, away = (int(part) if part.isdecimal() else part for part in parts[1:3])
+    return fj.NodeContact(int(parts[0]), along, away, int(parts[3]) if len(parts) == 4 else None)
 
 
 @dataclasses.dataclass(frozen=True)

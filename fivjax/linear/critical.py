@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import returning_numpy
+from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
@@ -43,6 +44,11 @@ class StabilityLimit(eqx.Module):
 def bare(structure: Structure) -> Structure:
     """The structure without the memory of how it was made: one compiled program serves every builder."""
     return Structure(*structure.matrices, contacts=structure.contacts)
+
+
+def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
+    # In coordinates of the contacts, so that one compiled program serves all directions that they may have.
+    return bare(in_contact_coordinates(structure)), jnp.full(len(structure.contacts), float(direction))
 
 
 def _is_a_limit(value):
@@ -87,7 +93,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
     if not one_contact(structure):
-        return _critical_friction_of_several(bare(structure), jnp.full(len(structure.contacts), float(direction)))
+        return _critical_friction_of_several(*_several(structure, direction))
     return _critical_friction(bare(structure), jnp.asarray(float(direction)))
 
 
@@ -122,7 +128,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
     if not one_contact(structure):
-        return _stability_limit_of_several(bare(structure), jnp.full(len(structure.contacts), float(direction)))
+        return _stability_limit_of_several(*_several(structure, direction))
     return _stability_limit(bare(structure), jnp.asarray(float(direction)))
 
 
