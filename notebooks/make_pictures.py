@@ -1,4 +1,4 @@
-"""The pictures that the README shows, out of the notebooks: each is run at full size, and a few of its pictures are kept.
+"""The pictures that pages of the site show, out of the notebooks: each is run at full size, and a few of its pictures are kept.
 
     python notebooks/make_pictures.py                  # all of them, in some minutes
     python notebooks/make_pictures.py 01_quickstart    # only these
@@ -22,7 +22,6 @@ FOLDER = Path(__file__).parent
 KEPT = {
     "01_quickstart": {1: "trajectory"},
     "02_paper": {5: "kicks", 8: "energy"},
-    "03_linear_theory": {1: "sensitivity"},
     "05_calibration": {0: "calibration"},
 }
 WIDTH = 760
@@ -44,7 +43,7 @@ def pictures(name: str) -> list[bytes]:
 
 
 def main(names: list[str]) -> None:
-    """Run the notebooks and write what is kept of them, small, so that the README stays light."""
+    """Run the notebooks and write what is kept of them, small, so that pages stay light."""
     for name in names or KEPT:
         shown = pictures(name)
         for place, kept in KEPT[name].items():

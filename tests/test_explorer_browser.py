@@ -2,7 +2,8 @@
 
     python tests/test_explorer_browser.py picture.png
 
-does the same outside pytest, prints how long pictures take to change, and takes a screenshot.
+does the same outside pytest, prints how long pictures take to change, and takes a screenshot: `picture.png`, and
+`picture_narrow.png` of a window 900 pixels wide.
 """
 
 import contextlib
@@ -97,7 +98,7 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     nbformat.write(notebook, folder / "explorer.ipynb")
     with jupyterlab(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"])
         page = browser.new_page(viewport={"width": 1500, "height": 1250})
         page.goto(address)
         page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=60_000)
@@ -133,6 +134,8 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
         page.wait_for_timeout(500)
         boxes = [page.locator(".slider-container").nth(k).bounding_box() for k in range(3)]
         tracks = [box["width"] for box in boxes if box]
+        if screenshot is not None:
+            page.locator(".jp-OutputArea-output").first.screenshot(path=screenshot.with_stem(f"{screenshot.stem}_narrow"))
         page.set_viewport_size({"width": 1500, "height": 1250})
         page.wait_for_timeout(500)
         springs = [page.locator(".widget-readout").nth(k).inner_text() for k in (7, 8)]
