@@ -62,7 +62,7 @@ def reference(pencil: fj.cea.Pencil, elastic, frequencies, modes: int = 40) -> t
     found, residuals = [], []
     for frequency in frequencies:
         # Two modes may be near one another: each is followed to its end, and the one that grows is taken.
-        near = np.flatnonzero(np.abs(guesses.imag / (2 * np.pi) - frequency) < 0.02 * frequency)
+        near = np.flatnonzero(np.abs(guesses.imag / (2 * np.pi) - frequency) < 0.05 * frequency)
         ends = [newton(pencil, guesses[place], basis @ vectors[:n, place]) for place in near]
         value, residual = max(ends, key=lambda end: end[0].real)
         found.append(value)

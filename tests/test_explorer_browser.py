@@ -98,7 +98,9 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     nbformat.write(notebook, folder / "explorer.ipynb")
     with jupyterlab(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"])
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+        )
         page = browser.new_page(viewport={"width": 1500, "height": 1250})
         page.goto(address)
         page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=60_000)
@@ -135,7 +137,9 @@ def explore(folder: Path, screenshot: Path | None = None) -> dict:
         boxes = [page.locator(".slider-container").nth(k).bounding_box() for k in range(3)]
         tracks = [box["width"] for box in boxes if box]
         if screenshot is not None:
-            page.locator(".jp-OutputArea-output").first.screenshot(path=screenshot.with_stem(f"{screenshot.stem}_narrow"))
+            page.locator(".jp-OutputArea-output").first.screenshot(
+                path=screenshot.with_stem(f"{screenshot.stem}_narrow")
+            )
         page.set_viewport_size({"width": 1500, "height": 1250})
         page.wait_for_timeout(500)
         springs = [page.locator(".widget-readout").nth(k).inner_text() for k in (7, 8)]

@@ -90,10 +90,15 @@ GROUPS = {
         "Results as matplotlib figures, and in notebooks.",
         ["plot", "show", "explorer", "plot_energy", "plot_linear", "plot_calibration", "save_figure"],
     ),
+    "finite_elements": (
+        "Finite-element models",
+        "Structures from files, and made small.",
+        ["read_structure", "read_matrices", "NodeContact", "SparseStructure", "craig_bampton", "Reduction"],
+    ),
     "files": (
         "Files, citation and the paper",
-        "Results and structures on disk; what to cite; the paper's figures.",
-        ["save", "open", "read_structure", "citation", "reproduce"],
+        "Results on disk; what to cite; the paper's figures.",
+        ["save", "open", "citation", "reproduce"],
     ),
 }
 
