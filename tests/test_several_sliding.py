@@ -47,6 +47,12 @@ def test_critical_friction_is_where_growth_begins_and_moves_as_differences_say()
             moved = fj.Structure(**matrices, load_direction=pair.load_direction, contacts=pair.contacts)
             ends.append(float(fj.cea.critical_friction(moved)))
         assert slopes[f"{name}[{i},{j}]"] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
+    mass, _, stiffness, load = map(np.asarray, pair.matrices)
+    undamped = fj.Structure(mass, np.zeros((6, 6)), stiffness, load, contacts=pair.contacts)
+    assert fj.cea.stability_limit(undamped).mechanism is fj.cea.Mechanism.COALESCENCE
+    slopes = fj.cea.sensitivity(undamped)
+    assert np.isnan(slopes["mass[0,0]"])
+    assert np.isnan(slopes["stiffness[1,4]"])
 
 
 def test_falling_friction_and_vectors():

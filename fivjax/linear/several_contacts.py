@@ -148,7 +148,8 @@ def critical_friction_of_several(structure: Structure, direction: Float[Array, "
 def _(primals, tangents):
     structure, direction = primals
     mu = critical_friction_of_several(structure, direction)
-    usable = jnp.isfinite(mu) & (mu > 0)
+    # Undamped modes meet at the limit, and the growth rate leaves it like a square root.
+    usable = jnp.isfinite(mu) & (mu > 0) & jnp.any(structure.damping != 0)
     at = jnp.where(usable, mu, 0.1)
 
     def growth(structure, mu):
@@ -157,4 +158,5 @@ def _(primals, tangents):
 
     _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))
     _, along_mu = jax.jvp(lambda m: growth(structure, m), (at,), (jnp.ones_like(at),))
-    return mu, jnp.where(usable, -along_structure / along_mu, jnp.nan)
+    # As a factor, so that a gradient is not a number either: of a branch not taken it would be zero.
+    return mu, jnp.where(usable, 1.0, jnp.nan) * -along_structure / along_mu
