@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.simulation.trajectory import start_state, states_at
+from fivjax.simulation.start import start_state
+from fivjax.simulation.trajectory import states_at
 from fivjax.steppers.base import MOST_ADVANCES
 
 T1 = 0.3

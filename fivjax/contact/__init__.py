@@ -19,11 +19,12 @@ impact law where the gap closed, and chooses the next status from the forces, ne
 
 Where a high load stores much more energy than a small vibration moves, states as totals cannot hold the vibration: its
 digits are lost in the rounding of what is at rest. `Mechanics.about` makes mechanics for displacements and loads that are
-deviations from a `Rest` instead. The free acceleration is then that under the contact forces at rest, and
-`sticking_forces`, `sliding_forces` and `forces_by_status` are what is *added* to those; `guards` and `contact_forces` are of
-the total forces either way.
+deviations from a `Rest` instead. The free acceleration is then that under the contact forces at rest, and `ModeForces`
+are what is *added* to those; `guards` and `contact_forces` are of the total forces either way.
 
-Everything here is about one contact at one instant; batches come from `jax.vmap`.
+Everything here is about one instant; batches come from `jax.vmap`. Of one contact a status, a force or a guard's value is a
+number. Of several, each has a last axis over the contacts: the demands of all of them are one linear system
+(`mode_forces`), and what follows from an event is found for all of them at once (`contact_problem`).
 """
 
 from .forces import State as State
@@ -31,13 +32,10 @@ from .forces import acceleration as acceleration
 from .forces import acceleration_under as acceleration_under
 from .forces import added_forces as added_forces
 from .forces import contact_forces as contact_forces
-from .forces import forces_by_status as forces_by_status
 from .forces import free_acceleration as free_acceleration
 from .forces import gap as gap
 from .forces import relative_velocity as relative_velocity
-from .forces import sliding_forces as sliding_forces
 from .forces import slip_speed as slip_speed
-from .forces import sticking_forces as sticking_forces
 from .forces import total_forces as total_forces
 from .guard import cone_margins as cone_margins
 from .guard import guards as guards
@@ -47,8 +45,11 @@ from .mechanics import Mechanics as Mechanics
 from .mechanics import Rest as Rest
 from .mode import Contact as Contact
 from .mode import Status as Status
+from .mode_forces import ModeForces as ModeForces
+from .mode_forces import sticking_forces as sticking_forces
 from .rounding import exactly_zero as exactly_zero
 from .rounding import magnitudes as magnitudes
+from .several_contacts import coupled_with as coupled_with
 from .transitions import on_constraint as on_constraint
 from .transitions import status_from_forces as status_from_forces
 from .transitions import transition as transition

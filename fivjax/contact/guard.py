@@ -3,12 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .forces import State, added_forces, by_status, gap, slip_speed, total_forces
+from .forces import Each, State, added_forces, gap, slip_speed, total_forces
 from .mechanics import Mechanics
 from .mode import Contact
+from .mode_forces import by_status
 
 
-def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "2"]:
+def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "*contacts 2"]:
     """What must stay positive for the status to last; N, or m/s and m where that is what counts.
 
     stick: distances of T from both edges of the friction cone; slide: N and the slip speed; detach: the gap, twice.
@@ -18,33 +19,27 @@ def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: St
 
 
 def guards_under(
-    mechanics: Mechanics,
-    contact: Contact,
-    tangential_force: Float[Array, ""],
-    normal_force: Float[Array, ""],
-    slip: Float[Array, ""],
-    height: Float[Array, ""],
-) -> Float[Array, "2"]:
+    mechanics: Mechanics, contact: Contact, tangential_force: Each, normal_force: Each, slip: Each, height: Each
+) -> Float[Array, "*contacts 2"]:
     """`guards` from the contact forces added to those at rest, the slip speed and the gap; linear in all of them."""
     _, pressing = total_forces(mechanics, tangential_force, normal_force)
     return by_status(
         contact,
         stick=cone_margins(mechanics, tangential_force, normal_force),
-        slide=jnp.stack([pressing, slip]),
-        detach=jnp.stack([height, height]),
+        slide=jnp.stack([pressing, slip], axis=-1),
+        detach=jnp.stack([height, height], axis=-1),
     )
 
 
-def cone_margins(
-    mechanics: Mechanics, tangential_force: Float[Array, ""], normal_force: Float[Array, ""]
-) -> Float[Array, "2"]:
+def cone_margins(mechanics: Mechanics, tangential_force: Each, normal_force: Each) -> Float[Array, "*contacts 2"]:
     """Distances of T from both edges of the friction cone, in N, from the contact forces added to those at rest."""
     static = mechanics.friction.static
     edge = static * normal_force
-    margins = jnp.stack([edge - tangential_force, edge + tangential_force])
+    margins = jnp.stack([edge - tangential_force, edge + tangential_force], axis=-1)
     if mechanics.rest is None:
         return margins
     # Apart from what is added, and not as a difference of forces that are rounded: at rest one of them is exactly zero
     # unless static friction is larger.
     friction = mechanics.rest.friction
-    return margins + jnp.stack([static - friction, static + friction]) * mechanics.rest.normal_force
+    widths = jnp.stack([static - friction, static + friction], axis=-1)
+    return margins + widths * mechanics.rest.normal_force[..., None]

@@ -2,8 +2,9 @@
 
 import jax.numpy as jnp
 
-from .forces import State, degrees_of_freedom, gap, relative_velocity, with_contact_coordinates
+from .forces import State, degrees_of_freedom, gap, gap_rate, relative_velocity, with_contact_coordinates
 from .mechanics import Mechanics
+from .several_contacts import impulses_of_impact
 
 
 def impact(mechanics: Mechanics, y: State) -> State:
@@ -14,18 +15,45 @@ def impact(mechanics: Mechanics, y: State) -> State:
     - "frictionless": no tangential impulse; the normal one moves whatever the mass matrix couples to it.
     - "reset": the normal velocity alone is changed, as a code does that resets one number. Not consistent with momentum.
 
+    Of several contacts, all whose gap is closed take part: an impulse on one may lift, stop or turn another.
+
     Newton's restitution above zero together with friction can create energy where the normal impulse turns the slip round
     (Kane's paradox); that takes a strong coupling of the two coordinates in the mass matrix. Restitution 0 never does.
 
     The paper does not state its law; its Table 2 comes out the same with all three.
     """
     n = degrees_of_freedom(y)
-    g_tt, g_tn, g_nn = mechanics.compliance
-    approach = y[n + mechanics.normal]
-    slip = relative_velocity(mechanics, y)
-    jump = -(1.0 + mechanics.restitution) * approach
+    approach = gap_rate(mechanics, y)
     if mechanics.impact_law == "reset":
+        jump = -(1.0 + mechanics.restitution) * approach
+        if mechanics.several:
+            jump = jnp.where((gap(mechanics, y) <= 0) & (approach < 0), jump, 0.0)
         return y.at[n + mechanics.normal].add(jump)
+    if mechanics.several:
+        y, struck, ends_slip = impulses_of_impact(mechanics, y)
+        # On the belt without an impulse: a rate that rounding leaves below zero does not close the gap.
+        own = gap_rate(mechanics, y)
+        own = jnp.where(gap(mechanics, y) <= 0, jnp.maximum(own, 0.0), own)
+        rate = jnp.where(struck, -mechanics.restitution * approach, own)
+    else:
+        y, ends_slip = _one(mechanics, y)
+        rate = -mechanics.restitution * approach
+    # What the law demands exactly, free of rounding: a mass that comes to rest on the belt rests.
+    tangential_velocity = y[n + mechanics.tangential]
+    if mechanics.impact_law == "coulomb":
+        tangential_velocity = jnp.where(ends_slip, mechanics.belt_speed, tangential_velocity)
+    return with_contact_coordinates(
+        mechanics, y, gap=gap(mechanics, y), gap_rate=rate, tangential_velocity=tangential_velocity
+    )
+
+
+def _one(mechanics: Mechanics, y: State):
+    """The state after the impulse on one contact, and whether it ends slip."""
+    n = degrees_of_freedom(y)
+    g_tt, g_tn, g_nn = mechanics.compliance
+    slip = relative_velocity(mechanics, y)
+    jump = -(1.0 + mechanics.restitution) * gap_rate(mechanics, y)
+    ends_slip = False
     if mechanics.impact_law == "frictionless":
         tangential_impulse, normal_impulse = jnp.zeros_like(jump), jump / g_nn
     else:
@@ -39,15 +67,4 @@ def impact(mechanics: Mechanics, y: State) -> State:
         tangential_impulse = jnp.where(ends_slip, ending, direction * mu * dragging_normal)
         normal_impulse = jnp.where(ends_slip, ending_normal, dragging_normal)
     kick = mechanics.from_tangential * tangential_impulse + mechanics.from_normal * normal_impulse
-    y = y.at[n:].add(kick)
-    # What the law demands exactly, free of rounding: a mass that comes to rest on the belt rests.
-    tangential_velocity = y[n + mechanics.tangential]
-    if mechanics.impact_law == "coulomb":
-        tangential_velocity = jnp.where(ends_slip, mechanics.belt_speed, tangential_velocity)
-    return with_contact_coordinates(
-        mechanics,
-        y,
-        gap=gap(mechanics, y),
-        gap_rate=-mechanics.restitution * approach,
-        tangential_velocity=tangential_velocity,
-    )
+    return y.at[n:].add(kick), ends_slip

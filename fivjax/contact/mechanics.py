@@ -2,10 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..model.friction import AbstractFriction
-from ..model.scene import Scene
+from ..model.friction_per_contact import FrictionPerContact
+from ..model.scene import Scene, steady_slip_speeds
 from ..model.springs import Springs
 from ..model.structure import Structure
 
@@ -14,32 +16,35 @@ class Rest(eqx.Module):
     """A state of steady sliding, as the forces that hold it; displacements and loads may be measured from there."""
 
     load: Float[Array, ""]  # N
-    tangential_force: Float[Array, ""]  # N
-    normal_force: Float[Array, ""]  # N
-    friction: Float[Array, ""]  # σμ, the ratio of the two
+    tangential_force: Float[Array, "*contacts"]  # N
+    normal_force: Float[Array, "*contacts"]  # N
+    friction: Float[Array, "*contacts"]  # σμ, the ratio of the two
 
-    def __init__(self, scene: Scene, load: Float[Array, ""], normal_force: Float[Array, ""]):
+    def __init__(self, scene: Scene, load: Float[Array, ""], normal_force: Float[Array, "*contacts"]):
         """Of a scene that presses with `normal_force` under `load`, see `scene.steady_sliding`."""
         self.load = load
-        self.friction = jnp.sign(scene.belt_speed) * scene.friction(jnp.abs(scene.belt_speed))
+        self.friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
         self.tangential_force = self.friction * normal_force
         self.normal_force = normal_force
 
 
 class Mechanics(eqx.Module):
-    """A scene in the form that accelerations need: everything divided by the mass matrix, once."""
+    """A scene in the form that accelerations need: everything divided by the mass matrix, once.
+
+    Of one contact everything about it is a number. Of several it is an array with a last axis over the contacts, and the
+    compliances are matrices; `tangential` and `normal` index whatever has coordinates either way.
+    """
 
     free_position: Float[Array, "n n"]  # -M⁻¹K, 1/s²
     free_velocity: Float[Array, "n n"]  # -M⁻¹C, 1/s
     free_load: Float[Array, " n"]  # M⁻¹f, 1/kg
-    from_tangential: Float[Array, " n"]  # M⁻¹e_t, 1/kg
-    from_normal: Float[Array, " n"]  # M⁻¹e_n, 1/kg
+    from_tangential: Float[Array, "n *contacts"]  # M⁻¹W_t, 1/kg
+    from_normal: Float[Array, "n *contacts"]  # M⁻¹W_n, 1/kg
     friction: AbstractFriction
-    belt_speed: Float[Array, ""]
-    restitution: Float[Array, ""]
+    belt_speed: Float[Array, "*contacts"]
+    restitution: Float[Array, "*contacts"]
     impact_law: str = eqx.field(static=True)
-    tangential: int = eqx.field(static=True)
-    normal: int = eqx.field(static=True)
+    places: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of the contacts: tangential and normal coordinates
     # See `about`; none: states are totals.
     rest: Rest | None = None
     springs: Springs | None = None
@@ -48,24 +53,46 @@ class Mechanics(eqx.Module):
     def __init__(self, scene: Scene):
         structure, matrices = scene.structure, scene.structure.matrices
         n = structure.size
-        forces = jnp.zeros((n, 2), matrices.mass.dtype)
-        forces = forces.at[structure.tangential, 0].set(1.0).at[structure.normal, 1].set(1.0)
+        self.places = _places(structure)
+        columns = np.eye(n)[:, np.array(self.places).T.ravel()]  # tangential directions, then normal ones
         right = jnp.concatenate(
-            [-matrices.stiffness, -matrices.damping, matrices.load_direction[:, None], forces], axis=1
+            [-matrices.stiffness, -matrices.damping, matrices.load_direction[:, None], columns], axis=1
         )
         solved = jnp.linalg.solve(matrices.mass, right)
+        count = len(self.places)
         self.free_position = solved[:, :n]
         self.free_velocity = solved[:, n : 2 * n]
         self.free_load = solved[:, 2 * n]
-        self.from_tangential = solved[:, 2 * n + 1]
-        self.from_normal = solved[:, 2 * n + 2]
-        self.friction = scene.friction
-        self.belt_speed = scene.belt_speed
-        self.restitution = scene.restitution
+        forces = solved[:, 2 * n + 1 :]
+        if count == 1:
+            self.from_tangential, self.from_normal = forces[:, 0], forces[:, 1]
+            self.friction, self.belt_speed, self.restitution = scene.friction, scene.belt_speed, scene.restitution
+        else:
+            self.from_tangential, self.from_normal = forces[:, :count], forces[:, count:]
+            law = scene.friction
+            self.friction = law if isinstance(law, FrictionPerContact) else FrictionPerContact([law] * count)
+            self.belt_speed = jnp.broadcast_to(scene.belt_speed, count)
+            self.restitution = jnp.broadcast_to(scene.restitution, count)
         self.impact_law = scene.impact_law
-        self.tangential = structure.tangential
-        self.normal = structure.normal
         self.rest = self.springs = self.from_springs = None
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several contacts."""
+        return len(self.places) > 1
+
+    @property
+    def tangential(self) -> int | np.ndarray:
+        """The coordinate along the belt; of several contacts, those of all of them."""
+        return self._coordinates(0)
+
+    @property
+    def normal(self) -> int | np.ndarray:
+        """The coordinate of the gap; of several contacts, those of all of them."""
+        return self._coordinates(1)
+
+    def _coordinates(self, kind: int) -> int | np.ndarray:
+        return np.array([place[kind] for place in self.places]) if self.several else self.places[0][kind]
 
     def about(self, rest: Rest, structure: Structure) -> "Mechanics":
         """The same mechanics for displacements and loads measured from a rest; velocities stay what they are.
@@ -95,18 +122,30 @@ class Mechanics(eqx.Module):
         )
 
     @property
-    def compliance(self) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """G_tt, G_tn and G_nn, in 1/kg."""
+    def compliance(self) -> tuple[Float[Array, "*c"], Float[Array, "*c"], Float[Array, "*c"]]:
+        """G_tt, G_tn and G_nn, in 1/kg: the blocks of the Delassus matrix."""
         return (
             self.from_tangential[self.tangential],
-            self.from_tangential[self.normal],
+            self.from_normal[self.tangential] if self.several else self.from_tangential[self.normal],
             self.from_normal[self.normal],
         )
 
     def normal_compliance(self, direction: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, ""]:
-        """G_nn + σμ G_nt: how the gap accelerates under a normal force that drags friction along, in 1/kg.
+        """G_nn + σμ G_nt of one contact: how the gap accelerates under a normal force that drags friction along, in 1/kg.
 
         Where it is not positive the contact problem has no unique solution (Painlevé's paradox).
         """
         _, g_tn, g_nn = self.compliance
         return g_nn + direction * mu * g_tn
+
+
+def _places(structure: Structure) -> tuple[tuple[int, int], ...]:
+    found = []
+    for tangential, normal in structure.places:
+        if not isinstance(tangential, int) or not isinstance(normal, int):
+            raise ValueError(
+                "This needs contacts whose directions are coordinates, but some of them are vectors. Give the structure as "
+                "`fivjax.in_contact_coordinates(structure)`."
+            )
+        found.append((tangential, normal))
+    return tuple(found)

@@ -1,4 +1,4 @@
-"""The contact mode: what the contact does, and which way friction points while it slides."""
+"""The contact mode: what each contact does, and which way friction points while it slides."""
 
 import enum
 
@@ -21,7 +21,10 @@ class Status(enum.IntEnum):
 
 
 class Contact(eqx.Module):
-    """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides."""
+    """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides.
+
+    Of several contacts both have a last axis over them.
+    """
 
     status: Int[Array, "*batch"]
     direction: Float[Array, "*batch"]

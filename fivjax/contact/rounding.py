@@ -5,10 +5,12 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .forces import State, by_status, degrees_of_freedom
+from .coordinates import at_places, spread, with_values
+from .forces import LARGEST_BY_COLUMNS, Each, State, degrees_of_freedom
 from .guard import cone_margins
 from .mechanics import Mechanics
 from .mode import Contact, Status
+from .mode_forces import ModeForces, by_status
 
 # A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
 # If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
@@ -51,17 +53,69 @@ def exactly_zero(contact: Contact) -> Bool[Array, "2 *batch"]:
 
 
 def magnitudes(
-    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
-) -> tuple[Float[Array, "2"], State]:
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, mode: ModeForces | None = None
+) -> tuple[Float[Array, "*contacts 2"], State]:
     """Sizes of the largest terms that the guards and the rates are sums of: their rounding is that share of these.
 
     `y` holds sizes, too. Where a stiff structure presses hard, forces are small differences of huge terms; whether one
-    is zero is a question that only these sizes answer.
+    is zero is a question that only these sizes answer. `mode` is that of the contact, where it is known already.
     """
     n = degrees_of_freedom(y)
     free = jnp.abs(mechanics.free_load) * jnp.abs(load)
-    for j in range(n):
-        free = free + jnp.abs(mechanics.free_position[:, j]) * y[j] + jnp.abs(mechanics.free_velocity[:, j]) * y[n + j]
+    if n > LARGEST_BY_COLUMNS:
+        free = free + jnp.abs(mechanics.free_position) @ y[:n] + jnp.abs(mechanics.free_velocity) @ y[n:]
+    else:
+        for j in range(n):
+            free = (
+                free + jnp.abs(mechanics.free_position[:, j]) * y[j] + jnp.abs(mechanics.free_velocity[:, j]) * y[n + j]
+            )
+    static = mechanics.friction.static
+    of = _several_sizes if mechanics.several else _one_size
+    tangential_force, normal_force, resting_n, onset = of(mechanics, contact, free, mode)
+    none = jnp.zeros_like(normal_force)
+    pressing, margins = normal_force, jnp.zeros((*none.shape, 2), none.dtype)
+    if mechanics.rest is not None:
+        at_rest = mechanics.rest
+        # What is added to the forces at rest is all that is rounded in the rates, but for forces that are not those.
+        tangential_force = tangential_force + by_status(
+            contact,
+            stick=none,
+            slide=_otherwise(mechanics, contact) * jnp.abs(at_rest.normal_force),
+            detach=jnp.abs(at_rest.tangential_force),
+        )
+        normal_force = normal_force + resting_n
+        pressing = normal_force + jnp.abs(at_rest.normal_force)
+        margins = jnp.abs(cone_margins(mechanics, none, none))
+    slip = y[n + mechanics.tangential] + jnp.abs(mechanics.belt_speed)
+    edge = static * normal_force + tangential_force
+    guards = by_status(
+        contact,
+        stick=edge[..., None] + margins,
+        slide=jnp.stack([pressing, slip], axis=-1),
+        detach=jnp.stack([y[mechanics.normal]] * 2, axis=-1),
+    )
+    acceleration = (
+        free
+        + spread(jnp.abs(mechanics.from_tangential), tangential_force)
+        + spread(jnp.abs(mechanics.from_normal), normal_force)
+    )
+    acceleration = acceleration + with_values(jnp.zeros_like(free), [(mechanics.tangential, onset)])
+    return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
+
+
+def _otherwise(mechanics: Mechanics, contact: Contact) -> Each:
+    """How far σμ may be from that at rest."""
+    assert mechanics.rest is not None
+    static = mechanics.friction.static
+    dragging = contact.direction * mechanics.friction(jnp.zeros_like(static))
+    return jnp.abs(dragging - mechanics.rest.friction) if mechanics.friction.constant else 2 * static
+
+
+def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], mode) -> tuple[Each, Each, Each, Each]:
+    """Sizes of T and N of one contact; of N by what a mode lacks of the forces at rest; of the acceleration at which slip sets
+    out.
+    """
+    del mode
     g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
     _, tn, _ = mechanics.compliance
     free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
@@ -73,43 +127,47 @@ def magnitudes(
     stick_t, stick_n = (g_tn * free_n + g_nn * free_t) / determinant, (g_tn * free_t + g_tt * free_n) / determinant
     tangential_force = by_status(contact, stick=stick_t, slide=static * sliding_n, detach=none)
     normal_force = by_status(contact, stick=stick_n, slide=sliding_n, detach=none)
-    pressing, margins, onset = normal_force, jnp.zeros(2, normal_force.dtype), none
-    if mechanics.rest is not None:
-        at_rest, rest_t, rest_n = mechanics.rest, mechanics.rest.tangential_force, mechanics.rest.normal_force
-        # What is added to the forces at rest is all that is rounded in the rates, but for forces that are not those.
-        dragging = contact.direction * mechanics.friction(jnp.zeros_like(static))
-        otherwise = jnp.abs(dragging - at_rest.friction) if mechanics.friction.constant else 2 * static
-        tangential_force = tangential_force + by_status(
-            contact, stick=none, slide=otherwise * jnp.abs(rest_n), detach=jnp.abs(rest_t)
-        )
-        normal_force = normal_force + by_status(
-            contact, stick=none, slide=g_tn * otherwise * jnp.abs(rest_n) / compliance, detach=jnp.abs(rest_n)
-        )
-        pressing = normal_force + jnp.abs(rest_n)
-        margins = jnp.abs(cone_margins(mechanics, none, none))
-        # Slip sets out with the acceleration that rounding leaves of the margin at which sticking ended; were that taken for
-        # more than nothing, the two would hand over to each other for ever.
-        edge = static * stick_n + stick_t
-        onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
-    slip = y[n + mechanics.tangential] + jnp.abs(mechanics.belt_speed)
-    edge = static * normal_force + tangential_force
-    guards = by_status(
-        contact,
-        stick=edge + margins,
-        slide=jnp.stack([pressing, slip]),
-        detach=jnp.stack([y[mechanics.normal]] * 2),
+    if mechanics.rest is None:
+        return tangential_force, normal_force, none, none
+    rest_n = jnp.abs(mechanics.rest.normal_force)
+    resting_n = by_status(
+        contact, stick=none, slide=g_tn * _otherwise(mechanics, contact) * rest_n / compliance, detach=rest_n
     )
-    acceleration = (
-        free + jnp.abs(mechanics.from_tangential) * tangential_force + jnp.abs(mechanics.from_normal) * normal_force
-    )
-    acceleration = acceleration + jnp.where(jnp.arange(n) == mechanics.tangential, onset, 0.0)
-    return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
+    # Slip sets out with the acceleration that rounding leaves of the margin at which sticking ended; were that taken for
+    # more than nothing, the two would hand over to each other for ever.
+    edge = static * stick_n + stick_t
+    onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
+    return tangential_force, normal_force, resting_n, onset
+
+
+def _several_sizes(
+    mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], mode: ModeForces | None
+) -> tuple[Each, Each, Each, Each]:
+    """The same of several contacts."""
+    static = mechanics.friction.static
+    mode = ModeForces(mechanics, contact, static) if mode is None else mode
+    assert mode.answer is not None
+    answer, count = jnp.abs(mode.answer), len(mechanics.places)
+    free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
+    sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
+    right = jnp.concatenate([jnp.where(sticking, free_t, 0.0), jnp.where(closed, free_n, 0.0)])
+    forces = answer @ right
+    none = jnp.zeros_like(free_t)
+    if mechanics.rest is None:
+        return forces[:count], forces[count:], none, none
+    rest_t, rest_n = jnp.abs(mechanics.rest.tangential_force), jnp.abs(mechanics.rest.normal_force)
+    missing_t = by_status(contact, stick=none, slide=_otherwise(mechanics, contact) * rest_n, detach=rest_t)
+    missing = answer @ jnp.concatenate([missing_t, jnp.where(closed, 0.0, rest_n)])
+    g_tt, _, g_nn = mechanics.compliance
+    alone = free_n / jnp.diagonal(g_nn)
+    onset = jnp.abs(jnp.diagonal(g_tt)) * (static * alone + free_t / jnp.diagonal(g_tt))
+    onset = jnp.where(contact.status == Status.SLIDE, onset, 0.0)
+    return forces[:count], forces[count:], missing[count:], onset
 
 
 def on_constraint_rates(mechanics: Mechanics, contact: Contact, rates: State) -> State:
     """Rates with what the status forbids set to exactly zero: those of the gap, and creep while sticking."""
     n = degrees_of_freedom(rates)
     touching, sticking = contact.status != Status.DETACH, contact.status == Status.STICK
-    index = jnp.arange(2 * n)
-    held = touching & ((index == mechanics.normal) | (index == n + mechanics.normal))
-    return jnp.where(held | (sticking & (index == n + mechanics.tangential)), 0.0, rates)
+    held = at_places(2 * n, mechanics.normal, touching) | at_places(2 * n, n + mechanics.normal, touching)
+    return jnp.where(held | at_places(2 * n, n + mechanics.tangential, sticking), 0.0, rates)

@@ -1,16 +1,18 @@
 """What follows when a contact mode ends: the next mode, chosen from the forces, and the state on its constraint."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .contact_problem import NONE
 from .forces import (
     State,
+    acceleration,
     degrees_of_freedom,
     free_acceleration,
     gap,
+    gap_rate,
     relative_velocity,
-    sliding_forces,
-    sticking_forces,
     total_forces,
     with_contact_coordinates,
 )
@@ -18,6 +20,8 @@ from .guard import cone_margins
 from .impacts import impact
 from .mechanics import Mechanics
 from .mode import Contact, Status
+from .mode_forces import ModeForces, sticking_forces
+from .several_contacts import modes_from_forces, state_of
 
 
 def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
@@ -28,7 +32,7 @@ def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
         mechanics,
         y,
         gap=jnp.where(touching, 0.0, gap(mechanics, y)),
-        gap_rate=jnp.where(touching, 0.0, y[degrees_of_freedom(y) + mechanics.normal]),
+        gap_rate=jnp.where(touching, 0.0, gap_rate(mechanics, y)),
         tangential_velocity=jnp.where(sticking, mechanics.belt_speed, y[degrees_of_freedom(y) + mechanics.tangential]),
     )
 
@@ -38,7 +42,7 @@ def transition(
     contact: Contact,
     load: Float[Array, ""],
     y: State,
-    ended: Bool[Array, "2"],
+    ended: Bool[Array, "*contacts 2"],
     resolution: Float[Array, ""],
 ) -> tuple[Contact, State]:
     """What follows where the guards in `ended` are used up: the next status, and the state on its constraint.
@@ -46,31 +50,13 @@ def transition(
     Where none is, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) is taken
     to have come to rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
     """
-    n = degrees_of_freedom(y)
-    detached = contact.status == Status.DETACH
-    sliding = contact.status == Status.SLIDE
-    lifted = sliding & ended[0]
-    touched = detached & ended[0]
-    # Slip that has run out is put at exactly zero; sticking has none to begin with.
-    stopped = (sliding & ended[1]) | (contact.status == Status.STICK)
-    stopped_velocity = jnp.where(stopped, mechanics.belt_speed, y[n + mechanics.tangential])
-    y_stopped = with_contact_coordinates(
-        mechanics,
-        y,
-        gap=jnp.where(touched, 0.0, gap(mechanics, y)),
-        gap_rate=y[n + mechanics.normal],
-        tangential_velocity=stopped_velocity,
-    )
-    y_next = jnp.where(touched, _resting(mechanics, load, impact(mechanics, y_stopped), resolution), y_stopped)
-    # At the edge of the friction cone, or where N has just reached zero, rounding alone would decide whether the status
-    # that has ended goes on. It does not.
-    following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
-    following = Contact(
-        status=jnp.where(lifted, Status.DETACH, following.status).astype(following.status.dtype),
-        direction=following.direction,
-    )
-    y_next = on_constraint(mechanics, following, y_next)
     any_ended = jnp.any(ended)
+    if mechanics.several:
+        # Much work, for which there is seldom a reason.
+        return jax.lax.cond(
+            any_ended, lambda: _following(mechanics, contact, load, y, ended, resolution), lambda: (contact, y)
+        )
+    following, y_next = _following(mechanics, contact, load, y, ended, resolution)
     return (
         Contact(
             status=jnp.where(any_ended, following.status, contact.status),
@@ -80,24 +66,72 @@ def transition(
     )
 
 
+def _following(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    ended: Bool[Array, "*contacts 2"],
+    resolution,
+) -> tuple[Contact, State]:
+    n = degrees_of_freedom(y)
+    detached = contact.status == Status.DETACH
+    sliding = contact.status == Status.SLIDE
+    lifted = sliding & ended[..., 0]
+    touched = detached & ended[..., 0]
+    # Slip that has run out is put at exactly zero; sticking has none to begin with.
+    stopped = (sliding & ended[..., 1]) | (contact.status == Status.STICK)
+    stopped_velocity = jnp.where(stopped, mechanics.belt_speed, y[n + mechanics.tangential])
+    y_stopped = with_contact_coordinates(
+        mechanics,
+        y,
+        gap=jnp.where(touched, 0.0, gap(mechanics, y)),
+        gap_rate=gap_rate(mechanics, y),
+        tangential_velocity=stopped_velocity,
+    )
+
+    def struck():
+        return _resting(mechanics, contact, load, impact(mechanics, y_stopped), touched, resolution)
+
+    # At the edge of the friction cone, or where N has just reached zero, rounding alone would decide whether the status
+    # that has ended goes on. It does not.
+    if mechanics.several:
+        y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
+        own = ended[..., 0] | ended[..., 1]
+        over = (own & (contact.status == Status.STICK)) | lifted
+        following = modes_from_forces(mechanics, load, y_next, contact, jnp.where(over, state_of(contact), NONE))
+        status = following.status
+    else:
+        y_next = jnp.where(touched, struck(), y_stopped)
+        following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
+        status = jnp.where(lifted, Status.DETACH, following.status)
+    following = Contact(status.astype(contact.status.dtype), following.direction)
+    return following, on_constraint(mechanics, following, y_next)
+
+
 def status_from_forces(
     mechanics: Mechanics, load: Float[Array, ""], y: State, may_stick: Bool[Array, ""] | bool = True
 ) -> Contact:
     """The status that a state on its constraints is in, found from the forces that each status would need.
 
     Open or opening: detached. Slipping: sliding if pressed, else detached. At rest on the belt: sticking if the holding
-    force lies in the friction cone, else sliding the way it is pushed, else detached.
+    force lies in the friction cone, else sliding the way it is pushed, else detached. Of several contacts, all of that at
+    once (`contact_problem`).
     """
+    if mechanics.several:
+        return modes_from_forces(mechanics, load, y)
     free = free_acceleration(mechanics, load, y)
     slip = relative_velocity(mechanics, y)
-    open_ = (gap(mechanics, y) > 0) | (y[degrees_of_freedom(y) + mechanics.normal] > 0)
+    open_ = (gap(mechanics, y) > 0) | (gap_rate(mechanics, y) > 0)
     holds = sticking_forces(mechanics, free)
     held = jnp.all(cone_margins(mechanics, *holds) >= 0)
     holding, pressing = total_forces(mechanics, *holds)
     sticks = may_stick & (slip == 0) & (pressing > 0) & held
     pushed = jnp.where(slip == 0, jnp.sign(holding), -jnp.sign(slip))
     direction = jnp.where(pushed == 0, 1.0, pushed).astype(y.dtype)
-    _, sliding_normal_force = total_forces(mechanics, *sliding_forces(mechanics, free, direction, jnp.abs(slip)))
+    sliding = Contact(jnp.full_like(open_, Status.SLIDE, jnp.int32), direction)
+    forces = ModeForces(mechanics, sliding, mechanics.friction(jnp.abs(slip))).added(mechanics, free)
+    _, sliding_normal_force = total_forces(mechanics, *forces)
     status = jnp.where(
         open_,
         Status.DETACH,
@@ -106,11 +140,29 @@ def status_from_forces(
     return Contact(status=status.astype(jnp.int32), direction=direction)
 
 
-def _resting(mechanics: Mechanics, load: Float[Array, ""], y: State, resolution: Float[Array, ""]) -> State:
-    rate = y[degrees_of_freedom(y) + mechanics.normal]
-    free_n = free_acceleration(mechanics, load, y)[mechanics.normal]
-    if mechanics.rest is not None:
-        _, g_tn, g_nn = mechanics.compliance
-        free_n = free_n - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
-    rests = rate + 0.5 * free_n * resolution <= 0
-    return jnp.where(jnp.arange(y.shape[0]) == degrees_of_freedom(y) + mechanics.normal, jnp.where(rests, 0.0, rate), y)
+def _resting(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    touched: Bool[Array, "*contacts"],
+    resolution: Float[Array, ""],
+) -> State:
+    """The state with rebounds that would be over at once left out."""
+    rate = gap_rate(mechanics, y)
+    if mechanics.several:
+        # As long as nothing holds it: in the mode before.
+        fall = acceleration(mechanics, contact, load, y)[mechanics.normal]
+    else:
+        fall = free_acceleration(mechanics, load, y)[mechanics.normal]
+        if mechanics.rest is not None:
+            _, g_tn, g_nn = mechanics.compliance
+            fall = fall - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
+    rests = touched & (rate + 0.5 * fall * resolution <= 0)
+    return with_contact_coordinates(
+        mechanics,
+        y,
+        gap=gap(mechanics, y),
+        gap_rate=jnp.where(rests, 0.0, rate),
+        tangential_velocity=y[degrees_of_freedom(y) + mechanics.tangential],
+    )

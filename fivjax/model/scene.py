@@ -18,7 +18,7 @@ from .friction import AbstractFriction
 from .friction_per_contact import FrictionPerContact
 from .load import AbstractLoad, ConstantLoad
 from .printing import as_call
-from .sliding import sliding_load, sliding_matrices
+from .sliding import contact_coordinates, sliding_coordinates, sliding_load, sliding_matrices
 from .structure import Structure
 
 IMPACT_LAWS = ("coulomb", "frictionless", "reset")
@@ -176,7 +176,7 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
         >>> fj.sliding_equilibrium(scene).round(6)  # x2, y1 and y2, which is closed
         array([ 0.000217, -0.000988,  0.      ])
     """
-    if is_known(scene.belt_speed) and float(scene.belt_speed) == 0:
+    if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
     q, normal_force = _compiled_steady_sliding(scene, scene.load.force)
     if is_known(q):
@@ -186,29 +186,39 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
                 "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
                 "the friction or the springs, or give `y0` to start elsewhere."
             )
-        if normal_force < 0:
+        if np.any(normal_force < 0):
             raise ValueError(
-                f"There is no sliding equilibrium: the belt would have to pull with {-float(normal_force):.3g} N. "
+                f"There is no sliding equilibrium: the belt would have to pull with {-float(np.min(normal_force)):.3g} N. "
                 f"Change the load, its direction or the friction."
             )
     return q
 
 
-def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:
     """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is none."""
     structure = scene.structure
-    friction = jnp.sign(scene.belt_speed) * scene.friction(jnp.abs(scene.belt_speed))
+    friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
     _, _, stiffness = sliding_matrices(structure, friction)
     load = sliding_load(structure, friction)
     reduced = jnp.linalg.solve(stiffness, load * force)
     # A motion that is free but for rounding answers with displacements whose rounding alone outweighs the load.
     rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
     reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
-    q = jnp.insert(reduced, structure.normal, 0.0)
+    _, normal = contact_coordinates(structure)
+    if isinstance(normal, np.ndarray):
+        q = jnp.zeros(structure.size, reduced.dtype).at[sliding_coordinates(structure.size, normal)].set(reduced)
+    else:
+        q = jnp.insert(reduced, normal, 0.0)
     matrices = structure.matrices
-    normal_force = matrices.stiffness[structure.normal] @ q
-    normal_force = normal_force - matrices.load_direction[structure.normal] * force
+    normal_force = matrices.stiffness[normal] @ q
+    normal_force = normal_force - matrices.load_direction[normal] * force
     return q, normal_force
+
+
+def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
+    """The slip speed of steady sliding; of several contacts, of each."""
+    speed, count = jnp.abs(scene.belt_speed), len(scene.structure.contacts)
+    return speed if count == 1 else jnp.broadcast_to(speed, count)
 
 
 _compiled_steady_sliding = compiled(steady_sliding)

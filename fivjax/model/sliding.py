@@ -1,8 +1,9 @@
 r"""Sliding as a projection of the structure: the normal coordinate is held, and friction joins the tangential row (Eq. 3).
 
-While the contact slides, the normal coordinate stays at zero and its row gives the normal force $N$. Friction
-$T = σμN$ then adds $-σμ$ times that row to the tangential one. Everything that needs the sliding motion's matrices, its
-coordinates or its load takes them from here; without friction ($μ = 0$) they are the structure's own, normal row left out.
+While a contact slides, its normal coordinate stays at zero and that row gives the normal force $N$. Friction
+$T = σμN$ then adds $-σμ$ times that row to the tangential one; of several contacts, all slide.
+Everything that needs the sliding motion's matrices, its coordinates or its load takes them from here; without friction
+($μ = 0$) they are the structure's own, normal rows left out.
 """
 
 import jax.numpy as jnp
@@ -11,39 +12,56 @@ from jaxtyping import Array, Float
 
 from .structure import Structure
 
+# A coordinate, or those of several contacts.
+Places = int | np.ndarray
 
-def sliding_coordinates(size: int, normal: int) -> np.ndarray:
-    """The coordinates that sliding leaves free: all but the normal one."""
+
+def contact_coordinates(structure: Structure) -> tuple[Places, Places]:
+    """The tangential and the normal coordinate of a structure's contact; of several contacts, those of all of them."""
+    if len(structure.places) == 1:
+        return structure.tangential, structure.normal
+    tangential, normal = zip(*structure.places, strict=True)
+    return np.array(tangential), np.array(normal)
+
+
+def sliding_coordinates(size: int, normal: Places) -> np.ndarray:
+    """The coordinates that sliding leaves free: all but the normal ones."""
     return np.delete(np.arange(size), normal)
 
 
-def sliding_states(size: int, normal: int) -> np.ndarray:
+def sliding_states(size: int, normal: Places) -> np.ndarray:
     """Places of the same coordinates in a state: displacements first, then velocities."""
     free = sliding_coordinates(size, normal)
     return np.concatenate([free, size + free])
 
 
-def sliding_rows(structure: Structure, matrix: Float[Array, "n k"], friction: Float[Array, ""]) -> Float[Array, "m k"]:
-    """Rows of the sliding motion: the structure's without the normal one, the tangential row less σμ times the normal row.
+def sliding_rows(
+    structure: Structure, matrix: Float[Array, "n k"], friction: Float[Array, "*contacts"]
+) -> Float[Array, "m k"]:
+    """Rows of the sliding motion: the structure's without the normal ones, each tangential row less σμ times its normal row.
 
-    `friction` is σμ: the coefficient with the sign of the belt's direction, 0 for motion without friction.
+    `friction` is σμ: the coefficient with the sign of the belt's direction, 0 for motion without friction; one number, or
+    one for each of several contacts.
     """
+    tangential, normal = contact_coordinates(structure)
+    index = np.arange(structure.size)
+    if isinstance(tangential, np.ndarray):
+        pulls = jnp.asarray(index[:, None] == tangential, matrix.dtype) * friction
+        return (matrix - pulls @ matrix[normal])[sliding_coordinates(structure.size, normal)]
     # A product with a constant rather than an update in place: in a batch it stays elementwise.
-    tangential = jnp.asarray(np.arange(structure.size) == structure.tangential, matrix.dtype)[:, None]
-    return (matrix - tangential * (friction * matrix[structure.normal]))[
-        sliding_coordinates(structure.size, structure.normal)
-    ]
+    along = jnp.asarray(index == tangential, matrix.dtype)[:, None]
+    return (matrix - along * (friction * matrix[normal]))[sliding_coordinates(structure.size, normal)]
 
 
 def sliding_matrices(
-    structure: Structure, friction: Float[Array, ""]
+    structure: Structure, friction: Float[Array, "*contacts"]
 ) -> tuple[Float[Array, "m m"], Float[Array, "m m"], Float[Array, "m m"]]:
     """M, C and K of the sliding motion (Eq. 3) under constant friction σμ, in kg, N·s/m and N/m."""
-    free = sliding_coordinates(structure.size, structure.normal)
+    free = sliding_coordinates(structure.size, contact_coordinates(structure)[1])
     mass, damping, stiffness = (sliding_rows(structure, matrix, friction)[:, free] for matrix in structure.matrices[:3])
     return mass, damping, stiffness
 
 
-def sliding_load(structure: Structure, friction: Float[Array, ""]) -> Float[Array, " m"]:
+def sliding_load(structure: Structure, friction: Float[Array, "*contacts"]) -> Float[Array, " m"]:
     """The share of a unit load that each row of the sliding motion carries (F of Eq. 3), without unit."""
     return sliding_rows(structure, structure.load_direction[:, None], friction)[:, 0]

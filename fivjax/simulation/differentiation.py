@@ -28,7 +28,8 @@ from ..foundation.precision import in_double_precision, known_to_numpy
 from ..model.scene import Scene, refuse_painleve, refuse_several_contacts
 from ..steppers.base import AbstractStepper, rates
 from ..steppers.event_exact import EventExact
-from .trajectory import Trajectory, simulate, start_state
+from .start import start_state
+from .trajectory import Trajectory, simulate
 
 # Looks at the guards within one advance; between two of them a guard is told from its derivatives.
 LOOKS = 32

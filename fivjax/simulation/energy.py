@@ -43,7 +43,7 @@ series for `EventExact`, the stages and weights of the Runge–Kutta step for `W
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
@@ -53,105 +53,10 @@ from ..model.springs import Springs
 from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment
-
-
-class Flows(eqx.Module):
-    """Energy flows, as powers in W or cumulated in J; signs as in the module's table. Scalars, or one row per instant."""
-
-    stick: Float[Array, "..."]
-    slide: Float[Array, "..."]
-    interface: Float[Array, "..."]
-    damping: Float[Array, "..."]
-    dampers: dict[str, Float[Array, "..."]]  # the parts of `damping`, by damper; empty where the structure names none
-    load: Float[Array, "..."]
-    kick: Float[Array, "..."]  # the part of `load` above the load's final value
-
-    @property
-    def contact(self) -> Float[Array, "..."]:
-        """What the belt gives to the structure, $P_c$ of Eq. 11."""
-        return self.stick + self.slide
-
-    @property
-    def mechanical(self) -> Float[Array, "..."]:
-        """What mechanical energy grows by between impacts: the right-hand side of Eq. 13."""
-        return self.contact - self.damping + self.load
-
-    def lines(self, kind: str) -> dict[str, Float[Array, "..."]]:
-        """The flows under the names that they have in a dataset, ending in `kind` ("power" or "work")."""
-        return {
-            f"stick_{kind}": self.stick,
-            f"slide_{kind}": self.slide,
-            f"interface_{kind}": self.interface,
-            f"damping_{kind}": self.damping,
-            **{f"damping_{kind}_{name}": part for name, part in self.dampers.items()},
-            f"load_{kind}": self.load,
-            f"kick_{kind}": self.kick,
-        }
-
-
-class Ledger(eqx.Module):
-    """What is added up along one trajectory; scalars, or one row per instant."""
-
-    work: Flows  # J
-    impact: Float[
-        Array, "..."
-    ]  # mechanical energy lost in re-contacts, J; negative where the belt gave more than was lost
-    impact_dissipated: Float[Array, "..."]  # the same with what the belt gave: dissipated between the two, J
-    stick_time: Float[Array, "..."]  # time spent sticking, s
-    detach_time: Float[Array, "..."]  # time spent detached, s
-    events: Int[Array, "..."]  # status changes, rebounds and reversals of slip
-    crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity
-    beyond_rest: Float[Array, "..."]  # work of all forces but impacts beyond those at rest, J; see the module's text
-    start: Float[Array, "..."]  # mechanical energy at the start, of displacements from rest, J
-    worst: Float[Array, "..."]  # largest size of the residual so far, J
-
-
-class Energy(eqx.Module):
-    """The ledger of a trajectory; arrays over its `T` instants, powers in W, everything else in J or s.
-
-    Cumulated lines start from zero at t = 0 and hold up to their row exactly, however far apart rows are.
-    """
-
-    kinetic: Float[Array, " T"]  # J
-    elastic: Float[Array, " T"]  # J
-    power: Flows  # W, at the row's instant and in its status
-    ledger: Ledger  # what had been entered by then
-    residual: Float[Array, " T"]  # growth of mechanical energy that no line accounts for, J
-
-    @property
-    def mechanical(self) -> Float[Array, " T"]:
-        """Kinetic and elastic energy, $E_m$, in J."""
-        return self.kinetic + self.elastic
-
-    @property
-    def work(self) -> Flows:
-        """The flows cumulated since t = 0, in J."""
-        return self.ledger.work
-
-    @property
-    def impact(self) -> Float[Array, " T"]:
-        """Mechanical energy lost in re-contacts since t = 0, in J."""
-        return self.ledger.impact
-
-    @property
-    def exchanged(self) -> Float[Array, " T"]:
-        """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
-        return exchanged(self.ledger)
-
-    def variables(self) -> dict[str, Float[Array, " T"]]:
-        """The ledger's lines under the names that they have in a dataset."""
-        return {
-            "kinetic_energy": self.kinetic,
-            "elastic_energy": self.elastic,
-            "mechanical_energy": self.mechanical,
-            **self.power.lines("power"),
-            **self.work.lines("work"),
-            "impact_loss": self.impact,
-            "impact_dissipated": self.ledger.impact_dissipated,
-            "energy_residual": self.residual,
-            "stick_time": self.ledger.stick_time,
-            "detach_time": self.ledger.detach_time,
-        }
+from .energy_lines import Energy as Energy
+from .energy_lines import Flows as Flows
+from .energy_lines import Ledger as Ledger
+from .energy_lines import exchanged as exchanged
 
 
 class Books(eqx.Module):
@@ -204,19 +109,28 @@ def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Arr
     force, _ = physics.added_forces(mechanics, contact, load, y)
     total_force, _ = physics.contact_forces(mechanics, contact, load, y)
     final_load = books.final_load if rest is None else books.final_load - rest.load
-    from_belt = force * velocity[structure.tangential]
+    from_belt = force * velocity[mechanics.tangential]
     none = jnp.zeros_like(from_belt)
     sliding = contact.status == Status.SLIDE
     along_load = jnp.sum(structure.load_direction * velocity)
+    stick = jnp.where(contact.status == Status.STICK, from_belt, none)
+    slide = jnp.where(sliding, from_belt, none)
+    interface = jnp.where(sliding, -total_force * physics.relative_velocity(mechanics, y), none)
     return Flows(
-        stick=jnp.where(contact.status == Status.STICK, from_belt, none),
-        slide=jnp.where(sliding, from_belt, none),
-        interface=jnp.where(sliding, -total_force * physics.relative_velocity(mechanics, y), none),
+        stick=_sum(mechanics, stick),
+        slide=_sum(mechanics, slide),
+        interface=_sum(mechanics, interface),
         damping=_form(structure.damping, velocity),
         dampers={name: _form(part, velocity) for name, part in books.dampers.items()},
         load=load * along_load,
         kick=(load - final_load) * along_load,
+        by_contact={"stick": stick, "slide": slide, "interface": interface} if mechanics.several else {},
     )
+
+
+def _sum(mechanics: Mechanics, each: Float[Array, "*contacts"]) -> Float[Array, ""]:
+    """Over the contacts, if there are several."""
+    return jnp.sum(each) if mechanics.several else each
 
 
 def _work(
@@ -225,31 +139,44 @@ def _work(
     """The flows of one advance, cumulated, and what all forces together did beyond those at rest, in J."""
     rest = mechanics.rest
     along = jax.vmap(lambda y: powers(books, mechanics, contact, load, y))(within.states)
-    beyond = jax.tree.map(lambda power: jnp.sum(within.weights * power), along)
+    weights = within.weights
+    beyond = jax.tree.map(
+        lambda power: jnp.sum((weights if power.ndim == 1 else weights[:, None]) * power, axis=0), along
+    )
     if rest is None:
         return beyond, beyond.mechanical
     moved = within.weights @ within.states[:, books.structure.size :]
-    by_contact = rest.tangential_force * moved[mechanics.tangential]
+    at_rest = rest.tangential_force * moved[mechanics.tangential]
     by_load = rest.load * jnp.sum(books.structure.load_direction * moved)
+    stick = jnp.where(contact.status == Status.STICK, at_rest, 0.0)
+    slide = jnp.where(contact.status == Status.SLIDE, at_rest, 0.0)
+    by_contact = beyond.by_contact
+    if by_contact:
+        by_contact = {**by_contact, "stick": by_contact["stick"] + stick, "slide": by_contact["slide"] + slide}
     total = eqx.tree_at(
-        lambda flows: (flows.stick, flows.slide, flows.load),
+        lambda flows: (flows.stick, flows.slide, flows.load, flows.by_contact),
         beyond,
         (
-            beyond.stick + jnp.where(contact.status == Status.STICK, by_contact, 0.0),
-            beyond.slide + jnp.where(contact.status == Status.SLIDE, by_contact, 0.0),
+            beyond.stick + _sum(mechanics, stick),
+            beyond.slide + _sum(mechanics, slide),
             beyond.load + by_load,
+            by_contact,
         ),
     )
     # Of an open contact the forces at rest are missing, which no line of the table says.
-    missing = by_contact + rest.normal_force * moved[mechanics.normal]
-    return total, beyond.mechanical - jnp.where(contact.status == Status.DETACH, missing, 0.0)
+    missing = at_rest + rest.normal_force * moved[mechanics.normal]
+    missing = _sum(mechanics, jnp.where(contact.status == Status.DETACH, missing, 0.0))
+    return total, beyond.mechanical - missing
 
 
 def open_ledger(books: Books, y: State) -> Ledger:
     """A ledger in which nothing has been entered yet."""
     none, no = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
+    count = len(books.structure.places)
+    each, several = jnp.zeros(count, y.dtype), count > 1
+    flows = dict.fromkeys(("stick", "slide", "interface"), each) if several else {}
     return Ledger(
-        work=Flows(none, none, none, none, dict.fromkeys(books.dampers, none), none, none),
+        work=Flows(none, none, none, none, dict.fromkeys(books.dampers, none), none, none, flows),
         impact=none,
         impact_dissipated=none,
         stick_time=none,
@@ -259,6 +186,7 @@ def open_ledger(books: Books, y: State) -> Ledger:
         beyond_rest=none,
         start=_stored(books, y),
         worst=none,
+        by_contact=dict.fromkeys(("impact", "stick_time", "detach_time"), each) if several else {},
     )
 
 
@@ -276,15 +204,6 @@ def _stored(books: Books, y: State) -> Float[Array, ""]:
     return kinetic_energy(books.structure, y) + books.springs.energy(y[: books.structure.size])
 
 
-def exchanged(ledger: Ledger) -> Float[Array, "..."]:
-    """How much the lines of the balance hold together, in J: what a residual is to be measured against.
-
-    Each line counts net, so what a vibration takes up and gives back within a cycle does not.
-    """
-    work = ledger.work
-    return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(ledger.impact)
-
-
 def enter(
     books: Books,
     method: AbstractStepper,
@@ -300,7 +219,7 @@ def enter(
     What a transition merely tidies up (a gap put at zero, slip that has run out) is no line: it goes into the residual.
     """
     structure = books.structure
-    n, normal, tangential = structure.size, structure.normal, structure.tangential
+    n, tangential, normal = structure.size, mechanics.tangential, mechanics.normal
     contact, load, y, after = segment.contact, segment.load, segment.y, segment.after
     within = method.within(mechanics, contact, load, y, after.h)
     work, beyond_rest = _work(books, mechanics, contact, load, within)
@@ -309,26 +228,46 @@ def enter(
     impulses = jnp.sum(structure.mass * (behind - before), axis=-1)
     loss = -0.5 * jnp.sum(impulses * (before + behind))
     by_belt = impulses[tangential] * mechanics.belt_speed
-    detached = contact.status == Status.DETACH
-    landed = detached & (after.y[normal] == 0)
-    loss, dissipated = jnp.where(landed, loss, 0.0), jnp.where(landed, loss + by_belt, 0.0)
-    bounced = landed & (after.contact.status == Status.DETACH) & (after.h > 0)
-    reversed_ = (contact.status == after.contact.status) & (contact.direction != after.contact.direction)
-    reversed_ = reversed_ & (contact.status == Status.SLIDE)
+    status, following = contact.status, after.contact.status
+    detached, sticks = status == Status.DETACH, status == Status.STICK
+    landed = detached & (physics.gap(mechanics, after.y) == 0)
+    loss = jnp.where(jnp.any(landed), loss, 0.0)
+    dissipated = jnp.where(jnp.any(landed), loss + _sum(mechanics, by_belt), 0.0)
+    bounced = landed & (following == Status.DETACH) & (after.h > 0)
+    reversed_ = (status == following) & (contact.direction != after.contact.direction)
+    reversed_ = reversed_ & (status == Status.SLIDE)
+    happened = (following != status) | bounced | reversed_
+    section = mechanics.places[0][0]
+    by_contact = {}
+    if mechanics.several:
+        # Impulses act at the contacts alone, so each has its own part of the loss, wherever the energy was.
+        own = impulses * (before + behind)
+        own = jnp.where(jnp.any(landed), -0.5 * (own[tangential] + own[normal]), 0.0)
+        entries = {
+            "impact": own,
+            "stick_time": jnp.where(sticks, after.h, 0.0),
+            "detach_time": jnp.where(detached, after.h, 0.0),
+        }
+        by_contact = {name: ledger.by_contact[name] + entry for name, entry in entries.items()}
     entered = Ledger(
         work=jax.tree.map(jnp.add, ledger.work, work),
         impact=ledger.impact + loss,
         impact_dissipated=ledger.impact_dissipated + dissipated,
-        stick_time=ledger.stick_time + jnp.where(contact.status == Status.STICK, after.h, 0.0),
-        detach_time=ledger.detach_time + jnp.where(detached, after.h, 0.0),
-        events=ledger.events + ((after.contact.status != contact.status) | bounced | reversed_),
-        crossings=ledger.crossings + ((y[n + tangential] < 0) & (after.y[n + tangential] >= 0)),
+        stick_time=ledger.stick_time + jnp.where(_all(mechanics, sticks), after.h, 0.0),
+        detach_time=ledger.detach_time + jnp.where(_all(mechanics, detached), after.h, 0.0),
+        events=ledger.events + (jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened),
+        crossings=ledger.crossings + ((y[n + section] < 0) & (after.y[n + section] >= 0)),
         beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
         worst=ledger.worst,
+        by_contact=by_contact,
     )
     open_ = jax.lax.stop_gradient(jnp.abs(residual(books, entered, after.y)))
     return eqx.tree_at(lambda ledger: ledger.worst, entered, jnp.maximum(ledger.worst, open_))
+
+
+def _all(mechanics: Mechanics, each: Bool[Array, "*contacts"]) -> Bool[Array, ""]:
+    return jnp.all(each) if mechanics.several else each
 
 
 def along_rows(

@@ -1,5 +1,6 @@
 """One trajectory, with everything that can be read off it."""
 
+import dataclasses
 import json
 import math
 from typing import TYPE_CHECKING
@@ -23,13 +24,16 @@ from ..foundation.precision import (
     refusing_reverse_in_single_precision,
 )
 from ..io.datasets import labelled
-from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, sliding_equilibrium, steady_sliding
+from ..model.contact_coordinates import in_contact_coordinates, transformation
+from ..model.scene import Scene, refuse_painleve
+from ..model.sliding import contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .ending import ENDING, GROWTH, Ending
 from .energy import Books, Energy, Ledger
+from .start import checked_start, snapped_to_belt, start_state
 from .stretches import MODES, Begin, go_on
 
 if TYPE_CHECKING:
@@ -56,9 +60,9 @@ class Trajectory(eqx.Module):
     displacement: Float[Returned, "T n"]  # m
     velocity: Float[Returned, "T n"]  # m/s
     acceleration: Float[Returned, "T n"]  # m/s²
-    status: Int[Returned, " T"]  # 0 stick, 1 slide, 2 detach
-    normal_force: Float[Returned, " T"]  # N
-    friction_force: Float[Returned, " T"]  # N
+    status: Int[Returned, "T *contacts"]  # 0 stick, 1 slide, 2 detach; of several contacts, one column for each
+    normal_force: Float[Returned, "T *contacts"]  # N
+    friction_force: Float[Returned, "T *contacts"]  # N
     load: Float[Returned, " T"]  # N
     scene: Scene
     energy: Energy | None = None  # the ledger, when asked for
@@ -72,14 +76,15 @@ class Trajectory(eqx.Module):
         return ENDING[Ending(int(self.outcome))]
 
     @property
-    def slip_velocity(self) -> Float[Returned, " T"]:
+    def slip_velocity(self) -> Float[Returned, "T *contacts"]:
         """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
-        return self.velocity[:, self.scene.structure.tangential] - np.asarray(self.scene.belt_speed)
+        along = _at_contacts(self.velocity, self.scene.structure.tangential_directions)
+        return along - np.asarray(self.scene.belt_speed)
 
     @property
-    def gap(self) -> Float[Returned, " T"]:
+    def gap(self) -> Float[Returned, "T *contacts"]:
         """Distance from the belt, in m."""
-        return self.displacement[:, self.scene.structure.normal]
+        return _at_contacts(self.displacement, self.scene.structure.normal_directions)
 
     @classmethod
     def from_dataset(cls, dataset: "xr.Dataset") -> "Trajectory":
@@ -98,14 +103,15 @@ class Trajectory(eqx.Module):
         import xarray as xr
 
         along = ("t", "coordinate")
+        each = ("t",) if np.ndim(self.status) == 1 else ("t", "contact")
         dataset = xr.Dataset(
             {
                 "displacement": (along, np.asarray(self.displacement)),
                 "velocity": (along, np.asarray(self.velocity)),
                 "acceleration": (along, np.asarray(self.acceleration)),
-                "status": ("t", np.asarray(self.status)),
-                "normal_force": ("t", np.asarray(self.normal_force)),
-                "friction_force": ("t", np.asarray(self.friction_force)),
+                "status": (each, np.asarray(self.status)),
+                "normal_force": (each, np.asarray(self.normal_force)),
+                "friction_force": (each, np.asarray(self.friction_force)),
                 "load": ("t", np.asarray(self.load)),
             },
             coords={"t": np.asarray(self.t), "coordinate": list(self.scene.structure.coordinates)},
@@ -161,7 +167,6 @@ def simulate(
     """
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "`simulate`")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
@@ -173,6 +178,8 @@ def simulate(
             f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
         )
     refuse_painleve(scene)
+    if not scene.structure.contacts_at_coordinates:
+        return _in_contact_coordinates(scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives)
     rows = math.ceil(t1 / dt_save - 1e-9)
     if rows > MOST_ROWS:
         raise ValueError(
@@ -202,6 +209,38 @@ def simulate(
         ("start", start),
     )
     return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, grown, most), settings=settings)
+
+
+def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
+    """`simulate` of a structure whose contacts' directions are vectors: in coordinates that hold them, and back again."""
+    structure = scene.structure
+    inner = Scene(
+        in_contact_coordinates(structure),
+        scene.friction,
+        scene.belt_speed,
+        scene.load,
+        scene.restitution,
+        scene.impact_law,
+    )
+    x, _ = transformation(structure)
+    if y0 is not None:
+        y = checked_start(structure.size, y0)
+        y0 = snapped_to_belt(inner, jnp.concatenate([jnp.linalg.solve(x, half) for half in jnp.split(y, 2)]))
+    run = simulate(inner, *how, y0=y0, **options)
+    rows = {name: getattr(run, name) @ x.T for name in ("displacement", "velocity", "acceleration")}
+    return dataclasses.replace(run, **rows, scene=scene)
+
+
+def _at_contacts(rows: Float[Returned, "T n"], directions: np.ndarray) -> Float[Returned, "T *contacts"]:
+    """A motion along the contacts' directions; of one contact without an axis for it."""
+    unit = np.count_nonzero(directions, axis=0) == 1
+    # A column is picked, and not multiplied by zeros, which would spoil it where another is not finite.
+    along = (
+        rows[:, np.argmax(directions, axis=0)]
+        if np.all(unit & (np.max(directions, axis=0) == 1))
+        else rows @ directions
+    )
+    return along[:, 0] if directions.shape[1] == 1 else along
 
 
 def _compiled_rows(count: int) -> int:
@@ -239,8 +278,8 @@ def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: 
         y, contact, events = carry
         after = method.advance(mechanics, contact, scene.load(t), y, jnp.asarray(method.dt, y.dtype))
         # A rebound keeps its status; it ends on the belt all the same.
-        landed = (contact.status == Status.DETACH) & (after.y[scene.structure.normal] == 0)
-        return after.y, after.contact, events + (landed | (after.contact.status != contact.status))
+        landed = (contact.status == Status.DETACH) & (physics.gap(mechanics, after.y) == 0)
+        return after.y, after.contact, events + jnp.any(landed | (after.contact.status != contact.status))
 
     contact = physics.status_from_forces(mechanics, scene.load(t), y)
     y, _, events = jax.lax.fori_loop(0, most, body, (y, contact, jnp.zeros((), jnp.int32)))
@@ -292,7 +331,8 @@ def _grown(
     """Which states are a billionfold beyond what the start, the belt and the load can explain."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
-    belt = weights[n + structure.tangential] * jnp.abs(scene.belt_speed)
+    tangential, _ = contact_coordinates(structure)
+    belt = jnp.max(weights[n + tangential] * jnp.abs(scene.belt_speed))
     # A load that nothing holds back accelerates a free structure for as long as it lasts.
     pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * jnp.max(jnp.abs(load)) * t
     expected = jnp.max(jnp.abs(weights * y[0])) + belt + pushed
@@ -357,40 +397,3 @@ def states_at(
         return jnp.concatenate([first[None], rest[rows]])
 
     return jax.tree.map(with_start, (y0, contact0, ledger0), after)
-
-
-def start_state(scene: Scene, y0) -> State:
-    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
-    n, normal = scene.structure.size, scene.structure.normal
-    if y0 is None:
-        # The first refuses where there is none, which nobody can tell inside a compiled function.
-        known = is_known(scene.belt_speed)
-        q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
-        return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
-    is_pair = isinstance(y0, tuple | list) and len(y0) == 2
-    parts = tuple(y0) if is_pair else (y0,)
-    for part in parts:
-        if is_known(part):
-            arguments.numeric_array("y0", part)
-    parts = tuple(map(real, parts))
-    shapes = tuple(part.shape for part in parts)
-    if shapes != (((n,), (n,)) if is_pair else ((2 * n,),)):
-        raise ValueError(
-            f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
-            f"({2 * n},), but has shape {' and '.join(map(str, shapes))}."
-        )
-    y = jnp.concatenate(parts)
-    if is_known(y):
-        if not np.all(np.isfinite(y)):
-            raise ValueError("Argument `y0` must be finite.")
-        if y[normal] < 0:
-            raise ValueError(
-                f"Argument `y0` must not start below the belt, but its displacement {normal} (the gap) is "
-                f"{float(y[normal]):g} m."
-            )
-        if y[normal] == 0 and y[n + normal] < 0:
-            raise ValueError(
-                f"Argument `y0` must not start on the belt and moving into it, but its velocity {normal} (of the gap) "
-                f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
-            )
-    return y

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..model.scene import Scene
-from .section import Rise, rise_between
+from .section import Rise, rise_between, section_coordinate
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
@@ -63,21 +63,22 @@ class Advance(NamedTuple):
     peak: Float[Array, ""]  # largest tangential speed it saw, m/s
     rise: Rise
     end: State  # where the mode's own motion ended, before anything that follows from its end
-    ended: Bool[Array, "2"]  # which of the guards ran out there
+    ended: Bool[Array, "*contacts 2"]  # which of the guards ran out there
 
 
 def advance_between(
     before: State,
     end: State,
-    ended: Bool[Array, "2"],
+    ended: Bool[Array, "*contacts 2"],
     y: State,
     contact: Contact,
     h: Float[Array, ""],
-    tangential: int,
+    mechanics: Mechanics,
 ) -> Advance:
     """An advance from one state to another that knows of what lay between only what these two say."""
-    peak = jnp.abs(y[y.shape[0] // 2 + tangential])
-    return Advance(y, contact, h, peak, rise_between(before, y, tangential), end, ended)
+    speed = jnp.abs(y[y.shape[0] // 2 + mechanics.tangential])
+    rise = rise_between(before, y, section_coordinate(mechanics))
+    return Advance(y, contact, h, jnp.max(speed) if mechanics.several else speed, rise, end, ended)
 
 
 class Within(NamedTuple):

@@ -17,13 +17,14 @@ from diffrax import AbstractLocalInterpolation
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State
+from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
 from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
+from .section import section_coordinate
 
 MOST_ROOT_STEPS = 60
 
@@ -90,13 +91,15 @@ class EventExact(AbstractStepper):
         at_section: bool = False,
     ) -> Advance:
         unit = _time_unit(mechanics)
-        states, guards = _series(mechanics, contact, load, y, self.order_, unit)
-        rounding = _rounding(mechanics, contact, load, y, unit)
-        exact = physics.exactly_zero(contact)
-        n, tangential = y.shape[0] // 2, mechanics.tangential
+        states, guards, mode = _series(mechanics, contact, load, y, self.order_, unit)
+        rounding = _rounding(mechanics, contact, load, y, unit, mode)
+        # Of several contacts the two guards of the first come first, then those of the second, …
+        guards, rounding = [guard.ravel() for guard in guards], [row.ravel() for row in rounding]
+        exact = physics.exactly_zero(contact).T.ravel()
+        n, count, section = y.shape[0] // 2, 2 * len(mechanics.places), section_coordinate(mechanics)
         if at_section:
             # One more row watches the tangential velocity rise through zero: not an event of the contact.
-            guards = [jnp.append(guard, -state[n + tangential]) for guard, state in zip(guards, states, strict=True)]
+            guards = [jnp.append(guard, -state[n + section]) for guard, state in zip(guards, states, strict=True)]
             rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, False)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
@@ -107,20 +110,25 @@ class EventExact(AbstractStepper):
             [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )
         if at_section:
-            watching = jnp.arange(3) < 2 + (guards[0][2] > 0)
+            watching = jnp.arange(count + 1) < count + (guards[0][count] > 0)
             safe, fires = jnp.where(watching, safe, 1.0), fires & watching
         first = jnp.min(safe)
         # Guards that run out at the same instant, but for rounding, do so together.
-        fires = fires & (safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps))
+        together = safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps)
+        if mechanics.several:
+            together = _together(mechanics, scaled, together & fires, first)
+            fires = together
+        else:
+            fires = fires & together
         x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
-        ended = fires[:2]
+        ended = fires[:count].reshape(*contact.status.shape, 2)
         reached, _ = value_and_slope(states, x * reach)
         if at_section:
-            reached = jnp.where((jnp.arange(2 * n) == n + tangential) & fires[2], 0.0, reached)
+            reached = jnp.where((jnp.arange(2 * n) == n + section) & fires[count], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, tangential)
+        return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -128,7 +136,7 @@ class EventExact(AbstractStepper):
         # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
         # product of two series is integrated with an error far below that of the series itself.
         unit = _time_unit(mechanics)
-        states, _ = _series(mechanics, contact, load, y, self.order_, unit)
+        states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
         times = 0.5 * (points + 1.0) * h
         inside, _ = value_and_slope([state[None] for state in states], times[:, None] / unit)
@@ -140,7 +148,7 @@ class EventExact(AbstractStepper):
     ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
         """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
         unit = _time_unit(mechanics)
-        states, _ = _series(mechanics, contact, load, y, self.order_, unit)
+        states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         return jnp.stack(states), unit
 
     def in_one_mode(self, mechanics: Mechanics, contact: Contact, y: State, h: Float[Array, ""]) -> State:
@@ -149,7 +157,7 @@ class EventExact(AbstractStepper):
 
         def step(carry):
             y, left, _ = carry
-            states, _ = _series(mechanics, contact, jnp.zeros_like(left), y, self.order_, unit)
+            states, *_ = _series(mechanics, contact, jnp.zeros_like(left), y, self.order_, unit)
             trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), 1e6) * unit)
             last = jnp.abs(left) <= trusted
             part = jnp.where(last, left, jnp.sign(left) * trusted)
@@ -174,51 +182,74 @@ def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
 
 def _series(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
-) -> tuple[list[State], list[Float[Array, "2"]]]:
-    """Taylor coefficients in time of the state and of the guards; time in units.
+) -> tuple[list[State], list[Float[Array, "*contacts 2"]], ModeForces]:
+    """Taylor coefficients in time of the state and of the guards, time in units; and the forces of the mode at the start.
 
     The physics is linear in the state but for friction, so it maps coefficients to coefficients, the constant parts
-    (load, belt) entering with the first. Only T = σμN and N (G_nn + σμ G_nt) = -a_n multiply two series.
+    (load, belt) entering with the first. Only T = σμN multiplies two series.
     """
     n = y.shape[0] // 2
-    _, g_tn, _ = mechanics.compliance
-    none = jnp.zeros_like(load)
-    states, guards, slips, friction, normal_forces = [y], [], [], [], []
+    slip = physics.slip_speed(mechanics, contact, y)
+    friction = [mechanics.friction(slip)]
+    mode = ModeForces(mechanics, contact, friction[0])
+    states, guards, slips, normal_forces = [y], [], [], []
     for k in range(order + 1):
-        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, none)
+        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
         free = physics.free_acceleration(own, force, states[k])
         slips.append(physics.slip_speed(own, contact, states[k]))
-        if k == 0:
-            sliding = physics.sliding_forces(own, free, contact.direction, slips[0])
-            friction.append(mechanics.friction(slips[0]))
-            compliance = mechanics.normal_compliance(contact.direction, friction[0])
-            normal_forces.append(physics.total_forces(own, *sliding)[1])
-        else:
-            if not mechanics.friction.constant:
-                friction.append(mechanics.friction.next_term(slips, friction))
-            varying = sum((friction[j] * normal_forces[k - j] for j in range(1, len(friction))), none)
-            normal = -(free[mechanics.normal] + contact.direction * g_tn * varying) / compliance
-            normal_forces.append(normal)
-            sliding = contact.direction * (friction[0] * normal + varying), normal
-        forces = physics.forces_by_status(own, contact, free, sliding)
+        otherwise = None
+        if k > 0 and not mechanics.friction.constant:
+            friction.append(mechanics.friction.next_term(slips, friction))
+            otherwise = contact.direction * sum(
+                (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
+            )
+        forces = mode.added(own, free, otherwise)
+        normal_forces.append(physics.total_forces(own, *forces)[1])
         guards.append(physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k])))
         rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
         states.append(rate * (unit / (k + 1)))
-    return states[: order + 1], guards
+    return states[: order + 1], guards, mode
 
 
 def _rounding(
-    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, unit: Float[Array, ""]
-) -> list[Float[Array, "2"]]:
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    unit: Float[Array, ""],
+    mode: ModeForces,
+) -> list[Float[Array, "*contacts 2"]]:
     """What rounding leaves of the first three coefficients of the guards where they are zero."""
-    mechanics, contact, load, y = jax.lax.stop_gradient((mechanics, contact, load, y))
+    mechanics, contact, load, y, mode = jax.lax.stop_gradient((mechanics, contact, load, y, mode))
     sizes, found = jnp.abs(y), []
     for k in range(3):
         own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
-        guards, rates = physics.magnitudes(own, contact, force, sizes)
+        guards, rates = physics.magnitudes(own, contact, force, sizes, mode)
         found.append(largest_rounding(guards))
         sizes = rates * (unit / (k + 1))
     return found
+
+
+def _together(
+    mechanics: Mechanics, scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], first: Float[Array, ""]
+) -> Bool[Array, " g"]:
+    """Which guards of several contacts end the advance together, of those that do at its end.
+
+    Contacts that the mass matrix couples feel each other's events at once, so theirs are one event; also where rounding alone
+    tells their instants apart. Those of others come one after another, with no time in between if need be: each then has its
+    own instant, and its own derivative.
+    """
+    count = 2 * len(mechanics.places)
+    chosen = jax.lax.argmax(fires, 0, jnp.int32)
+    among = physics.coupled_with(mechanics, jnp.minimum(chosen, count - 1) // 2)
+    own = jnp.arange(count) // 2 == chosen // 2
+    values, slopes = value_and_slope([jax.lax.stop_gradient(c[:count]) for c in scaled], first)
+    size = sum(jnp.abs(c[:count]) for c in scaled)
+    nearly = (values <= 64 * jnp.finfo(size.dtype).eps * size) & (slopes < 0)
+    coupled = jnp.repeat(among, 2) & jnp.any(fires[:count])
+    of_contacts = coupled & (fires[:count] | (nearly & ~own))
+    # The row of the section, if there is one, is no contact's.
+    return jnp.concatenate([of_contacts, fires[count:]])
 
 
 def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..contact import State
+from ..contact import Mechanics, State
 
 
 class Rise(NamedTuple):
@@ -13,6 +13,11 @@ class Rise(NamedTuple):
 
     happened: Bool[Array, ""]
     at: State  # the state there; anything if there was none
+
+
+def section_coordinate(mechanics: Mechanics) -> int:
+    """The coordinate whose velocity defines the section: the tangential one, of several contacts that of the first."""
+    return mechanics.places[0][0]
 
 
 def rise_between(before: State, after: State, tangential: int) -> Rise:

@@ -86,7 +86,7 @@ class WhereSwitched(AbstractStepper):
         del at_section  # its steps end where they end
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
         y_next, next_contact, ended = self._switched(mechanics, contact, load, smooth, h)
-        return advance_between(y, smooth, ended, y_next, next_contact, h, mechanics.tangential)
+        return advance_between(y, smooth, ended, y_next, next_contact, h, mechanics)
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -114,10 +114,10 @@ class WhereSwitched(AbstractStepper):
             stages.append(rates(mechanics, contact, load, states[-1]))
         return states, stages
 
-    def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact, Bool[Array, "2"]]:
+    def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact, Bool[Array, "*contacts 2"]]:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
         # An impact noticed up to a step late is that much too fast, which keeps rebounds of up to e/(1 - e) steps alive.
-        e = mechanics.restitution
+        e = jnp.max(mechanics.restitution) if mechanics.several else mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
         next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)
         return y, next_contact, ended

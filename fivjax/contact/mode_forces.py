@@ -1,0 +1,109 @@
+r"""The contact forces of a mode, as a linear answer to what accelerates the contacts without them.
+
+Of one contact the answers of the three statuses are written out. Of several, the demands of all contacts are one linear system:
+with the Delassus matrix G and $D = \mathrm{diag}(σ_i μ_i)$, the row of a contact's T says $(G λ)_t = -a_t$ (stick),
+$T - σ μ N = 0$ (slide) or $T = 0$ (detach); that of its N says $(G λ)_n = -a_n$ or $N = 0$. Its inverse is worked out once and
+serves all that happens in the mode.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..foundation.linear_solve import inverse
+from .mechanics import Mechanics
+from .mode import Contact, Status
+
+Each = Float[Array, "*contacts"]
+
+
+class ModeForces(eqx.Module):
+    """How the contact forces of one mode follow from the free accelerations."""
+
+    contact: Contact
+    dragging: Float[Array, "*contacts"]  # σμ
+    compliance: Float[Array, ""] | None  # G_nn + σμ G_nt, of one contact
+    answer: Float[Array, "k k"] | None  # the inverse of several contacts' system: (T, N) from its right-hand sides
+
+    def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]):
+        self.contact = contact
+        self.dragging = contact.direction * mu
+        self.compliance = self.answer = None
+        if mechanics.several:
+            sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
+            self.answer = inverse(mode_matrix(mechanics, sticking, closed, self.dragging))
+        else:
+            self.compliance = mechanics.normal_compliance(contact.direction, mu)
+
+    def added(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Each | None = None) -> tuple[Each, Each]:
+        """(T, N) in N that the mode adds to those at `mechanics.rest`.
+
+        `otherwise` is friction of a sliding contact besides σμN, in N.
+        """
+        if mechanics.rest is not None:
+            # What friction pulls otherwise than at rest under the same pressing force: exactly zero where friction is constant.
+            more = (self.dragging - mechanics.rest.friction) * mechanics.rest.normal_force
+            otherwise = more if otherwise is None else otherwise + more
+        if self.answer is not None:
+            return self._of_several(self.answer, mechanics, free, otherwise)
+        slide_t, slide_n = self._sliding(mechanics, free, otherwise)
+        stick_t, stick_n = sticking_forces(mechanics, free)
+        open_t = open_n = jnp.zeros_like(slide_n)
+        if mechanics.rest is not None:
+            open_t, open_n = -mechanics.rest.tangential_force, -mechanics.rest.normal_force
+        return (
+            by_status(self.contact, stick=stick_t, slide=slide_t, detach=open_t),
+            by_status(self.contact, stick=stick_n, slide=slide_n, detach=open_n),
+        )
+
+    def _sliding(self, mechanics: Mechanics, free, otherwise) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        pressed = free[mechanics.normal]
+        if otherwise is None:
+            normal_force = -pressed / self.compliance
+            return self.dragging * normal_force, normal_force
+        _, g_tn, _ = mechanics.compliance
+        normal_force = -(pressed + g_tn * otherwise) / self.compliance
+        return self.dragging * normal_force + otherwise, normal_force
+
+    def _of_several(
+        self, answer, mechanics: Mechanics, free, otherwise
+    ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+        status, rest = self.contact.status, mechanics.rest
+        open_t, open_n = (0.0, 0.0) if rest is None else (-rest.tangential_force, -rest.normal_force)
+        slides = jnp.zeros_like(self.dragging) if otherwise is None else otherwise
+        right_t = by_status(self.contact, stick=-free[mechanics.tangential], slide=slides, detach=open_t)
+        right_n = jnp.where(status == Status.DETACH, open_n, -free[mechanics.normal])
+        forces = answer @ jnp.concatenate([right_t, right_n])
+        return forces[: len(status)], forces[len(status) :]
+
+
+def mode_matrix(
+    mechanics: Mechanics, sticking: Bool[Array, " c"], closed: Bool[Array, " c"], dragging: Float[Array, " c"]
+) -> Float[Array, "k k"]:
+    """The system of several contacts' forces; rows and columns are all T, then all N."""
+    g_tt, g_tn, g_nn = mechanics.compliance
+    one = jnp.eye(sticking.shape[0], dtype=g_tt.dtype)
+    slides = jnp.where(closed & ~sticking, -dragging, 0.0)
+    stuck, touching = sticking[:, None], closed[:, None]
+    return jnp.concatenate(
+        [
+            jnp.concatenate([jnp.where(stuck, g_tt, one), jnp.where(stuck, g_tn, one * slides)], axis=1),
+            jnp.concatenate([jnp.where(touching, g_tn.T, 0.0), jnp.where(touching, g_nn, one)], axis=1),
+        ]
+    )
+
+
+def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) in N that hold the one contact still, added to those at rest."""
+    g_tt, g_tn, g_nn = mechanics.compliance
+    free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
+    determinant = g_tt * g_nn - g_tn**2
+    return (g_tn * free_n - g_nn * free_t) / determinant, (g_tn * free_t - g_tt * free_n) / determinant
+
+
+def by_status(contact: Contact, *, stick, slide, detach):
+    """What belongs to the contact's status, of three values; they may have one axis more than it."""
+    status = contact.status
+    if max(jnp.ndim(value) for value in (stick, slide, detach)) > status.ndim:
+        status = status[..., None]
+    return jnp.where(status == Status.STICK, stick, jnp.where(status == Status.SLIDE, slide, detach))

@@ -1,0 +1,167 @@
+"""What follows of several contacts at an event: their modes from the forces, and the impulses where gaps have closed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .contact_problem import BACKWARD, FORWARD, NONE, OPEN, STICK, ContactProblem, forces_of, settled_states
+from .coordinates import spread
+from .forces import State, degrees_of_freedom, free_acceleration, gap, gap_rate, relative_velocity
+from .mechanics import Mechanics
+from .mode import Contact, Status
+
+
+def modes_from_forces(
+    mechanics: Mechanics,
+    load: Float[Array, ""],
+    y: State,
+    before: Contact | None = None,
+    ended: Int[Array, " c"] | None = None,
+) -> Contact:
+    """The modes that a state on its constraints is in, from the forces that they would need.
+
+    `before` is a guess, and `ended` what `ContactProblem` says: states that must not go on by a hair.
+    """
+    slip = relative_velocity(mechanics, y)
+    free = free_acceleration(mechanics, load, y)
+    away = (gap(mechanics, y) > 0) | (gap_rate(mechanics, y) > 0)
+    slips = slip != 0
+    sizes = _sizes_of_free(mechanics, load, y)
+    problem = _problem(
+        mechanics,
+        free[mechanics.tangential],
+        free[mechanics.normal],
+        sizes,
+        sliding=mechanics.friction(jnp.abs(slip)),
+        static=mechanics.friction.static,
+        allowed=_allowed(away, slips, slip < 0),
+        slips=slips,
+        away=away,
+        ended=jnp.full_like(away, NONE, jnp.int32) if ended is None else ended,
+        with_rest=True,
+    )
+    guess = jnp.where(away, OPEN, jnp.where(slips, jnp.where(slip < 0, FORWARD, BACKWARD), STICK))
+    if before is not None:
+        going_on = state_of(before)
+        guess = jnp.where(jnp.take_along_axis(problem.allowed, going_on[:, None], 1)[:, 0], going_on, guess)
+    found = settled_states(problem, guess.astype(jnp.int32))
+    status = jnp.where(found == STICK, Status.STICK, jnp.where(found == OPEN, Status.DETACH, Status.SLIDE))
+    return Contact(status.astype(jnp.int32), jnp.where(found == BACKWARD, -1.0, 1.0).astype(y.dtype))
+
+
+def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
+    """The state after gaps have closed, Newton's restitution and Coulomb's law for all contacts on the belt at once; who of
+    them got an impulse, and whose slip it ended.
+
+    Every contact on the belt takes part: what strikes one may lift, stop or turn another.
+    """
+    n = degrees_of_freedom(y)
+    approach, slip = gap_rate(mechanics, y), relative_velocity(mechanics, y)
+    away = gap(mechanics, y) > 0
+    demanded = (1.0 + mechanics.restitution) * approach
+    mu = mechanics.friction(jnp.abs(slip))
+    frictionless = mechanics.impact_law == "frictionless"
+    if frictionless:
+        mu = jnp.zeros_like(mu)
+    nobody = jnp.zeros_like(away)
+    problem = _problem(
+        mechanics,
+        slip,
+        demanded,
+        (jnp.abs(slip), jnp.abs(demanded)),
+        sliding=mu,
+        static=mu,
+        # Without friction there is nothing to choose but whether there is an impulse.
+        allowed=_allowed(away, jnp.full_like(away, frictionless), ~nobody),
+        slips=jnp.full_like(away, frictionless),
+        away=away,
+        ended=jnp.full_like(away, NONE, jnp.int32),
+        with_rest=False,
+    )
+    guess = jnp.where(away, OPEN, FORWARD if frictionless else STICK)
+    found = settled_states(problem, guess.astype(jnp.int32))
+    tangential_impulse, normal_impulse = forces_of(problem, found)
+    kick = spread(mechanics.from_tangential, tangential_impulse) + spread(mechanics.from_normal, normal_impulse)
+    return y.at[n:].add(kick), found != OPEN, found == STICK
+
+
+def state_of(contact: Contact) -> Int[Array, " c"]:
+    """The state of a `ContactProblem` that a mode stands for."""
+    slides = jnp.where(contact.direction > 0, FORWARD, BACKWARD)
+    by = jnp.where(contact.status == Status.SLIDE, slides, OPEN)
+    return jnp.where(contact.status == Status.STICK, STICK, by).astype(jnp.int32)
+
+
+def coupled_with(mechanics: Mechanics, which: Int[Array, ""]) -> Bool[Array, " c"]:
+    """Which contacts feel at once what happens to one, itself included: those that the mass matrix couples with it."""
+    g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
+    size = jnp.sqrt(jnp.diagonal(g_tt) * jnp.diagonal(g_nn))
+    # Relative to the contacts' own compliances.
+    coupling = g_tt + g_tn + g_tn.T + g_nn
+    scale = jnp.diagonal(g_tt) + jnp.diagonal(g_nn) + size
+    coupling = coupling / jnp.sqrt(scale[:, None] * scale)
+    mine = jnp.arange(len(size)) == which
+    row = jnp.sum(jnp.where(mine[:, None], coupling, 0.0), axis=0)
+    return mine | (row > 64 * jnp.finfo(row.dtype).eps)
+
+
+def _allowed(away: Bool[Array, " c"], slips: Bool[Array, " c"], forward: Bool[Array, " c"]) -> Bool[Array, "c 4"]:
+    """The states that each contact may be in, by what it does already; friction is `forward` where it slips back."""
+    closed = ~away
+    return jnp.stack(
+        [closed & ~slips, closed & (~slips | forward), closed & (~slips | ~forward), jnp.ones_like(away)], axis=-1
+    )
+
+
+def _problem(
+    mechanics: Mechanics, tangential, normal, sizes, *, sliding, static, allowed, slips, away, ended, with_rest: bool
+) -> ContactProblem:
+    g_tt, g_tn, g_nn = mechanics.compliance
+    none = jnp.zeros_like(normal)
+    rest = mechanics.rest if with_rest else None
+    edges, pressing, otherwise, open_normal = jnp.stack([none] * 2, -1), none, jnp.stack([none] * 4, -1), none
+    if rest is not None:
+        n_0 = rest.normal_force
+        edges = jnp.stack([static - rest.friction, static + rest.friction], axis=-1) * n_0[:, None]
+        otherwise = jnp.stack(
+            [none, (sliding - rest.friction) * n_0, -(sliding + rest.friction) * n_0, -rest.tangential_force], axis=-1
+        )
+        pressing, open_normal = n_0, -n_0
+    own_t, own_n = jnp.diagonal(g_tt), jnp.diagonal(g_nn)
+    # Of contacts that nothing acts on alone, forces are those that the others hand on.
+    alone = sizes[0] / own_t + sizes[1] / own_n
+    if rest is not None:
+        alone = alone + jnp.abs(rest.normal_force) + jnp.abs(rest.tangential_force)
+    handed_on = (jnp.abs(g_tt) + jnp.abs(g_tn) + jnp.abs(g_tn.T) + jnp.abs(g_nn)) @ alone
+    force_size = alone + handed_on / jnp.minimum(own_t, own_n)
+    change_size = sizes[0] + sizes[1] + handed_on
+    tiny = jnp.finfo(normal.dtype).tiny
+    return ContactProblem(
+        mechanics=mechanics,
+        tangential=tangential,
+        normal=normal,
+        sliding=sliding,
+        cone_edges=edges,
+        static=static,
+        pressing=pressing,
+        otherwise=otherwise,
+        open_normal=open_normal,
+        allowed=allowed,
+        slips=slips,
+        away=away,
+        ended=ended.astype(jnp.int32),
+        force_size=jnp.maximum(force_size, tiny),
+        change_size=jnp.maximum(change_size, tiny),
+    )
+
+
+def _sizes_of_free(mechanics: Mechanics, load, y: State) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Sizes of the terms in the contacts' free accelerations, along the belt and away from it."""
+    mechanics, load, y = jax.lax.stop_gradient((mechanics, load, y))
+    n = degrees_of_freedom(y)
+    places = np.array(mechanics.places).T.ravel()
+    sizes = jnp.abs(mechanics.free_load[places] * load)
+    sizes = sizes + jnp.abs(mechanics.free_position[places]) @ jnp.abs(y[:n])
+    sizes = sizes + jnp.abs(mechanics.free_velocity[places]) @ jnp.abs(y[n:])
+    return sizes[: len(mechanics.places)], sizes[len(mechanics.places) :]

@@ -1,0 +1,66 @@
+"""The state that a run starts from."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..contact import State
+from ..foundation import arguments
+from ..foundation.precision import is_known, real
+from ..model.scene import Scene, sliding_equilibrium, steady_sliding
+from ..model.sliding import contact_coordinates
+
+
+def start_state(scene: Scene, y0) -> State:
+    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
+    n = scene.structure.size
+    if y0 is None:
+        # The first refuses where there is none, which nobody can tell inside a compiled function.
+        known = is_known(scene.belt_speed)
+        q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
+        return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
+    y = checked_start(n, y0)
+    if is_known(y):
+        for normal in map(int, np.ravel(contact_coordinates(scene.structure)[1])):
+            if y[normal] < 0:
+                raise ValueError(
+                    f"Argument `y0` must not start below the belt, but its displacement {normal} (the gap) is "
+                    f"{float(y[normal]):g} m."
+                )
+            if y[normal] == 0 and y[n + normal] < 0:
+                raise ValueError(
+                    f"Argument `y0` must not start on the belt and moving into it, but its velocity {normal} (of the gap) "
+                    f"is {float(y[n + normal]):g} m/s. Start a little above the belt."
+                )
+    return y
+
+
+def checked_start(n: int, y0) -> State:
+    """Displacements and velocities given as a pair or as one array, once their shapes are checked."""
+    is_pair = isinstance(y0, tuple | list) and len(y0) == 2
+    parts = tuple(y0) if is_pair else (y0,)
+    for part in parts:
+        if is_known(part):
+            arguments.numeric_array("y0", part)
+    parts = tuple(map(real, parts))
+    shapes = tuple(part.shape for part in parts)
+    if shapes != (((n,), (n,)) if is_pair else ((2 * n,),)):
+        raise ValueError(
+            f"Argument `y0` must hold {n} displacements and {n} velocities, as a pair of arrays or one of shape "
+            f"({2 * n},), but has shape {' and '.join(map(str, shapes))}."
+        )
+    y = jnp.concatenate(parts)
+    if is_known(y) and not np.all(np.isfinite(y)):
+        raise ValueError("Argument `y0` must be finite.")
+    return y
+
+
+def snapped_to_belt(scene: Scene, y: State) -> State:
+    """A state whose gaps and slip are exactly zero where they are zero but for the rounding of a change of coordinates."""
+    tangential, normal = contact_coordinates(scene.structure)
+    n = scene.structure.size
+    size = 64 * np.finfo(np.float64).eps * jnp.repeat(jnp.max(jnp.abs(y.reshape(2, n)), axis=1), n)
+    at_rest = jnp.zeros_like(y).at[n + tangential].set(scene.belt_speed)
+    contact_values = np.isin(
+        np.arange(2 * n), np.concatenate([np.ravel(k) for k in (normal, n + normal, n + tangential)])
+    )
+    return jnp.where(contact_values & (jnp.abs(y - at_rest) <= size), at_rest, y)

@@ -1,0 +1,216 @@
+"""Structures with several contacts, against single runs, closed forms and independent solvers.
+
+All fast tests share one compiled program: two contacts at the same places of six coordinates, lists of Coulomb laws, a pulse.
+"""
+
+import numpy as np
+import pytest
+import several_contacts_reference as reference
+
+import fivjax as fj
+
+EACH = 3  # coordinates of one oscillator
+
+
+def copies(count, structure=None, shares=None):
+    """Uncoupled copies of a structure in one, each with its own share of the load."""
+    mass, damping, stiffness, load = map(
+        np.asarray, (fj.belt_oscillator() if structure is None else structure).matrices
+    )
+    shares = np.ones(count) if shares is None else shares
+    contacts = [fj.ContactPoint(EACH * i, EACH * i + 2) for i in range(count)]
+    return fj.Structure(
+        *(np.kron(np.eye(count), matrix) for matrix in (mass, damping, stiffness)),
+        np.kron(shares, load),
+        contacts=contacts,
+    )
+
+
+def scene_of(structure, *, mu=0.2, mu_static=None, belt=3.0, force=100.0, p=1.0, restitution=0.0):
+    count = len(structure.contacts)
+    mu, mu_static, belt = (
+        np.broadcast_to(value, count) for value in (mu, mu if mu_static is None else mu_static, belt)
+    )
+    laws = [fj.Coulomb(float(m), float(s)) for m, s in zip(mu, mu_static, strict=True)]
+    restitution = np.broadcast_to(float(restitution), count)
+    return fj.Scene(structure, laws, np.array(belt), fj.Pulse(force, p), restitution)
+
+
+def coupled(count, seed, *, each=EACH):
+    """A scene whose contacts are coupled in mass, damping and stiffness, its model for the reference, and a wild start."""
+    rng, n = np.random.default_rng(seed), each * count
+    a, b = rng.normal(size=(2, n, n))
+    mass, stiffness = np.eye(n) + 0.15 * (a @ a.T) / n, 4 * np.eye(n) + 3 * (b @ b.T) / n
+    damping, load = 0.01 * np.eye(n) + 0.004 * stiffness, np.zeros(n)
+    load[each - 1 :: each] = -rng.uniform(2, 4, count)
+    mu, belt = rng.uniform(0.2, 0.5, count), rng.uniform(0.3, 1.0, count)
+    contacts = [fj.ContactPoint(each * i, each * i + each - 1) for i in range(count)]
+    scene = scene_of(fj.Structure(mass, damping, stiffness, load, contacts=contacts), mu=mu, belt=belt, force=1.0)
+    directions = np.eye(n)[:, ::each], np.eye(n)[:, each - 1 :: each]
+    model = reference.Model(mass, damping, stiffness, load, *directions, mu, belt, np.zeros(count))
+    q, v = 0.3 * rng.normal(size=n), 6.0 * rng.normal(size=n)
+    q[each - 1 :: each] = np.abs(q[each - 1 :: each])
+    return scene, model, np.concatenate([q, v])
+
+
+def between_events(model, y0, count):
+    """An instant after so many events of the reference, well away from the next one."""
+    _, found = reference.events(model, y0, 50.0, most=count + 8)
+    instants = np.array([t for t, _ in found])
+    after = count - 1 + np.argmax(np.diff(instants[count - 1 :]))
+    return instants[after] + 0.5 * (instants[after + 1] - instants[after])
+
+
+def closes(run):
+    return np.abs(run.energy.residual).max() / np.abs(run.energy.exchanged).max()
+
+
+def agrees_with_copies(count, t1):
+    shares = 1 + 0.1 * np.arange(count)
+    run = fj.simulate(scene_of(copies(count, shares=shares), p=2.0), t1, t1 / 40, energy=True)
+    events = 0
+    for i in range(count):
+        one = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0 * shares[i], 2.0))
+        alone = fj.simulate(one, t1, t1 / 40, energy=True)
+        mine = slice(EACH * i, EACH * i + EACH)
+        assert np.array_equal(run.status[:, i], alone.status)
+        for name in ("displacement", "velocity"):
+            got, expected = getattr(run, name)[:, mine], getattr(alone, name)
+            assert np.abs(got - expected).max() < 1e-12 * np.abs(expected).max(), name
+        for line in ("stick", "slide", "interface"):
+            got, expected = run.energy.work.by_contact[line][:, i], getattr(alone.energy.work, line)
+            assert np.allclose(got, expected, rtol=0, atol=1e-12 * np.abs(alone.energy.exchanged).max()), line
+        events += int(alone.energy.ledger.events[-1])
+    assert int(run.energy.ledger.events[-1]) == events
+    assert closes(run) < 1e-12
+    return events
+
+
+def test_two_copies_of_the_paper_s_oscillator_move_like_one_each():
+    """Two uncoupled copies under different loads: each contact as if it were alone, through 100 events; so are its energies.
+    They lift off at the same instants, which must not make one put the other back."""
+    assert agrees_with_copies(2, 0.4) > 100
+
+
+@pytest.mark.slow
+def test_five_copies_move_like_one_each():
+    """Five copies, beyond what is enumerated."""
+    assert agrees_with_copies(5, 0.35) > 100
+
+
+def agrees_with_reference(count, seed, *, events=20):
+    scene, model, y0 = coupled(count, seed)
+    t1 = between_events(model, y0, events)
+    expected, found = reference.events(model, y0, t1)
+    run = fj.simulate(scene, t1, t1 / 20, y0=y0, energy=True)
+    n = len(y0) // 2
+    assert len(found) >= events
+    assert np.abs(run.displacement[-1] - expected[:n]).max() < 1e-9
+    assert np.abs(run.velocity[-1] - expected[n:]).max() < 1e-9
+    assert closes(run) < 1e-12
+    # Forces of each contact obey its law.
+    normal, friction = run.normal_force, run.friction_force
+    mu = np.array([law.mu for law in scene.friction.laws])
+    assert np.all(normal >= -1e-9)
+    assert np.all(np.abs(friction) <= mu * normal + 1e-9)
+    assert np.all(run.gap >= 0)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 6])
+def test_two_coupled_contacts_are_those_of_an_independent_solver(seed):
+    """Stick, slip, lift-off and impacts that strike the other contact, against matrix exponentials with enumeration."""
+    agrees_with_reference(2, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "seed"), [(3, 0), (3, 2), (5, 0), (5, 2)])
+def test_more_coupled_contacts_are_those_of_an_independent_solver(count, seed):
+    """Three contacts by enumeration, five by pivoting."""
+    agrees_with_reference(count, seed)
+
+
+@pytest.mark.slow
+def test_a_time_stepping_scheme_converges_to_the_same_motion():
+    """Moreau's scheme knows no events; its distance falls in proportion to its step."""
+    scene, model, y0 = coupled(2, 3)
+    run = fj.simulate(scene, 2.0, 0.1, y0=y0)
+    exact = np.concatenate([run.displacement[-1], run.velocity[-1]])
+    distances = [np.abs(reference.time_stepping(model, y0, 2.0, steps) - exact).max() for steps in (4000, 16000)]
+    assert distances[1] < 2e-3
+    assert distances[1] < 0.4 * distances[0]
+
+
+def test_a_chain_of_equal_blocks_moves_as_one():
+    """Blocks of 1 kg on springs of 1 N/m, coupled by a spring that equal motions do not stretch: the closed form of one block
+    with F_s = 1 N, F_d = 0.5 N on a belt of 0.2 m/s."""
+    mass = np.eye(6)
+    stiffness = np.diag([1.0, 5.0, 9.0, 1.0, 5.0, 9.0])
+    stiffness[np.ix_([0, 3], [0, 3])] += 0.7 * np.array([[1, -1], [-1, 1]])
+    load = np.array([0.0, 0, -1, 0, 0, -1])
+    structure = fj.Structure(
+        mass, np.zeros((6, 6)), stiffness, load, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)]
+    )
+    scene = scene_of(structure, mu=0.5, mu_static=1.0, belt=0.2, force=1.0)
+    period = 8.902605408
+    y0 = np.zeros(12)
+    y0[[0, 3]], y0[[6, 9]] = 0.9, 0.2
+    run = fj.simulate(scene, 4 * period, period / 4, y0=y0, energy=True)
+    assert np.abs(run.displacement[:, 0] - run.displacement[:, 3]).max() < 1e-12
+    assert np.array_equal(run.status[:, 0], run.status[:, 1])
+    later = run.displacement[4:, 0]
+    assert np.abs(later[4:] - later[:-4]).max() < 1e-9
+    # Sticks until the spring holds F_s, 2Δ/(kv) long.
+    stuck = run.energy.ledger.by_contact["stick_time"]
+    assert stuck[-1] - stuck[-5] == pytest.approx([5.0, 5.0], abs=1e-9)
+
+
+def mirrored():
+    """The paper's oscillator and its mirror image on belts that run apart, coupled by a spring and by a mass."""
+    pair = copies(2)
+    mirror = np.diag([1.0, 1, 1, -1, 1, 1])
+    mass, damping, stiffness, load = (np.array(matrix) for matrix in pair.matrices)
+    mass, damping, stiffness = (mirror @ matrix @ mirror for matrix in (mass, damping, stiffness))
+    stiffness[np.ix_([1, 4], [1, 4])] += 2e3 * np.array([[1, -1], [-1, 1]])
+    mass[2, 5] = mass[5, 2] = 0.004
+    structure = fj.Structure(mass, damping, stiffness, load, contacts=pair.contacts)
+    return scene_of(structure, belt=[3.0, -3.0], p=2.0), np.array([1.0, 1, 1, -1, 1, 1])
+
+
+def symmetric(cycles, rows):
+    scene, _ = mirrored()
+    t1 = cycles / 68.0
+    run = fj.simulate(scene, t1, t1 / rows, energy=True)
+    other = run.velocity[:, 3:] * np.array([-1.0, 1, 1])
+    assert int(run.energy.ledger.events[-1]) > cycles
+    return np.abs(run.velocity[:, :3] - other).max() / np.abs(run.velocity).max()
+
+
+def test_a_mirror_symmetric_pair_stays_symmetric():
+    """Both lift, land and stick at the same instants, and the impact of one is felt by the other at once."""
+    assert symmetric(50, 40) < 1e-9
+
+
+@pytest.mark.slow
+def test_a_mirror_symmetric_pair_stays_symmetric_for_long():
+    """The same for 10⁴ cycles."""
+    assert symmetric(10_000, 1000) < 1e-6
+
+
+def test_contacts_along_vectors_are_those_at_coordinates():
+    """The same motion in coordinates that mix the contacts' directions with others: W_t and W_n are vectors there."""
+    scene, model, y0 = coupled(2, 3)
+    n = 6
+    mix = np.eye(n) + 0.3 * np.random.default_rng(5).normal(size=(n, n))  # q = mix · z
+    matrices = [mix.T @ matrix @ mix for matrix in (model.mass, model.damping, model.stiffness)]
+    matrices = [0.5 * (matrix + matrix.T) for matrix in matrices]
+    contacts = [fj.ContactPoint(mix.T @ model.tangential[:, i], mix.T @ model.normal[:, i]) for i in range(2)]
+    turned = fj.Structure(*matrices, mix.T @ model.load, contacts=contacts)
+    assert np.allclose(fj.delassus(turned).matrix, fj.delassus(scene.structure).matrix, atol=1e-13)
+    z0 = np.linalg.solve(mix, y0[:n]), np.linalg.solve(mix, y0[n:])
+    t1 = between_events(model, y0, 6)
+    run = fj.simulate(scene, t1, t1 / 20, y0=y0, energy=True)
+    again = fj.simulate(scene_of(turned, mu=model.mu, belt=model.belt, force=1.0), t1, t1 / 20, y0=z0, energy=True)
+    assert np.abs(again.displacement @ mix.T - run.displacement).max() < 1e-10
+    assert np.abs(again.slip_velocity - run.slip_velocity).max() < 1e-10
+    assert np.abs(again.gap - run.gap).max() < 1e-10
+    assert np.array_equal(again.status, run.status)
