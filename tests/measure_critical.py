@@ -93,7 +93,7 @@ def derivatives() -> None:
                     kicks.append(np.nan)
                     continue
                 guess = p + slope * side
-                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 1e-8, guess + 1e-8)))
+                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 1e-7, guess + 1e-7)))
             difference = (kicks[1] - (p if np.isnan(kicks[0]) else kicks[0])) / (by if np.isnan(kicks[0]) else 2 * by)
             print(
                 f"  v = {speed:g} {name:12s} {slope: .9e}  differences {difference: .9e}  apart {slope - difference: .1e}"

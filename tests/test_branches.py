@@ -117,3 +117,31 @@ def test_benchmark_a_s_unstable_branch_runs_from_the_hopf_point_to_the_grazing()
     # Beyond the grazing it is the stick–slip cycle, which goes back.
     assert branch.stable.values[-1] and float(branch.parameter[-1]) == 1.0
     assert branch.word.values[-1] == "stick – slide"
+
+
+def test_a_branch_is_drawn_and_saved(branch, tmp_path):
+    """Solid where stable, dashed where not, special points by name; several branches share one picture."""
+    assert branch.sliding_stable.all()
+    path = fj.save(branch, tmp_path / "branch.nc")
+    kept = fj.open(path)
+    np.testing.assert_array_equal(kept.multipliers, branch.multipliers)
+    (axes,) = fj.plot.branch({"1 m/s": branch, "again": kept}).axes
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert {"fold", "1 m/s", "again", "stable", "unstable"} <= set(texts)
+    assert fj.show(branch).axes[0].get_xlabel() == axes.get_xlabel()
+    with pytest.raises(TypeError, match="continue_cycle"):
+        fj.plot.branch(fj.cycle_at(branch, 0))
+
+
+def test_the_command_writes_branch_and_picture(branch, monkeypatch, tmp_path, capsys):
+    from fivjax.cli import main
+
+    asked = []
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
+    monkeypatch.setattr(fj, "continue_cycle", lambda scene, *rest, **_: asked.append((scene, *rest)) or branch)
+    out = str(tmp_path / "b")
+    assert main(["branch", "--over", "mu=0.1:0.3", "--each", "belt_speed=1:2:2", "--out", out]) == 0
+    assert [float(scene.belt_speed) for scene, *_ in asked] == [1.0, 2.0] and asked[0][1:] == ("mu", (0.1, 0.3))
+    said = capsys.readouterr().out
+    assert "fold" in said and "The bound mu = 0.21 is reached." in said
+    assert {path.name for path in tmp_path.iterdir()} == {"b-1.nc", "b-2.nc", "b.png"}

@@ -12,6 +12,7 @@ import tyro
 import fivjax as fj
 
 from .analysis_commands import Calibrate, Cea
+from .branch_command import Branch
 from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
@@ -23,6 +24,7 @@ COMMANDS = {
     "simulate": Simulate,
     "cea": Cea,
     "cycle": Cycle,
+    "branch": Branch,
     "calibrate": Calibrate,
     "tradeoff": Tradeoff,
     "reproduce": Reproduce,

@@ -21,9 +21,10 @@ from ..steppers.event_exact import EventExact
 from .around import seen_around
 from .closing import Closed
 from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
-from .following import Point, follow_branch, seen
+from .following import Point, follow_branch, seen, sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
 from .pseudo_arclength import Curve, Family
+from .saddle import saddle_cycle
 from .search import NoLimitCycle, limit_cycle
 from .section_map import Point as SectionPoint
 from .section_map import return_with_jacobian, sliding_state
@@ -56,13 +57,15 @@ def continue_cycle(
 
     - `scene`; `parameter`, the name of any scalar parameter of it under its final load, such as "mu" or "belt_speed".
     - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own lies between.
-    - `start`: as in `limit_cycle`; a `LimitCycle` may be an unstable one.
+    - `start`: as in `limit_cycle`; a `LimitCycle` may be an unstable one. Without it, the scene's limit cycle, or its saddle
+      cycle where that is a torus.
     - `points`: the most cycles that are computed each way.
     - `derivatives`: whether special points are differentiated in all parameters.
 
     **Returns:** a dataset over `point`, in the order along the branch:
 
     - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
+    - `sliding_stable`, whether steady sliding is stable there;
     - `multipliers` over `multiplier`, largest first, without the one of the cycle's own direction;
     - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
     - `special`: what is special about a point, or nothing: "fold", "period doubling", "Neimark–Sacker", or how the contact
@@ -91,6 +94,9 @@ def continue_cycle(
     arguments.whole_number("points", points, minimum=2)
     arguments.truth("derivatives", derivatives)
     cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
+    if cycle.kind != "periodic" and start is None:
+        # On the way round a fold the branch of the saddle comes to the cycle that has become a torus.
+        cycle = saddle_cycle(final, cycle)
     if cycle.kind != "periodic":
         raise NoLimitCycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
@@ -163,9 +169,10 @@ def _checked_bounds(bounds) -> tuple[float, float]:
 
 def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
     size = 2 * family.scene.structure.size
-    states, status, direction, amplitude = [], [], [], []
+    states, status, direction, amplitude, slides = [], [], [], [], []
     for point in points:
         scene = family.at(point.place.parameter)
+        slides.append(bool(sliding_rates(scene)[0].real < 0))
         rest = np.asarray(_equilibrium(scene))
         at = None if point.real is None else on_section(scene, family.stepper, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
@@ -184,6 +191,7 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
             "amplitude": ("point", amplitude),
             "multipliers": (("point", "multiplier"), multipliers),
             "stable": ("point", largest < 1 - MARGIN),
+            "sliding_stable": ("point", slides),
             "word": ("point", [word_of(point.place.phases) for point in points]),
             "special": ("point", [point.name for point in points]),
             "state": (("point", "coordinate"), np.stack(states)),

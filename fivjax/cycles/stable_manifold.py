@@ -174,4 +174,9 @@ def _derivatives(
     of_saddle = returned(scene, stepper, directions, saddle.closed.point, saddle.closed.crossings)
     moved = (weights * of_saddle.y_parameter[:, saddle.closed.crossings - 1]) @ saddle.left / (1 - saddle.multiplier)
     value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
-    return {name: float(-value[k] / value[0]) for k, name in enumerate(every) if name != "p"}
+    found = {name: float(-value[k] / value[0]) for k, name in enumerate(every) if name != "p"}
+    if float(np.asarray(scene.restitution)) == 0 and "restitution" in found:
+        # The least rebound is a flight that the derivative of no rebound does not see. What the impact then presses more, the
+        # flight and the next impact press less: to first order nothing changes.
+        found["restitution"] = 0.0
+    return found

@@ -2,6 +2,7 @@
 
 from . import energy as energy
 from . import linear as linear
+from .branches import branch as branch
 from .contact_status import STATUS_COLOURS as STATUS_COLOURS
 from .contact_status import STATUS_NAMES as STATUS_NAMES
 from .contact_status import shade_status as shade_status

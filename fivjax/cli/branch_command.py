@@ -1,0 +1,68 @@
+"""`fivjax branch`: the bifurcation diagram of a scene's limit cycles."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import fivjax as fj
+
+from .options import SceneOptions
+from .outputs import Failure, Overwrite, output_paths, say, waiting
+from .parsing import axis, bound
+
+
+@dataclasses.dataclass(frozen=True)
+class Branch:
+    """Limit cycles, stable and unstable, over a parameter, and where they begin and end. Writes OUT.nc and OUT.png."""
+
+    over: Annotated[str, tyro.conf.arg(metavar="NAME=LOW:HIGH")] = "mu=0.02:0.3"
+    """parameter, and how far it is followed; the scene's own value lies between"""
+    each: Annotated[str | None, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = None
+    """one branch for each value of another parameter; writes OUT-1.nc, OUT-2.nc, …"""
+    map: Annotated[str | None, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = None
+    """a map of that parameter upwards, over the same range to the right, is drawn beside; writes OUT-map.nc"""
+    points: int = 400
+    """the most cycles that are computed each way"""
+    out: Path = Path("branch")
+    """files to write, without suffix"""
+    overwrite: Overwrite = False
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+
+    def run(self) -> None:
+        import numpy as np
+
+        name, bounds = bound(self.over)
+        scene = self.scene.scene()
+        other, values = (None, [None]) if self.each is None else axis(self.each)
+        endings = [".nc"] if other is None else [f"-{k + 1}.nc" for k in range(len(values))]
+        endings += [] if self.map is None else ["-map.nc"]
+        *data, picture = output_paths(self.out, self.overwrite, *endings, ".png")
+        upwards = None if self.map is None else axis(self.map)
+        branches = {}
+        for value in values:
+            label = "" if other is None else f"{other} = {value:g}"
+            here = scene if other is None else scene.replace(**{other: value})
+            try:
+                with waiting(f"branch {label}: compiling and following"):
+                    branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
+            except fj.NoLimitCycle as none:
+                raise Failure(f"{label + ': ' if label else ''}{none}") from none
+        for path, found in zip(data, branches.values(), strict=False):
+            fj.save(found, path)
+        beside = None
+        if upwards is not None:
+            low = max(bounds[0], 1e-9) if name == "mu" else bounds[0]
+            beside = fj.bistability_map(
+                scene, **{name: np.linspace(low, bounds[1], len(upwards[1])), upwards[0]: upwards[1]}
+            )
+            fj.save(beside, data[-1])
+        fj.save_figure(fj.plot.branch(branches, beside=beside), picture)
+        for label, found in branches.items():
+            print(
+                f"{label + ': ' if label else ''}{found.sizes['point']} cycles. {found.attrs['begins']} {found.attrs['ends']}"
+            )
+            for point in np.flatnonzero(found["special"].values != ""):
+                print(f"  {name} = {float(found['parameter'][point]):.10g}: {found['special'].values[point]}")
+        say(*data, picture)

@@ -1,0 +1,87 @@
+"""Bifurcation diagrams: amplitudes of limit cycles over a parameter, beside the map of the same parameter."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+
+from .maps import bistability
+from .style import BLACK, COLOURS, axis_label, check_dataset, legend_above, new_figure
+
+CALL = "fj.continue_cycle(scene, 'mu', (0.02, 0.3))"
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+
+
+def branch(
+    branches: xr.Dataset | Mapping[str, xr.Dataset],
+    *,
+    beside: xr.Dataset | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """A bifurcation diagram: steady sliding and limit cycles over a parameter; stable ones solid, unstable ones dashed.
+
+    **Arguments:** `branches`, a dataset from `continue_cycle`, or several over the same parameter by label; `beside`, a map
+    from `bistability_map` that is drawn to the right.
+
+    **Returns:** a matplotlib figure.
+
+    **Raises:** `TypeError` for anything but branches, `ValueError` for branches over different parameters.
+    """
+    several = {"": branches} if isinstance(branches, xr.Dataset) else branches
+    if not isinstance(several, Mapping) or not several:
+        check_dataset(branches, ("amplitude",), CALL, "branches")
+    for one in several.values():
+        check_dataset(one, ("parameter", "amplitude", "special", "sliding_stable"), CALL, "branches")
+    names = {str(one.attrs["parameter"]) for one in several.values()}
+    if len(names) > 1:
+        raise ValueError(
+            f"Argument `branches` must be over one parameter, but they are over {', '.join(sorted(names))}."
+        )
+    figure = new_figure(figure, 7.2 if beside is None else 14.4, 4.8)
+    left: Figure | SubFigure = figure
+    if beside is not None:
+        halves = np.ravel(figure.subfigures(1, 2))
+        left = halves[0]
+        bistability(beside, figure=halves[1])
+    axes = left.add_subplot()
+    handles = _special_points(axes, several)
+    for colour, (label, one) in zip(np.resize(COLOURS, len(several)), several.items(), strict=True):
+        _lines(axes, one, str(colour))
+        if label:
+            handles.append(Line2D([], [], color=str(colour), label=label))
+    if any(not np.all(one["stable"]) for one in several.values()):
+        handles += [Line2D([], [], color=BLACK, label="stable"), Line2D([], [], color=BLACK, ls="--", label="unstable")]
+    axes.set(xlabel=axis_label(names.pop()), ylabel="peak tangential speed (m/s)")
+    axes.set_ylim(bottom=-0.02 * axes.get_ylim()[1])
+    legend_above(axes, handles, columns=2)
+    return figure
+
+
+def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
+    x, y, stable = one["parameter"].values, one["amplitude"].values, one["stable"].values
+    known = np.isfinite(y)
+    x, y, stable = x[known], y[known], stable[known]
+    # A line between two points is that of a stable cycle if both are, or a special point lies at one of its ends.
+    for is_stable, style in ((True, "-"), (False, "--")):
+        chosen = stable == is_stable
+        shown = chosen | np.append(False, chosen[:-1]) if is_stable else chosen | np.append(chosen[1:], False)
+        axes.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), color=colour, ls=style, lw=1.3)
+    order = np.argsort(one["parameter"].values, kind="stable")
+    x, slides = one["parameter"].values[order], one["sliding_stable"].values[order]
+    for is_stable, style in ((True, "-"), (False, "--")):
+        axes.plot(np.where(slides == is_stable, x, np.nan), np.zeros(len(x)), color=colour, ls=style, lw=1.3)
+
+
+def _special_points(axes: Axes, several: Mapping[str, xr.Dataset]) -> list[Line2D]:
+    kinds = sorted({str(name) for one in several.values() for name in one["special"].values if name})
+    handles = []
+    for kind, marker in zip(kinds, np.resize(MARKERS, len(kinds)), strict=True):
+        style = {"ls": "none", "marker": str(marker), "ms": 5, "mfc": "white", "mec": BLACK, "zorder": 3}
+        for one in several.values():
+            here = one["special"].values == kind
+            axes.plot(one["parameter"].values[here], one["amplitude"].values[here], **style)
+        handles.append(Line2D([], [], **style, label=kind))
+    return handles
