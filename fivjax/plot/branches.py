@@ -43,7 +43,7 @@ def branch(
     figure = new_figure(figure, 7.2 if beside is None else 14.4, 4.8)
     left: Figure | SubFigure = figure
     if beside is not None:
-        halves = np.ravel(figure.subfigures(1, 2))
+        halves = figure.subfigures(1, 2, squeeze=False)[0]
         left = halves[0]
         bistability(beside, figure=halves[1])
     axes = left.add_subplot()
