@@ -77,6 +77,12 @@ def continue_cycle(
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not hold the scene's value, and whatever
     `limit_cycle` refuses; `NoLimitCycle` where there is no cycle to start from, or it is a torus.
+
+    **Example:**
+
+        >>> branch = fj.continue_cycle(scene.replace(belt_speed=1.0), "mu", (0.2, 0.24))  # doctest: +SLOW
+        >>> bool(branch["stable"].any())
+        True
     """
     import xarray as xr
 
@@ -132,6 +138,12 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
 
     **Raises:** `TypeError` or `ValueError` for what is no branch, or an `i` that is not among its points; `NoLimitCycle`
     where the section is not met, as where the amplitude is next to nothing.
+
+    **Example:**
+
+        >>> branch = fj.continue_cycle(scene.replace(belt_speed=1.0), "mu", (0.2, 0.24))  # doctest: +SLOW
+        >>> fj.cycle_at(branch, 0).kind
+        'periodic'
     """
     try:
         name, row = branch.attrs["parameter"], branch.isel(point=i)

@@ -29,6 +29,12 @@ def read_matrices(path: str | Path) -> dict[str, FileMatrix]:
 
     **Raises:** `ValueError` naming the file with the line, or the matrix, that cannot be used; `ImportError` where pyyeti is
     not installed.
+
+    **Example:**
+
+        >>> np.savez("model.npz", K=np.diag([2e4, 3e4]), M=np.eye(2))
+        >>> sorted(fj.read_matrices("model.npz"))
+        ['K', 'M']
     """
 
     path = Path(path)

@@ -22,6 +22,10 @@ class NodeContact:
     - `tangential`, `normal`: "x", "-z" and so on, a direction 1 to 6, or three numbers along x, y and z (made a unit vector).
     - `against`: the node it touches where that belongs to the structure, too; the displacements are then those of `node` less
       those of `against`. Unless given, it touches the belt.
+
+    **Example:**
+
+        >>> contact = fj.NodeContact(17, tangential="x", normal="-z")
     """
 
     node: int

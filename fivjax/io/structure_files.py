@@ -65,6 +65,13 @@ def read_structure(
 
     **Raises:** `ValueError` as a sentence for files that cannot be used, matrices that do not go together, unknown units,
     nodes or directions.
+
+    **Example:**
+
+        >>> np.savez("model.npz", K=np.diag([2e4, 3e4]), M=np.eye(2))
+        >>> contact = fj.NodeContact(1, tangential="x", normal="z")
+        >>> names = {"stiffness": "K", "mass": "M"}
+        >>> big = fj.read_structure("model.npz", units="SI", names=names, labels=[(1, 1), (1, 3)], contacts=[contact])
     """
     if units not in SYSTEMS:
         raise ValueError(

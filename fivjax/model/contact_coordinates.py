@@ -31,6 +31,11 @@ def in_contact_coordinates(structure: Structure) -> Structure:
 
     New coordinates are called "tangential", "normal", or "tangential_0", "normal_0", … of several contacts; the others keep
     their names.
+
+    **Example:**
+
+        >>> fj.in_contact_coordinates(structure) is structure
+        True
     """
     if structure.contacts_at_coordinates:
         return structure

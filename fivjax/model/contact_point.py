@@ -24,6 +24,13 @@ class ContactPoint:
     coordinate, its name, or a vector `(n,)` without unit.
 
     **Raises:** `TypeError` for anything else. Shapes and names are checked by the `Structure` that the contact belongs to.
+
+    **Example:**
+
+        >>> pads = [fj.ContactPoint(tangential=0, normal=2), fj.ContactPoint(tangential=1, normal=3)]
+        >>> disc = fj.Structure(np.eye(4), np.zeros((4, 4)), np.eye(4), [0.0, 0.0, -1.0, -1.0], contacts=pads)
+        >>> len(disc.contacts)
+        2
     """
 
     tangential: Direction

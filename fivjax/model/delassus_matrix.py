@@ -16,7 +16,13 @@ MOST_CONTACTS = 8
 
 
 class Delassus(NamedTuple):
-    """The blocks of G, in 1/kg: the acceleration of contact i (row) by a unit force at contact j (column)."""
+    """The blocks of G, in 1/kg: the acceleration of contact i (row) by a unit force at contact j (column).
+
+    **Example:**
+
+        >>> fj.delassus(structure).normal.shape
+        (1, 1)
+    """
 
     tangential: Float[Array | np.ndarray, "c c"]  # G_tt
     coupling: Float[Array | np.ndarray, "c c"]  # G_tn: tangential acceleration by normal forces
@@ -36,7 +42,14 @@ class Delassus(NamedTuple):
 
 @returning_numpy
 def delassus(structure: Structure) -> Delassus:
-    r"""The Delassus matrix of a structure's contacts, $G = W^T M^{-1} W$ with $W = [W_t, W_n]$."""
+    r"""The Delassus matrix of a structure's contacts, $G = W^T M^{-1} W$ with $W = [W_t, W_n]$.
+
+    **Example:**
+
+        >>> G = fj.delassus(structure)
+        >>> round(float(G.normal[0, 0] / abs(G.coupling[0, 0])), 2)  # Painlevé's limit
+        108.49
+    """
     return _delassus(structure)
 
 

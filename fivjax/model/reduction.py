@@ -31,6 +31,8 @@ class Reduction:
     - `basis`: `(n, m)`, displacements of the full structure for each reduced coordinate: `q = basis @ z`.
     - `frequencies`: of the full structure, free of contact and undamped, up to the frequency asked for, in Hz.
     - `reduced_frequencies`: those of the reduced structure beside them, in Hz.
+
+    **Example:** see `fj.craig_bampton`.
     """
 
     structure: Structure
@@ -78,6 +80,17 @@ def craig_bampton(
     **Returns:** a `Reduction`.
 
     **Raises:** `ValueError` for a structure without contacts, not symmetric, or loose where its contacts are held.
+
+    **Example:**
+
+        >>> np.savez("model.npz", K=np.diag([2e4, 3e4, 5e4]), M=np.eye(3))
+        >>> contact = fj.NodeContact(1, tangential="x", normal="z")
+        >>> names = {"stiffness": "K", "mass": "M"}
+        >>> labels = [(1, 1), (1, 3), (2, 1)]
+        >>> big = fj.read_structure(
+        ...     "model.npz", units="SI", names=names, labels=labels, contacts=[contact], load={(1, "z"): -1.0}
+        ... )
+        >>> reduction = fj.craig_bampton(big, up_to=100.0)
     """
     from scipy.sparse.linalg import splu
 

@@ -24,6 +24,15 @@ class SparseStructure:
     - `checks`: what was found about the matrices; print it.
 
     It is made small for simulations and maps by `fj.craig_bampton`, and read by `fj.cea.complex_modes` as it is.
+
+    **Example:**
+
+        >>> np.savez("model.npz", K=np.diag([2e4, 3e4]), M=np.eye(2))
+        >>> contact = fj.NodeContact(1, tangential="x", normal="z")
+        >>> names = {"stiffness": "K", "mass": "M"}
+        >>> big = fj.read_structure("model.npz", units="SI", names=names, labels=[(1, 1), (1, 3)], contacts=[contact])
+        >>> big.size
+        2
     """
 
     mass: "sparse.csr_array"
