@@ -1,6 +1,8 @@
 """What is published: versions, addresses and what to cite are said once, or alike wherever they are said again."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -43,6 +45,14 @@ def test_what_to_cite_is_the_same_everywhere():
 def test_a_type_checker_is_told_to_look():
     """Without this file a user's checker takes everything here for `Any`."""
     assert (Path(fj.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.slow
+def test_a_user_s_file_is_clean_to_a_type_checker():
+    """Rejects a public name whose type a checker cannot see, or sees wrongly."""
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, str(ROOT / "tests" / "typed_user.py")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "tests")
+    assert done.returncode == 0, done.stdout
 
 
 def test_the_readme_can_be_shown_anywhere():

@@ -65,7 +65,7 @@ def bistability_map(
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
-    tangential speed on the final orbit in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
+    tangential speed on its attractor in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
     With an axis p, `p_crit_low` and `p_crit_high` over the others are the two kicks on it between which the limit cycle
     first appears, proved to slide and proved to end on it, and `p_crit` is their middle, NaN where undecided kicks lie
     between; `critical_perturbation` narrows that down. With an axis mu, the attribute `mu_crit` is the critical friction

@@ -146,7 +146,7 @@ class Coulomb(AbstractFriction):
         return self.mu if self.mu_static is None else self.mu_static
 
     def check(self) -> None:
-        """The constructor has."""
+        """Nothing is left to check: the constructor has."""
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu
@@ -187,7 +187,7 @@ class ExponentialDecay(AbstractFriction):
         return self.mu_static
 
     def check(self) -> None:
-        """The constructor has."""
+        """Nothing is left to check: the constructor has."""
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)

@@ -108,7 +108,7 @@ class ConstantLoad(AbstractLoad):
         return self.force
 
     def check(self) -> None:
-        """It is made so."""
+        """Nothing is left to check: it keeps its promises by the way it is made."""
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         return self.force
@@ -151,7 +151,7 @@ class Pulse(AbstractLoad):
         return self.force
 
     def check(self) -> None:
-        """It is made so."""
+        """Nothing is left to check: it keeps its promises by the way it is made."""
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         kicked = (t >= self.start) & (t < self.start + self.duration)

@@ -34,7 +34,8 @@ class Scene(eqx.Module):
     - `belt_speed`: in m/s; sliding equilibrium needs one that is not zero. One number, or one for each contact.
     - `load`: `ConstantLoad` or `Pulse`.
     - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1. One number, or one for each contact.
-    - `impact_law`: "coulomb", "frictionless" or "reset" (see `contact.impact`).
+    - `impact_law`: what happens where the gap closes: "coulomb" (an impulse with Coulomb friction), "frictionless" (an impulse
+      along the normal alone) or "reset" (the gap stops closing, all other velocities stay).
 
     **Raises:** `TypeError` or `ValueError`, as a sentence, for parts of the wrong kind or values out of range.
 
