@@ -3,6 +3,8 @@
 All fast tests share one compiled program: two contacts at the same places of six coordinates, lists of Coulomb laws, a pulse.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import several_contacts_reference as reference
@@ -214,3 +216,42 @@ def test_contacts_along_vectors_are_those_at_coordinates():
     assert np.abs(again.slip_velocity - run.slip_velocity).max() < 1e-10
     assert np.abs(again.gap - run.gap).max() < 1e-10
     assert np.array_equal(again.status, run.status)
+
+
+def velocities(structure, q, v, t1):
+    """Final velocities as a function of a share that contact 0 alone has in its start, and of friction."""
+
+    def of(x):
+        start = jnp.concatenate([q, v.at[0].add(x[0]).at[1].add(x[1])])
+        scene = scene_like(structure, x[2])
+        return fj.simulate(scene, t1, t1, y0=start, derivatives="forward").velocity[-1]
+
+    return of
+
+
+def scene_like(structure, more):
+    laws = [fj.Coulomb(0.2 + more), fj.Coulomb(0.2)]
+    return fj.Scene(structure, laws, np.array([3.0, 3.0]), fj.Pulse(100.0, 2.0), np.zeros(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shares", [(1.0, 1.0), (1.0, 1.0 + 1e-7)], ids=["simultaneous", "neighbouring"])
+def test_derivatives_through_events_of_two_contacts_that_fall_together(shares):
+    """Two oscillators, coupled by a spring alone, whose events fall on one instant or next to it: the derivative in what only
+    one of them feels must not move the other's events. Against central differences of the run itself."""
+    with jax.enable_x64(True):
+        pair = copies(2, shares=np.array(shares))
+        mass, damping, stiffness, load = (np.array(matrix) for matrix in pair.matrices)
+        stiffness[np.ix_([1, 4], [1, 4])] += 2e3 * np.array([[1, -1], [-1, 1]])
+        structure = fj.Structure(mass, damping, stiffness, load, contacts=pair.contacts)
+        q = jnp.asarray(fj.sliding_equilibrium(scene_like(structure, 0.0)))
+        run = fj.simulate(scene_like(structure, 0.0), 0.2, 0.01, energy=True)
+        assert int(run.energy.ledger.events[-1]) >= 8
+        of = jax.jit(velocities(structure, q, jnp.zeros(6), 0.2))
+        forward = np.asarray(jax.jit(jax.jacfwd(of))(jnp.zeros(3)))
+        for k, step in enumerate((1e-6, 1e-6, 1e-7)):
+            e = jnp.zeros(3).at[k].set(step)
+            # Of fourth order.
+            near, far = of(e) - of(-e), of(2 * e) - of(-2 * e)
+            difference = np.asarray((8 * near - far) / (12 * step))
+            assert np.abs(forward[:, k] - difference).max() < 1e-7 * np.abs(difference).max()
