@@ -48,4 +48,6 @@ if __name__ == "__main__":
         if count > 1:
             for name, coupling in (("uncoupled", 0.0), ("coupled", 0.004)):
                 found = cost(count, mass_coupling=coupling)
-                print(f"{count} contacts, {name}: {1e3 * found:.3f} ms per cycle, {found / one:.1f} times one", flush=True)
+                print(
+                    f"{count} contacts, {name}: {1e3 * found:.3f} ms per cycle, {found / one:.1f} times one", flush=True
+                )

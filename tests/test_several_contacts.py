@@ -218,6 +218,48 @@ def test_contacts_along_vectors_are_those_at_coordinates():
     assert np.array_equal(again.status, run.status)
 
 
+def test_a_run_of_several_contacts_is_saved_and_drawn_with_one_panel_each(tmp_path):
+    """Status, forces and ledger lines keep their contact in a file, and a picture shades each with its own status."""
+    scene, _ = mirrored()
+    run = fj.simulate(scene, 0.4, 0.01, energy=True)
+    data = run.to_dataset()
+    assert data["status"].dims == data["normal_force"].dims == ("t", "contact")
+    assert np.allclose(data["stick_work_0"] + data["stick_work_1"], data["stick_work"], atol=1e-12)
+    assert np.allclose(data["impact_0"] + data["impact_1"], data["impact_loss"], atol=1e-12)
+    fj.save(run, tmp_path / "run.nc")
+    again = fj.Trajectory.from_dataset(fj.open(tmp_path / "run.nc"))
+    assert np.array_equal(again.status, run.status)
+    assert again.scene.structure.places == scene.structure.places
+    assert len(fj.plot.response(run).axes) == 2
+
+
+@pytest.mark.parametrize("act", [
+    lambda scene: fj.bistability_map(scene, mu_0=[0.1, 0.2], p=[1.0, 2.0]),
+    fj.limit_cycle,
+    lambda scene: fj.derivatives(lambda run: run.velocity[-1, 0], scene, ["mu_0"]),
+    fj.explorer,
+], ids=["map", "limit cycle", "derivatives", "explorer"])  # fmt: skip
+def test_what_takes_one_contact_says_so(act):
+    """A sentence, before anything is compiled, and not a broadcast that goes through by chance."""
+    with pytest.raises(ValueError, match=r"one contact, but this one has 2\."):
+        act(scene_of(copies(2)))
+
+
+def test_friction_beyond_painleve_is_refused_for_several_contacts():
+    """Two copies are refused from the limit of one on, and coupled ones where some principal minor of G_nn + G_nt D is not
+    positive."""
+    steep = fj.belt_oscillator(theta=0.8)
+    limit = float(fj.painleve_friction(steep))
+    pair = copies(2, steep)
+    fj.simulate(scene_of(pair, mu=0.3, force=1.0), 1e-3, 1e-3, y0=np.r_[0, 0, 1.0, 0, 0, 1.0, np.zeros(6)])
+    with pytest.raises(ValueError, match="P-matrix"):
+        fj.simulate(scene_of(pair, mu=[0.1, 1.01 * limit]), 0.1)
+    with pytest.raises(ValueError, match="follow from the others"):
+        fj.Structure(
+            *copies(2).matrices, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, np.eye(6)[2] + np.eye(6)[0])]
+        )
+
+
 def velocities(structure, q, v, t1):
     """Final velocities as a function of a share that contact 0 alone has in its start, and of friction."""
 

@@ -82,6 +82,8 @@ def _refuse_more_axes(dataset: "xr.Dataset") -> None:
 
 
 def _of_trajectory(run: Trajectory, **options) -> Figure:
+    if len(run.scene.structure.contacts) > 1:
+        return plot.response(run, **options)
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A part of a figure has all that a picture function asks of a figure.
@@ -100,8 +102,9 @@ def png(figure: Figure) -> bytes:
 def trajectory_summary(run: Trajectory) -> str:
     """A trajectory as HTML: its picture, and in one line how long, how often and how much."""
     counts = {name: int(np.sum(np.asarray(run.status) == status)) for status, name in plot.STATUS_NAMES.items()}
-    shares = ", ".join(f"{name} {count / len(run.t):.1%}" for name, count in counts.items() if count)
-    peak = float(np.nanmax(np.abs(np.asarray(run.velocity)[:, run.scene.structure.tangential])))
+    shares = ", ".join(f"{name} {count / np.size(run.status):.1%}" for name, count in counts.items() if count)
+    along = np.asarray(run.slip_velocity) + np.asarray(run.scene.belt_speed)
+    peak = float(np.nanmax(np.abs(along)))
     said = f"{run.t[-1]:g} s in {len(run.t)} rows; {shares}; tangential speed up to {peak:.3g} m/s"
     if run.energy is not None:
         said += (

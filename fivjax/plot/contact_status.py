@@ -15,12 +15,14 @@ STATUS_NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH
 KICK_HEIGHT = 0.045
 
 
-def shade_status(axes: Axes, run: Trajectory) -> list[Patch]:
-    """Shade where the contact sticks or is detached; returns legend entries for what occurs."""
+def shade_status(axes: Axes, run: Trajectory, contact: int = 0) -> list[Patch]:
+    """Shade where a contact (by its number, of several) sticks or is detached; returns legend entries for what occurs."""
     handles = []
+    statuses = np.asarray(run.status)
+    statuses = statuses if statuses.ndim == 1 else statuses[:, contact]
     t = np.append(run.t, run.t[-1])
     for status, colour in STATUS_COLOURS.items():
-        is_on = np.asarray(run.status) == status
+        is_on = statuses == status
         if not is_on.any():
             continue
         hatch = "///" if status == Status.STICK else None

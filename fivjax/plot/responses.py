@@ -31,8 +31,10 @@ def response(
 ) -> Figure:
     """One coordinate over time, with the contact's status shaded and the kick marked at the top.
 
+    Of several contacts, a panel for each: its tangential coordinate, with its own status.
+
     **Arguments:** `run`; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, by its number, the
-    tangential one unless given.
+    tangential one unless given. Of several contacts, a coordinate that is given is drawn without any status.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity.
 
@@ -41,15 +43,28 @@ def response(
         >>> figure = fj.plot.response(run, "velocity")
     """
     check_run(run)
-    figure = new_figure(figure, 8.0, 3.6)
-    axes = figure.add_subplot()
-    coordinate = run.scene.structure.tangential if coordinate is None else coordinate
-    axes.plot(run.t, _of(run, quantity)[:, coordinate], color=BLACK, lw=0.8)
-    handles = [*shade_status(axes, run), *mark_kick(axes, run)]
-    what = f"{coordinate_label(run.scene.structure, coordinate)}, {quantity}"
-    axes.set(xlabel="time (s)", ylabel=with_unit(what, QUANTITIES[quantity][1]), xlim=(run.t[0], run.t[-1]))
-    if handles:
-        legend_above(axes, handles)
+    structure = run.scene.structure
+    several = len(structure.contacts) > 1
+    if several and coordinate is None:
+        places = [tangential for tangential, _ in structure.places]
+    else:
+        places = [structure.tangential if coordinate is None else coordinate]
+    figure = new_figure(figure, 8.0, 3.6 if len(places) == 1 else 1.2 + 1.6 * len(places))
+    panels = figure.subplots(len(places), 1, sharex=True, squeeze=False)[:, 0]
+    found = {}
+    for contact, (axes, place) in enumerate(zip(panels, places, strict=True)):
+        if isinstance(place, tuple):
+            values, what = _of(run, quantity) @ np.array(place), "along the belt"
+        else:
+            values, what = _of(run, quantity)[:, place], coordinate_label(structure, place)
+        axes.plot(run.t, values, color=BLACK, lw=0.8)
+        handles = [] if several and coordinate is not None else shade_status(axes, run, contact)
+        found.update({handle.get_label(): handle for handle in [*handles, *mark_kick(axes, run)]})
+        what = f"{what}, {quantity}" if len(places) == 1 else what
+        axes.set(ylabel=with_unit(what, QUANTITIES[quantity][1]), xlim=(run.t[0], run.t[-1]))
+    panels[-1].set_xlabel("time (s)")
+    if found:
+        legend_above(panels[0], list(found.values()))
     return figure
 
 

@@ -53,9 +53,12 @@ def variable_label(variable: xr.DataArray) -> str:
 
 
 def coordinate_label(structure: Structure, index: int) -> str:
-    """The name of a coordinate with what it is to the contact: "tangential x2", "normal y2", "y1"."""
+    """The name of a coordinate with what it is to a contact: "tangential x2", "normal y2", "y1"."""
     name = structure.coordinates[index]
-    role = {structure.tangential: "tangential", structure.normal: "normal"}.get(index)
+    roles = {}
+    for tangential, normal in structure.places:
+        roles.update({tangential: "tangential", normal: "normal"})
+    role = roles.get(index)
     return name if role is None else f"{role} {name}"
 
 

@@ -18,7 +18,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
-from ..model.scene import Scene
+from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
@@ -133,6 +133,7 @@ def _events(ledger: Ledger) -> Array:
 
 def _check(run) -> None:
     arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
+    refuse_several_contacts(run.scene.structure, "A table of cycles or events")
     if run.energy is None:
         raise ValueError(
             "Argument `run` must come with its ledger, but has none; ask for it: `simulate(..., energy=True)`."
