@@ -24,6 +24,7 @@ from .io.references import citation as citation
 from .io.structure_files import read_structure as read_structure
 from .linear import cea as cea
 from .linear import design as design
+from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
 from .maps.threshold import critical_perturbation as critical_perturbation
 from .maps.tradeoff_study import tradeoff as tradeoff

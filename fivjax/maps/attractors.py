@@ -71,6 +71,8 @@ def search(
     """
     members = len(nominating.RELEASES)
     own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
+    # The ensemble's own states, not those of a trajectory.
+    each[:, len(batch.history) :] = np.nan
     running, moving = np.arange(len(own)), np.ones(len(own), bool)
     trajectories = rounds.begun(batch, shared, own, each, np.tile(nominating.RELEASES, len(groups)))
     if near is not None:

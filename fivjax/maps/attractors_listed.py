@@ -1,5 +1,7 @@
 """The table of attractors that a map's trajectories were captured by."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Int
 
@@ -13,13 +15,14 @@ KINDS = np.array(["periodic", "torus"])
 
 
 def attractor_table(
-    values: dict[str, np.ndarray], verdicts: Verdicts
+    values: dict[str, np.ndarray], verdicts: Verdicts, states: Sequence[str] = ()
 ) -> tuple[Int[np.ndarray, " trajectories"], dict[str, np.ndarray]]:
     """Each trajectory's place in the table (-1 where it has none), and the table's columns by name.
 
-    Attractors stand in the order of their groups, those of a group by amplitude. `values` are the trajectories' parameters.
+    Attractors stand in the order of their groups, those of a group by amplitude. `values` are the trajectories' parameters,
+    those of their initial `states` among them.
     """
-    _, group = grouped(values)
+    _, group = grouped(values, states)
     on_one = np.flatnonzero(verdicts.verdict == Verdict.LIMIT_CYCLE)
     columns = np.stack(
         [

@@ -1,6 +1,5 @@
 """Bi-stability maps: many trajectories, one batch run, labelled results."""
 
-import json
 import math
 from importlib import metadata
 from pathlib import Path
@@ -11,16 +10,13 @@ import xarray as xr
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..io.datasets import describe, labelled
+from ..io.datasets import describe
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
-from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from . import store as checkpoint
-from .attractors_listed import attractor_table
-from .axes import add_linear_limit, check_run, checked_axes
-from .crossing import first_crossings
+from .axes import check_run, checked_axes
+from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .results import Verdicts
 
@@ -114,41 +110,7 @@ def bistability_map(
         keep=keep,
         energy=bool(energy),
     )
-    place, table = attractor_table(columns, verdicts)
-    dataset = xr.Dataset(
-        {
-            "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),
-            "amplitude": (tuple(axes), verdicts.amplitude.reshape(shape)),
-            "decided_at": (tuple(axes), verdicts.decided_at.reshape(shape)),
-            "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
-            "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
-            "attractor": (tuple(axes), place.reshape(shape)),
-            **{name: ("attractors", column) for name, column in table.items()},
-            **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},
-        },
-        coords=axes,
-    )
-    if "p" in axes:
-        others = tuple(name for name in axes if name != "p")
-        rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(axes["p"]))
-        crossing, over = first_crossings(axes["p"], rows), [len(axes[name]) for name in others]
-        dataset["p_crit"] = (others, crossing.middle.reshape(over))
-        dataset["p_crit_low"] = (others, crossing.low.reshape(over))
-        dataset["p_crit_high"] = (others, crossing.high.reshape(over))
-    labelled(dataset, scene, method=describe_method(method), t_max=t_max)
-    dataset["verdict"].attrs.update(
-        flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
-        flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
-        meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
-    )
-    add_linear_limit(dataset, scene)
-    first = Verdict(int(verdicts.verdict[0]))
-    if first in FAILURES and np.all(verdicts.verdict == first):
-        dataset.attrs["failure"] = MEANING[first]
-    dataset.attrs["counts"] = json.dumps(
-        {verdict.name.lower(): int(np.sum(verdicts.verdict == verdict)) for verdict in MEANING}
-    )
-    return dataset
+    return map_dataset(scene, method, t_max, axes, columns, verdicts)
 
 
 def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits: dict, axes: dict[str, np.ndarray]):

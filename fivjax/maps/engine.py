@@ -47,6 +47,7 @@ def run_to_verdict(
     keep: Callable[[Verdicts], None] | None = None,
     energy: bool = False,
     attractors: dict[bytes, Attractors] | None = None,
+    states: dict[str, int] | None = None,
 ) -> Verdicts:
     """Follow one trajectory for each row of `values` (equally long arrays of parameters by name) until its verdict.
 
@@ -56,6 +57,9 @@ def run_to_verdict(
     everything that is finished, every few seconds and at the end.
 
     `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
+
+    `states` are names of `values` that are no parameters but displacements or velocities at the beginning, with their places in
+    the state; others begin at the sliding equilibrium.
 
     Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
     """
@@ -85,7 +89,8 @@ def run_to_verdict(
             keep(verdicts)
             kept, new = time.monotonic(), 0
 
-    distinct, group = grouped(values)
+    states = {} if states is None else states
+    distinct, group = grouped(values, tuple(states))
     attractors = {} if attractors is None else attractors
     # The same in all rounds and portions, because products of other shapes round differently.
     in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
@@ -96,8 +101,9 @@ def run_to_verdict(
     batch = Batch(
         scene=scene,
         method=method if energy else in_bulk(method, scene),
-        names=tuple(name for name in values if name not in HISTORY),
+        names=tuple(name for name in values if name not in HISTORY and name not in states),
         history=tuple(name for name in values if name in HISTORY),
+        states=tuple(states.values()),
         energy=energy,
         width=width,
         many=total >= MANY,
@@ -109,7 +115,9 @@ def run_to_verdict(
                 chosen = order[start : start + portion]
                 if np.any(verdicts.pending[chosen]):
                     rows = {name: column[chosen] for name, column in values.items()}
-                    rounds.follow_all(batch, rows, attractors, t_max, max_steps, verdicts, chosen, finished)
+                    rounds.follow_all(
+                        batch, rows, tuple(states), attractors, t_max, max_steps, verdicts, chosen, finished
+                    )
         except KeyboardInterrupt:
             left = int(np.sum(verdicts.pending))
             warnings.warn(

@@ -89,6 +89,19 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
     )
 
 
+def placed(now: Progress, scene: Scene, shared, places: tuple[int, ...], values) -> Progress:
+    """The trajectory with values of its own (not deviations) at these places of its initial state; NaN leaves them."""
+    if not places:
+        return now
+    equilibrium, at = shared.modes.linear.equilibrium, jnp.array(places)
+    y = now.y.at[at].set(jnp.where(jnp.isnan(values), now.y[at], values - equilibrium[at]))
+    contact = physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y)
+    energy = None if now.energy is None else EnergyRecord(open_ledger(Books(scene), y), now.energy.vibration)
+    return eqx.tree_at(
+        lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
+    )
+
+
 def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array, ""]) -> Progress:
     """The trajectory at rest under so many times its final load, which jumps to its final value now, after all kicks; not a
     number, and the trajectory stays as it is.

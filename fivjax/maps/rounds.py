@@ -20,7 +20,7 @@ from .blocks import in_blocks
 from .captures import Cycle, captured, distinct, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
-from .progress import Setting, begin, released, step
+from .progress import Setting, begin, placed, released, step
 from .results import Ended, Verdicts, record
 from .section import ReturnMaps
 from .sharing import Batch, grouped, shared_by, with_values
@@ -38,6 +38,7 @@ LOOKS = 8
 def follow_all(
     batch: Batch,
     values: dict[str, np.ndarray],
+    states: tuple[str, ...],
     known: dict[bytes, Attractors],
     t_max: float,
     max_steps: int,
@@ -47,12 +48,14 @@ def follow_all(
 ) -> None:
     """Follow trajectories that fit in memory together; writes the results of those not run yet at `index`.
 
+    `states` are the names of `values` that are initial displacements and velocities.
+
     `known` has the attractors of groups, by the group's parameters, and gets those that are found; `report` is told how many
     have ended.
     """
-    distinct, group = grouped(values)
+    distinct, group = grouped(values, states)
     shared = shared_by(batch, distinct)
-    columns = np.stack([np.zeros(len(index)), *(values[name] for name in batch.history)], axis=-1)[:, 1:]
+    columns = np.stack([np.zeros(len(index)), *(values[name] for name in (*batch.history, *states))], axis=-1)[:, 1:]
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(verdicts.pending[index])
     trajectories = _begun(batch, shared, group[pending], columns[pending])
@@ -194,7 +197,7 @@ def _begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarr
     releases = np.full(len(group), np.nan) if releases is None else releases
 
     def function(*block):
-        return _begin_block(batch.scene, batch.names, batch.history, batch.energy, *block)
+        return _begin_block(batch.scene, batch.names, batch.history, batch.states, batch.energy, *block)
 
     return in_blocks(function, shared, group, flatten((columns, releases)), batch.width, batch.pool)
 
@@ -210,12 +213,15 @@ def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Fl
 
 
 @compiled
-def _begin_block(scene, names, history, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _begin_block(scene, names, history, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
     def group(shared, columns, releases):
         own = with_values(scene, names, shared.values)
 
         def one(row, release):
-            begun = begin(with_values(own, history, row), shared.mechanics, shared.modes, energy)
+            scene = with_values(own, history, row)
+            begun = placed(
+                begin(scene, shared.mechanics, shared.modes, energy), scene, shared, states, row[len(history) :]
+            )
             return released(own, shared.modes, begun, release)
 
         return jax.vmap(one)(columns, releases)

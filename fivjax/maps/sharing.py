@@ -4,6 +4,7 @@ Trajectories that differ in the history of their load only make a *group*: they 
 matrices of their stepper, the same proofs and the same attractor.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -52,6 +53,7 @@ class Batch(NamedTuple):
     method: AbstractStepper | Windowed
     names: tuple[str, ...]  # parameters that make groups
     history: tuple[str, ...]  # those of the load's history
+    states: tuple[int, ...]  # places of the initial state that trajectories begin with values of their own for
     energy: bool
     width: int  # trajectories of a group side by side
     many: bool  # so many that code which runs faster repays what it takes to compile
@@ -74,9 +76,11 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
-def grouped(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows of parameters that are not history, and the row that each trajectory belongs to."""
-    own = [column for name, column in values.items() if name not in HISTORY]
+def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of parameters that are neither history nor initial `states`, and the row that each trajectory belongs
+    to.
+    """
+    own = [column for name, column in values.items() if name not in HISTORY and name not in states]
     if not own:
         count = len(next(iter(values.values())))
         return np.zeros((1, 0)), np.zeros(count, int)

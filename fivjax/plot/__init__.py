@@ -8,6 +8,7 @@ from .contact_status import STATUS_NAMES as STATUS_NAMES
 from .contact_status import shade_status as shade_status
 from .cycles import cycle as cycle
 from .fits import calibration as calibration
+from .initial_states import basins as basins
 from .maps import SLIDING_SHADE as SLIDING_SHADE
 from .maps import bistability as bistability
 from .responses import comparison as comparison

@@ -26,6 +26,9 @@ from .base import AbstractStepper, Advance, StepperState, Within, advance_betwee
 from .core import follow
 from .section import section_coordinate
 
+# No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
+# Powers of a longer one would be out of range.
+LONGEST_STEP = 1e6
 MOST_ROOT_STEPS = 60
 
 
@@ -158,7 +161,7 @@ class EventExact(AbstractStepper):
         def step(carry):
             y, left, _ = carry
             states, *_ = _series(mechanics, contact, jnp.zeros_like(left), y, self.order_, unit)
-            trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), 1e6) * unit)
+            trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), LONGEST_STEP) * unit)
             last = jnp.abs(left) <= trusted
             part = jnp.where(last, left, jnp.sign(left) * trusted)
             reached, _ = value_and_slope(states, part / unit)
@@ -269,7 +272,7 @@ def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
         # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
         end = jnp.maximum(size(last), tiny)
         steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1)]
-        return jnp.where(moves, jnp.maximum(*steps), jnp.inf)
+        return jnp.where(moves, jnp.minimum(jnp.maximum(*steps), LONGEST_STEP), jnp.inf)
 
     return jnp.minimum(reach(order), reach(order - 1))
 

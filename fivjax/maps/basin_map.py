@@ -1,0 +1,128 @@
+"""Basins of attraction: where initial states lead, on the map's engine."""
+
+import math
+
+import equinox as eqx
+import numpy as np
+import xarray as xr
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..model.load import ConstantLoad
+from ..model.scene import Scene, sliding_equilibrium
+from ..steppers.base import AbstractStepper
+from ..steppers.event_exact import EventExact
+from ..verdicts.verdict import Verdict
+from .axes import check_run, checked_axes
+from .bistability import MOST_TRAJECTORIES
+from .datasets import map_dataset
+from .engine import run_to_verdict
+
+
+@in_double_precision
+def basins(
+    scene: Scene,
+    *,
+    kick: bool = False,
+    method: AbstractStepper | None = None,
+    t_max: float = 20.0,
+    memory: float = 2e9,
+    progress: bool | None = None,
+    **axes,
+) -> xr.Dataset:
+    """Which attractor each initial state leads to: a map over displacements and velocities, and the share of each basin.
+
+        b = fj.basins(scene, x2=np.linspace(-0.02, 0.02, 64), dx2=np.linspace(-6.0, 6.0, 64))
+
+    **Arguments:**
+
+    - `scene`: the scene; coordinates that are not on an axis start at the sliding equilibrium of the load's start.
+    - `**axes`: one-dimensional, strictly increasing values: displacements (m) by the names of `scene.structure.coordinates`,
+      velocities (m/s) by these with a `d` before them; and, where wanted, any parameter of the scene, as in
+      `bistability_map`. Displacements are totals, as `y0` of `simulate` has them, not deviations.
+    - `kick`: whether the load goes through its history; unless wanted, it has its final value from the start.
+    - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
+
+    **Returns:** a dataset like that of `bistability_map`, with `verdict`, `amplitude` and `attractor` over the axes and the
+    table of attractors; beside it, over the attractors, `share` of the states that lead there, with `share_low` and
+    `share_high` (a Wilson interval of 95 %, as if the states were drawn at random), and the same of sliding as
+    `sliding_share`, `sliding_share_low` and `sliding_share_high`. States without a verdict count as none of them.
+
+    **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, no coordinate among them,
+    states below the belt, or on it and moving into it.
+    """
+    method = EventExact() if method is None else method
+    check_run(scene, method, t_max, memory)
+    arguments.truth("kick", kick)
+    states = _places(scene, axes)
+    if not states:
+        names = ", ".join(f"{name}, d{name}" for name in scene.structure.coordinates)
+        raise ValueError(f"A map of basins needs at least one displacement or velocity as its axis: {names}.")
+    if not kick:
+        scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
+    parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
+    axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
+    shape = tuple(len(values) for values in axes.values())
+    if math.prod(shape) > MOST_TRAJECTORIES:
+        raise ValueError(
+            f"The axes ask for {math.prod(shape):.3g} trajectories; the most is {MOST_TRAJECTORIES:.0e}. Give fewer values."
+        )
+    _check_gap(scene, axes)
+    grid = np.meshgrid(*axes.values(), indexing="ij")
+    columns = {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
+    verdicts = run_to_verdict(
+        scene, columns, method, t_max=t_max, memory=memory, progress=progress, label="basins", states=states
+    )
+    dataset = map_dataset(scene, method, t_max, axes, columns, verdicts, tuple(states))
+    for name, place in states.items():
+        n = scene.structure.size
+        what, unit = ("displacement", "m") if place < n else ("velocity", "m/s")
+        dataset[name].attrs.update(long_name=f"initial {what} {scene.structure.coordinates[place % n]}", units=unit)
+    return _with_shares(dataset)
+
+
+def _places(scene: Scene, axes: dict) -> dict[str, int]:
+    """The axes that are displacements or velocities, with their places in the state."""
+    n = scene.structure.size
+    known = {name: k for k, name in enumerate(scene.structure.coordinates)}
+    known |= {f"d{name}": n + k for name, k in known.items()}
+    unknown = [name for name in axes if name not in known and name not in scene.parameters]
+    if unknown:
+        raise ValueError(
+            f"Unknown axis `{unknown[0]}`; the states are {', '.join(known)}, and the scene has "
+            f"{', '.join(sorted(scene.parameters))}."
+        )
+    return {name: known[name] for name in axes if name in known}
+
+
+def _check_gap(scene: Scene, axes: dict[str, np.ndarray]) -> None:
+    name = scene.structure.coordinates[scene.structure.normal]
+    gap = axes.get(name, np.array([float(sliding_equilibrium(scene)[scene.structure.normal])]))
+    rate = axes.get(f"d{name}", np.zeros(1))
+    if gap[0] < 0:
+        raise ValueError(f"Axis `{name}` must not go below the belt, but holds {gap[0]:g} m.")
+    if gap[0] == 0 and rate[0] < 0:
+        raise ValueError(
+            f"Axis `d{name}` must not hold velocities into the belt where the contact is closed, but holds {rate[0]:g} m/s. "
+            f"Start a little above the belt: give `{name}` positive values."
+        )
+
+
+def _with_shares(dataset: xr.Dataset) -> xr.Dataset:
+    """With the share of each basin, and its interval."""
+    total = dataset["verdict"].size
+    reached = np.bincount(dataset["attractor"].values.ravel() + 1, minlength=dataset.sizes["attractors"] + 1)[1:]
+    shares = np.stack(wilson(reached, total))
+    sliding = np.stack(wilson(np.sum(dataset["verdict"].values == Verdict.SLIDING), total))
+    for name, of_attractors, of_sliding in zip(("share", "share_low", "share_high"), shares, sliding, strict=True):
+        dataset[name] = ("attractors", of_attractors, {"long_name": "share of the initial states", "units": "1"})
+        dataset[f"sliding_{name}"] = ((), of_sliding, {"long_name": "share of states that slide", "units": "1"})
+    return dataset
+
+
+def wilson(successes, total: int, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A share and its interval after E. B. Wilson (1927), of 95 % unless `z` says otherwise."""
+    share = np.asarray(successes) / total
+    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+    half = z * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2)) / (1 + z**2 / total)
+    return share, np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0)

@@ -1,0 +1,68 @@
+"""The dataset of a map: verdicts, attractors and what the run was, labelled."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from ..io.datasets import labelled
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+from ..steppers.description import describe_method
+from ..verdicts.verdict import FAILURES, MEANING, Verdict
+from .attractors_listed import attractor_table
+from .axes import add_linear_limit
+from .crossing import first_crossings
+from .results import Verdicts
+
+
+def map_dataset(
+    scene: Scene,
+    method: AbstractStepper,
+    t_max: float,
+    axes: dict[str, np.ndarray],
+    columns: dict[str, np.ndarray],
+    verdicts: Verdicts,
+    states: Sequence[str] = (),
+) -> xr.Dataset:
+    """The labelled dataset of one trajectory for each combination of values on the `axes`.
+
+    `columns` are the trajectories' values by name, in the order of `verdicts`; `states` the names of initial ones.
+    """
+    shape = tuple(len(values) for values in axes.values())
+    place, table = attractor_table(columns, verdicts, states)
+    dataset = xr.Dataset(
+        {
+            "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),
+            "amplitude": (tuple(axes), verdicts.amplitude.reshape(shape)),
+            "decided_at": (tuple(axes), verdicts.decided_at.reshape(shape)),
+            "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
+            "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
+            "attractor": (tuple(axes), place.reshape(shape)),
+            **{name: ("attractors", column) for name, column in table.items()},
+            **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},
+        },
+        coords=axes,
+    )
+    if "p" in axes:
+        others = tuple(name for name in axes if name != "p")
+        rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(axes["p"]))
+        crossing, over = first_crossings(axes["p"], rows), [len(axes[name]) for name in others]
+        dataset["p_crit"] = (others, crossing.middle.reshape(over))
+        dataset["p_crit_low"] = (others, crossing.low.reshape(over))
+        dataset["p_crit_high"] = (others, crossing.high.reshape(over))
+    labelled(dataset, scene, method=describe_method(method), t_max=t_max)
+    dataset["verdict"].attrs.update(
+        flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
+        flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
+        meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
+    )
+    add_linear_limit(dataset, scene)
+    first = Verdict(int(verdicts.verdict[0]))
+    if first in FAILURES and np.all(verdicts.verdict == first):
+        dataset.attrs["failure"] = MEANING[first]
+    dataset.attrs["counts"] = json.dumps(
+        {verdict.name.lower(): int(np.sum(verdicts.verdict == verdict)) for verdict in MEANING}
+    )
+    return dataset
