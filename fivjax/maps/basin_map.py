@@ -50,6 +50,12 @@ def basins(
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, no coordinate among them,
     states below the belt, or on it and moving into it.
+
+    **Example:**
+
+        >>> b = fj.basins(scene, x2=np.linspace(-0.002, 0.002, 6), dx2=[-1.0, 0.0, 1.0])  # doctest: +SLOW
+        >>> bool(b["sliding_share"] + b["share"].sum() <= 1.0)  # doctest: +SLOW
+        True
     """
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)
