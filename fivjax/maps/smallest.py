@@ -1,0 +1,207 @@
+r"""The smallest kick that leads to squeal, between a bound below which every kick is proved to slide and one that was found.
+
+While the contact slides under constant friction the motion is linear. With $A$ its state matrix and $z_∞$ the shift of the
+equilibrium by the load itself, the deviation during a kick is $(p - 1)(1 - e^{At}) z_∞$, and after one of duration $d$ it is
+$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speed and pressing force stay positive, and both
+are affine in the deviation. So with $P(d)$ a bound on a signal over all the future after a kick of $p - 1 = 1$ (the bound that
+verdicts use, `envelope_peak`), every kick with $p - 1$ below the least ratio of margin to $P(d)$, over all durations, slides
+for ever. Between two durations $h$ apart $P$ is at most the larger one plus $h L / 2$, with $L$ a bound on the signal's
+derivative.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
+from ..foundation import arguments
+from ..foundation.compiling import compiled
+from ..foundation.precision import in_double_precision
+from ..linear.linearisation import linear_sliding
+from ..model.load import Pulse
+from ..model.scene import Scene, refuse_several_contacts
+from ..model.sliding import sliding_states
+from ..verdicts.sliding_proof import envelope_peak, sliding_modes
+from .threshold import critical_perturbation
+
+# Durations at which the bound is evaluated, and from which the smallest kick is sought.
+GRID, STARTS = 4096, 24
+# Steps of the search about the best start; derivatives of p_crit that count as zero, relative to p - 1 per duration.
+MOST_STEPS, LEVEL = 24, 1e-9
+OVER = ("p", "duration", "start")
+
+
+class SmallestKick(NamedTuple):
+    """The smallest kick found, and the bound below which every one is proved to slide."""
+
+    p: float  # of the smallest kick found that leads to a limit cycle
+    duration: float  # s
+    certified: float  # every p above 1 and below this slides, whatever the duration within its bounds
+    proved_low: float  # the same duration with this p was proved to slide, and
+    proved_high: float  # with this p to end on a limit cycle
+
+    @property
+    def ratio(self) -> float:
+        """The certified bound's share of what was found, as excesses over 1: one would close the gap."""
+        return (self.certified - 1.0) / (self.p - 1.0)
+
+    def __str__(self) -> str:
+        return (
+            f"smallest kick found: p = {self.p:.9g} for {self.duration:.6g} s leads to a limit cycle\n"
+            f"certified: every kick with p below {self.certified:.9g} slides for ever\n"
+            f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
+        )
+
+
+class NoSquealingKick(ValueError):
+    """No kick in the bounds leads to a limit cycle."""
+
+
+@in_double_precision
+def smallest_kick(
+    scene: Scene, over=("p", "duration"), bounds: dict[str, tuple[float, float]] | None = None, *, p_step: float = 0.01
+) -> SmallestKick:
+    """The smallest p of a kick that leads to a limit cycle, over its duration too, and a certified bound below it.
+
+    **Arguments:**
+
+    - `scene`, whose load is a `Pulse` and whose friction is constant.
+    - `over`: what of the kick is free: "p" always, "duration", and "start", which changes nothing, because steady sliding
+      waits as it is.
+    - `bounds`: by name; p from 1 to 5 and durations up to twice the scene's unless given.
+    - `p_step`: how finely p is scanned, as in `critical_perturbation`. A window of kicks narrower than it is not seen.
+
+    **Returns:** a `SmallestKick`; printing it says the gap.
+
+    **Raises:** `ValueError` for a load without a pulse, friction that varies with speed, sliding that is not stable, and
+    names or bounds that make no sense; `NoSquealingKick` where no kick leads to a limit cycle.
+
+    **Example:**
+
+        >>> kick = fj.smallest_kick(scene)  # doctest: +SLOW
+        >>> bool(1 < kick.certified < kick.p)
+        True
+    """
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
+    refuse_several_contacts(scene.structure, "`smallest_kick`")
+    if not scene.friction.constant:
+        raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
+    free = (over,) if isinstance(over, str) else tuple(over)
+    for name in free:
+        arguments.one_of("over", name, OVER)
+    if "p" not in free:
+        raise ValueError(f'Argument `over` must hold "p", whose smallest value is sought, but is {free!r}.')
+    own = float(scene.load.duration)
+    given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **(bounds or {})}
+    unknown = sorted(set(given) - set(OVER))
+    if unknown:
+        raise ValueError(
+            f"Argument `bounds` must name what of a kick is free ({', '.join(OVER)}), but has {unknown[0]!r}."
+        )
+    for name, pair in given.items():
+        arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
+        arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
+    shortest, longest = given["duration"] if "duration" in free else (own, own)
+    certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
+    starts = np.linspace(shortest, longest, STARTS + 1)[1:] if "duration" in free else np.array([own])
+    scanned = critical_perturbation(
+        scene, duration=starts, p_range=tuple(map(float, given["p"])), p_step=p_step, progress=False
+    )
+    if not np.any(np.isfinite(scanned["p_crit"])):
+        raise NoSquealingKick(
+            f"No kick with p up to {given['p'][1]:g} that was tried leads to a limit cycle. Raise `bounds`, or scan more "
+            f"finely."
+        )
+    best = int(np.nanargmin(scanned["p_crit"]))
+    row = scanned.isel(duration=best)
+    p, duration = float(row["p_crit"]), float(starts[best])
+    if "duration" in free:
+        p, duration = _descended(scene, p, duration, float(shortest), float(longest))
+    at = critical_perturbation(
+        scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
+    ).isel(duration=0)
+    if np.isfinite(at["p_crit"]):
+        row, p = at, float(at["p_crit"])
+    else:
+        duration, p = float(starts[best]), float(row["p_crit"])
+    return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]))
+
+
+def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:
+    """From a critical kick down to a duration at which p_crit is smallest, or to an end of the durations."""
+    saddle: Saddle | None = None
+
+    def critical(d: float, near: float):
+        nonlocal saddle
+        found = critical_kick(scene.replace(duration=d), (near * (1 - 1e-4), near * (1 + 1e-4)), ("duration",), saddle)
+        if found is not None and saddle is None:
+            saddle = saddle_of(found.saddle, np.asarray(scene.structure.weights))
+        return found
+
+    here = critical(duration, p)
+    step = (longest - shortest) / (4 * STARTS)
+    for _ in range(MOST_STEPS):
+        if here is None or abs(here.d_p["duration"]) * duration < LEVEL * (here.p - 1):
+            break
+        slope = here.d_p["duration"]
+        d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6), longest))
+        following = critical(d, here.p + slope * (d - duration)) if d != duration else None
+        if following is None or following.p >= here.p:
+            step *= 0.25
+            if step < 1e-9 * longest:
+                break
+            continue
+        turned = following.d_p["duration"] * slope < 0
+        # Beyond the lowest, the slopes on both sides say where it is.
+        share = abs(slope) / (abs(slope) + abs(following.d_p["duration"]))
+        step = abs(d - duration) * (1 - share if turned else 1.0)
+        duration, here = d, following
+    return (p, duration) if here is None else (here.p, duration)
+
+
+@in_double_precision
+def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
+    """A p - 1 below which no kick of a duration between these (s) has any contact event: it slides for ever."""
+    linear = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], _linear(scene))
+    modes = sliding_modes(linear)
+    if not bool(modes.stable[0]) or not bool(np.asarray(linear.exists)[0]):
+        raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
+    rates, shift = modes.eigenvalues[0], np.asarray(linear.equilibrium)[0]
+    states = np.asarray(sliding_states(scene.structure.size, scene.structure.normal))
+    modal = modes.to_modal[0] @ shift[states].astype(complex)
+    envelope = jax.tree.map(lambda leaf: leaf[0], modes.envelope)
+    least = np.inf
+    signals = ((modes.slip[0], linear.slip_margin), (modes.pressing[0], linear.pressing_margin))
+    for row, (shares, margin) in enumerate(signals):
+        size = float(np.asarray(margin)[0])
+        steady = float(np.real(np.sum(shares * modal)))
+        # The load presses by itself while it lasts: in the end, as much more as there is more of it.
+        direct = size - steady if row == 1 else 0.0
+        slope = float(_peaks(shares * rates * modal, envelope)[0])
+        during = np.linspace(0.0, longest, GRID)
+        response = direct + steady - np.real(np.exp(np.outer(during, rates)) @ (shares * modal))
+        # For p above 1 only what falls ends the contact.
+        peak = np.max(-response) + 0.5 * slope * (during[1] - during[0])
+        after = np.linspace(shortest, longest, GRID if longest > shortest else 1)
+        kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)
+        gap = after[1] - after[0] if len(after) > 1 else 0.0
+        peak = max(peak, float(np.max(_peaks(kicked, envelope))) + 0.5 * slope * gap)
+        least = min(least, size / peak)
+    return float(least)
+
+
+@compiled
+def _linear(scene: Scene):
+    return linear_sliding(scene)
+
+
+@compiled
+def _compiled_peaks(shares, envelope):
+    return jax.vmap(lambda one: envelope_peak(one, envelope))(shares)
+
+
+def _peaks(shares, envelope) -> np.ndarray:
+    return np.asarray(_compiled_peaks(jnp.atleast_2d(jnp.asarray(shares)), jax.tree.map(jnp.asarray, envelope)))
