@@ -77,21 +77,12 @@ def continue_cycle(
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not hold the scene's value, and whatever
     `limit_cycle` refuses; `NoLimitCycle` where there is no cycle to start from, or it is a torus.
-<<<<<<< HEAD
 
     **Example:**
 
         >>> branch = fj.continue_cycle(scene.replace(belt_speed=1.0), "mu", (0.2, 0.24))  # doctest: +SLOW
         >>> bool(branch["stable"].any())
         True
-=======
-    **Example:**
-
-        >>> start = fj.limit_cycle(scene.replace(belt_speed=1.0, mu=0.2))  # doctest: +SLOW
-        >>> branch = fj.continue_cycle(start.scene, "mu", (0.15, 0.25), start)  # doctest: +SLOW
-        >>> print(round(float(branch["parameter"].min()), 6))
-        0.167967
->>>>>>> 16390cf (smallest_kick: the smallest p found, over durations too, and a certified bound below it)
     """
     import xarray as xr
 
