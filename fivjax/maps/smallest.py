@@ -34,7 +34,14 @@ OVER = ("p", "duration", "start")
 
 
 class SmallestKick(NamedTuple):
-    """The smallest kick found, and the bound below which every one is proved to slide."""
+    """The smallest kick found, and the bound below which every one is proved to slide.
+
+    **Example:**
+
+        >>> kick = fj.SmallestKick(p=1.5, duration=0.1, certified=1.25, proved_low=1.49, proved_high=1.51)
+        >>> kick.ratio
+        0.5
+    """
 
     p: float  # of the smallest kick found that leads to a limit cycle
     duration: float  # s
@@ -56,7 +63,16 @@ class SmallestKick(NamedTuple):
 
 
 class NoSquealingKick(ValueError):
-    """No kick in the bounds leads to a limit cycle."""
+    """No kick in the bounds leads to a limit cycle.
+
+    **Example:**
+
+        >>> try:
+        ...     fj.smallest_kick(scene, over="p", bounds={"p": (1.0, 1.02)})  # doctest: +SLOW
+        ... except fj.NoSquealingKick:
+        ...     print("none up to 1.02")
+        none up to 1.02
+    """
 
 
 @in_double_precision
