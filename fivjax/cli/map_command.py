@@ -25,6 +25,8 @@ class Map:
     out: Path = Path("bistability")
     """files to write, without suffix"""
     overwrite: Overwrite = False
+    refine: int = 0
+    """how many times to halve all intervals where neighbours differ"""
     t_max: float = 20.0
     """time after which a trajectory without a verdict is called undecided (s)"""
     memory: float = 2e9
@@ -58,7 +60,13 @@ class Map:
                 # What is said of an interrupted map here is more.
                 warnings.filterwarnings("ignore", message="Interrupted:")
                 dataset = fj.bistability_map(
-                    scene, method=method, t_max=self.t_max, memory=self.memory, resume=unfinished, **axes
+                    scene,
+                    method=method,
+                    t_max=self.t_max,
+                    memory=self.memory,
+                    resume=unfinished,
+                    refine=self.refine,
+                    **axes,
                 )
             if np.any(dataset["verdict"] == fj.Verdict.NOT_RUN):
                 raise KeyboardInterrupt

@@ -17,6 +17,7 @@ from .axes import check_run, checked_axes
 from .bistability import MOST_TRAJECTORIES
 from .datasets import map_dataset
 from .engine import run_to_verdict
+from .shares import wilson
 
 
 @in_double_precision
@@ -124,11 +125,3 @@ def _with_shares(dataset: xr.Dataset) -> xr.Dataset:
         dataset[name] = ("attractors", of_attractors, {"long_name": "share of the initial states", "units": "1"})
         dataset[f"sliding_{name}"] = ((), of_sliding, {"long_name": "share of states that slide", "units": "1"})
     return dataset
-
-
-def wilson(successes, total: int, z: float = 1.959963984540054) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A share and its interval after E. B. Wilson (1927), of 95 % unless `z` says otherwise."""
-    share = np.asarray(successes) / total
-    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
-    half = z * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2)) / (1 + z**2 / total)
-    return share, np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0)

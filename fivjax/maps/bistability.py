@@ -18,7 +18,8 @@ from . import store as checkpoint
 from .axes import check_run, checked_axes
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
-from .results import Verdicts
+from .refinement import audit_note, finer, refined
+from .results import Verdicts, not_run
 
 # Trajectories that a map may have: some 10 GB of results, and days of work.
 MOST_TRAJECTORIES = 10**8
@@ -35,6 +36,8 @@ def bistability_map(
     progress: bool | None = None,
     resume: str | Path | None = None,
     energy: bool = False,
+    refine: int = 0,
+    audit: float = 0.01,
     **axes,
 ) -> xr.Dataset:
     """Where a scene returns to sliding after its kick, and where it ends on a limit cycle; one batch run.
@@ -58,6 +61,14 @@ def bistability_map(
       lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
       error of the balance on the way, with `energy_exchanged` (the sizes of the works and the loss, net of each line) to
       measure it against: 1e-8 of it at most, but for one trajectory in a thousand. It makes a map some ten times slower.
+
+    - `refine`: how many times to halve the intervals of all axes, but only where neighbours differ in verdict or attractor. An
+      axis of n values becomes one of `(n - 1) * 2**refine + 1`; places that are not computed take what the place before them
+      on the coarser grid has, and the variable `computed` says which these are. What lies between the coarse grid's
+      places, and touches none, is missed.
+    - `audit`: the share of the places not computed that are computed all the same, at random, to count how many of them are
+      wrong: the attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its interval of 95 %, `audit_rate_low` and
+      `audit_rate_high`.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
@@ -85,7 +96,9 @@ def bistability_map(
             "A map needs at least one axis, such as `mu=np.linspace(0.05, 0.228, 64)`; the scene has: "
             f"{', '.join(sorted(scene.parameters))}."
         )
-    axes = checked_axes(scene, axes)
+    arguments.whole_number("refine", refine, minimum=0)
+    arguments.real_number("audit", audit, minimum=0, maximum=1)
+    axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
     shape = tuple(len(values) for values in axes.values())
     if math.prod(shape) > MOST_TRAJECTORIES:
         raise ValueError(
@@ -93,24 +106,39 @@ def bistability_map(
             f"{MOST_TRAJECTORIES:.0e}. Give fewer values, or make several maps."
         )
     grid = np.meshgrid(*axes.values(), indexing="ij")
-    known, keep = _kept(
-        resume, scene, method, {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}, axes
-    )
     columns = {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
-    verdicts = run_to_verdict(
-        scene,
-        columns,
-        method,
-        t_max=t_max,
-        memory=memory,
-        max_steps=max_steps,
-        progress=progress,
-        label="map",
-        known=known,
-        keep=keep,
-        energy=bool(energy),
-    )
-    return map_dataset(scene, method, t_max, axes, columns, verdicts)
+    limits = {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
+    limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
+    known, keep = _kept(resume, scene, method, limits, axes)
+    limited = {"t_max": t_max, "memory": memory, "max_steps": max_steps, "progress": progress, "energy": bool(energy)}
+    if not refine:
+        verdicts = run_to_verdict(scene, columns, method, label="map", known=known, keep=keep, **limited)
+        return map_dataset(scene, method, t_max, axes, columns, verdicts)
+    verdicts = not_run(math.prod(shape), bool(energy)) if known is None else known
+    found: dict = {}  # attractors, which another level need not find anew
+
+    def run(places: np.ndarray, what: str) -> None:
+        def write(part: Verdicts) -> None:
+            for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(part), strict=True):
+                whole[places] = own
+
+        def keep_all(part: Verdicts) -> None:
+            write(part)
+            if keep is not None:
+                keep(verdicts)
+
+        own = {name: column[places] for name, column in columns.items()}
+        mine = jax.tree.map(lambda leaf: leaf[places], verdicts)
+        write(
+            run_to_verdict(
+                scene, own, method, label=f"map, {what}", known=mine, keep=keep_all, attractors=found, **limited
+            )
+        )
+
+    source, checked = refined(shape, refine, audit, verdicts, run)
+    dataset = map_dataset(scene, method, t_max, axes, columns, verdicts, source=source)
+    dataset.attrs.update(audit_note(checked))
+    return dataset
 
 
 def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits: dict, axes: dict[str, np.ndarray]):

@@ -3,8 +3,10 @@
 import json
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 import xarray as xr
+from jaxtyping import Int
 
 from ..io.datasets import labelled
 from ..model.scene import Scene
@@ -25,13 +27,20 @@ def map_dataset(
     columns: dict[str, np.ndarray],
     verdicts: Verdicts,
     states: Sequence[str] = (),
+    source: Int[np.ndarray, " trajectories"] | None = None,
 ) -> xr.Dataset:
     """The labelled dataset of one trajectory for each combination of values on the `axes`.
 
-    `columns` are the trajectories' values by name, in the order of `verdicts`; `states` the names of initial ones.
+    `columns` are the trajectories' values by name, in the order of `verdicts`; `states` the names of initial ones;
+    `source` of each the one whose result it takes, where not all were computed.
     """
     shape = tuple(len(values) for values in axes.values())
     place, table = attractor_table(columns, verdicts, states)
+    computed = {}
+    if source is not None:
+        own = source == np.arange(len(source))
+        computed["computed"] = (tuple(axes), own.reshape(shape), {"long_name": "whether it was computed", "units": "1"})
+        place, verdicts = place[source], jax.tree.map(lambda leaf: leaf[source], verdicts)
     dataset = xr.Dataset(
         {
             "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),
@@ -40,6 +49,7 @@ def map_dataset(
             "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
             "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
             "attractor": (tuple(axes), place.reshape(shape)),
+            **computed,
             **{name: ("attractors", column) for name, column in table.items()},
             **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},
         },

@@ -1,0 +1,129 @@
+"""Adaptive maps: a coarse grid, halved again and again where neighbours differ, and checked at random elsewhere."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..verdicts.verdict import Verdict
+from .results import Verdicts
+from .shares import wilson
+
+# Limit cycles of neighbours whose amplitudes differ by more than this factor are taken for different attractors.
+JUMP = 1.1
+
+# Runs trajectories, by their places on the fine grid, and writes what they come to into the verdicts of the whole grid.
+Run = Callable[[Int[np.ndarray, " r"], str], None]
+
+
+class Audit(NamedTuple):
+    """Cells that were not to be computed, and were: how many, and how many of them had another verdict than was assumed."""
+
+    cells: int
+    wrong: int
+
+
+def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
+    """An axis with each of its intervals halved so many times."""
+    parts = 2**halvings
+    share = np.arange(parts) / parts
+    inside = values[:-1, None] + share * np.diff(values)[:, None]
+    return np.append(inside.ravel(), values[-1])
+
+
+def refined(
+    shape: tuple[int, ...], halvings: int, audit: float, verdicts: Verdicts, run: Run
+) -> tuple[Int[np.ndarray, " cells"], Audit]:
+    """Computes some places of a grid of this shape; returns of each place the one whose result it takes, and the audit.
+
+    The coarse grid is every `2**halvings`-th value of each axis. In each halving those of the new places are computed that
+    lie in a cell, or next to one, at whose corners the verdict or the attractor differs. The others take what the corner before
+    them has; a computed place takes its own. Of those that are never computed, a share `audit` is computed in the end, and
+    counted. After an interrupt nothing more is computed, and the finer places are their own.
+    """
+    places = np.arange(np.prod(shape)).reshape(shape)
+    source = places.ravel().copy()
+
+    def every(step: int) -> tuple[slice, ...]:
+        return tuple(slice(None, None, step) for _ in shape)
+
+    def compute(which: np.ndarray, what: str) -> bool:
+        """Whether they were all followed to their ends: an interrupt leaves some."""
+        if which.size:
+            run(which, what)
+        return not np.any(verdicts.pending[which])
+
+    step = 2**halvings
+    going = compute(places[every(step)].ravel(), "coarse grid")
+    for level in range(1, halvings + 1):
+        if not going:
+            return source, Audit(0, 0)
+        corners = places[every(step)]
+        step //= 2
+        new = places[every(step)]
+        wanted = _near_differences(_differ(verdicts, source[corners]), new.shape)
+        rest = ~wanted
+        wanted[every(2)] = rest[every(2)] = False
+        before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
+        source[new[rest]] = source[before[rest]]
+        going = compute(new[wanted], f"halving {level} of {halvings}")
+    others = np.flatnonzero(source != places.ravel())
+    count = min(len(others), int(np.ceil(audit * len(others)))) if going else 0
+    chosen = np.sort(np.random.default_rng(0).choice(others, count, replace=False)) if count else others[:0]
+    compute(chosen, "audit")
+    chosen = chosen[~verdicts.pending[chosen]]
+    wrong = verdicts.verdict[chosen] != verdicts.verdict[source[chosen]]
+    source[chosen] = chosen
+    return source, Audit(len(chosen), int(wrong.sum()))
+
+
+def audit_note(audit: Audit) -> dict[str, float | int]:
+    """The audit as attributes of a dataset: counts, the rate of wrong cells and its interval of 95 %."""
+    note: dict[str, float | int] = {"audit_cells": audit.cells, "audit_wrong": audit.wrong}
+    if audit.cells:
+        rate, low, high = (float(part) for part in wilson(audit.wrong, audit.cells))
+        note |= {"audit_rate": rate, "audit_rate_low": low, "audit_rate_high": high}
+    return note
+
+
+def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:
+    """Of which cells the corners differ."""
+    verdict, kind = verdicts.verdict[corners], verdicts.attractor_kind[corners]
+    size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
+    low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
+    different = [_over_corners(np.minimum, part) != _over_corners(np.maximum, part) for part in (verdict, kind)]
+    return different[0] | different[1] | (high > JUMP * low)
+
+
+def _over_corners(combine, values: np.ndarray) -> np.ndarray:
+    """Corner values of each cell combined, along each axis that has more than one value."""
+    for axis, length in enumerate(values.shape):
+        if length > 1:
+            first, second = (np.take(values, np.arange(k, length - 1 + k), axis=axis) for k in (0, 1))
+            values = combine(first, second)
+    return values
+
+
+def _near_differences(differ: Bool[np.ndarray, "*cells"], shape: tuple[int, ...]) -> Bool[np.ndarray, "*grid"]:
+    """The places of the halved grid that lie in such a cell, or in one beside it."""
+    for axis, length in enumerate(shape):
+        if length == 1:
+            continue
+        # A ring of cells more: what differs between corners may end a little beyond them.
+        aside = np.zeros_like(np.take(differ, [0], axis=axis))
+        padded = np.concatenate([aside, aside, differ, aside, aside], axis=axis)
+        count = differ.shape[axis]
+        ringed = np.zeros_like(np.concatenate([differ, aside, aside], axis=axis))
+        for k in range(3):
+            ringed |= np.take(padded, np.arange(k, k + count + 2), axis=axis)
+        # Place 2i is the corner between cells i - 1 and i, place 2i + 1 the middle of cell i.
+        corner = np.take(ringed, np.arange(count + 1), axis=axis) | np.take(ringed, np.arange(1, count + 2), axis=axis)
+        middle = np.take(ringed, np.arange(1, count + 1), axis=axis)
+        halved = np.zeros((*differ.shape[:axis], length, *differ.shape[axis + 1 :]), bool)
+        cut = [slice(None)] * differ.ndim
+        for part, start in ((corner, 0), (middle, 1)):
+            cut[axis] = slice(start, None, 2)
+            halved[tuple(cut)] = part
+        differ = halved
+    return differ
