@@ -66,6 +66,7 @@ def test_special_points_have_the_derivatives_that_scaling_demands(branch):
         assert change == pytest.approx(float(slope.sel(of="belt_speed")), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_cycle_at_gives_the_cycle_back(branch):
     for i in (0, len(branch.point) // 2, len(branch.point) - 1):
         cycle = fj.cycle_at(branch, i)

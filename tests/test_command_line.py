@@ -40,7 +40,7 @@ def test_the_module_is_the_program():
 def made_up_map(verdicts):
     """A stand-in for `bistability_map` that finds these verdicts."""
 
-    def make(scene, *, method, t_max, memory, resume, **axes):
+    def make(scene, *, method, t_max, memory, resume, refine, **axes):
         dims = tuple(axes)
         fields = {"verdict": (dims, np.array(verdicts, np.int8)), "amplitude": (dims, np.ones(np.shape(verdicts)))}
         return labelled(xr.Dataset(fields, axes), scene)

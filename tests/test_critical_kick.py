@@ -23,6 +23,7 @@ def critical():
     )
 
 
+@pytest.mark.slow
 def test_both_ends_are_proved_next_to_a_kick_that_is_exact(critical):
     assert list(critical.kind.values) == ["manifold", "manifold"] and not any(critical.why_none.values)
     assert np.all(critical.p_crit_low < critical.p_crit) and np.all(critical.p_crit < critical.p_crit_high)
@@ -30,6 +31,7 @@ def test_both_ends_are_proved_next_to_a_kick_that_is_exact(critical):
     assert np.all(critical.newton_trajectories <= 6)
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_belt_speed_have_closed_forms(critical):
     """Where the saddle only slides and sticks, kicks scale with the belt speed; where it never reaches that, nothing does."""
     by_speed = critical.d_p_crit.sel(parameter="belt_speed").values
@@ -38,6 +40,7 @@ def test_derivatives_in_the_belt_speed_have_closed_forms(critical):
     assert by_speed[1] == pytest.approx(0.0, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_obey_the_scaling_of_time_and_force(critical):
     for row, speed in enumerate((1.0, 5.0)):
         slope = critical.d_p_crit.isel(belt_speed=row)
@@ -52,6 +55,7 @@ def test_derivatives_obey_the_scaling_of_time_and_force(critical):
         assert change == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
 def test_a_derivative_is_the_difference_of_an_independent_solver_s_kicks(critical):
     """The mass on the belt, where lift-off and impact lie on the way to the saddle."""

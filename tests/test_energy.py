@@ -752,6 +752,7 @@ def test_the_command_line_writes_the_ledger(tmp_path, capsys):
     assert "response_energy.png" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_map_keeps_the_ledger_of_each_lane(paper_scene):
     """Against the ledger of single runs, which are tested against the oracle; the residual is an error meter per lane."""
     m = fj.bistability_map(paper_scene, p=[1.1, 1.3], energy=True, progress=False)

@@ -250,6 +250,7 @@ def test_what_takes_one_contact_says_so(act):
         act(scene_of(copies(2)))
 
 
+@pytest.mark.slow
 def test_friction_beyond_painleve_is_refused_for_several_contacts():
     """Two copies are refused from the limit of one on, and coupled ones where some principal minor of G_nn + G_nt D is not
     positive."""

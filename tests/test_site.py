@@ -27,7 +27,7 @@ _spec.loader.exec_module(reference)
 
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "reference"} & set(path.parts))
 # Pages whose code takes seconds; of the others a map or a limit cycle is compiled.
-QUICK = {"cite", "structure", "clusters"}
+QUICK = {"cite", "clusters"}
 
 
 def code_of(path: Path) -> list[str]:
@@ -93,6 +93,7 @@ def run_examples(slow: bool, names) -> None:
     assert not said, "".join(said)
 
 
+@pytest.mark.slow
 def test_examples_in_docstrings_run(names, folder):
     """Rejects an example that has fallen behind the function it stands under."""
     run_examples(False, names)

@@ -54,7 +54,9 @@ class Mechanics(eqx.Module):
         structure, matrices = scene.structure, scene.structure.matrices
         n = structure.size
         self.places = _places(structure)
-        columns = np.eye(n)[:, np.array(self.places).T.ravel()]  # tangential directions, then normal ones
+        columns = jnp.eye(n, dtype=matrices.mass.dtype)[
+            :, np.array(self.places).T.ravel()
+        ]  # tangential directions, then normal ones
         right = jnp.concatenate(
             [-matrices.stiffness, -matrices.damping, matrices.load_direction[:, None], columns], axis=1
         )

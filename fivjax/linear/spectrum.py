@@ -84,8 +84,8 @@ def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Co
 
     **Example:**
 
-        >>> (abs(fj.cea.eigenvalues(structure, 0.2).imag) / (2 * np.pi)).round(1)  # Hz, in pairs
-        array([67.4, 67.4, 68.5, 68.5])
+        >>> (abs(fj.cea.eigenvalues(structure, 0.2).imag) / (2 * np.pi)).round(1).tolist()  # Hz, in pairs
+        [67.4, 67.4, 68.5, 68.5]
     """
     if mu is not None and np.ndim(mu) > 0:
         arguments.instance("system", system, Structure, "a Structure where `mu` is an array")
