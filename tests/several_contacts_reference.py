@@ -37,17 +37,13 @@ class Model:
         return len(self.mu)
 
 
-def _affine(model, states):
-    """Rates, T, N, tangential and normal accelerations as matrices on (q, v, 1), in the given states of the contacts."""
-    n, c = len(model.mass), model.count
-    inverse = np.linalg.inv(model.mass)
-    free = np.hstack([-inverse @ model.stiffness, -inverse @ model.damping, (inverse @ model.load)[:, None]])
-    w = np.hstack([model.tangential, model.normal])
-    g = w.T @ inverse @ w
-    demand, right = np.zeros((2 * c, 2 * c)), np.zeros((2 * c, 2 * n + 1))
+def _forces(model, states, g, before):
+    """T and N (or impulses) of the contacts that stop what would move without them (`before`) as the states demand."""
+    c = model.count
+    demand, right = np.zeros((2 * c, 2 * c)), np.zeros((2 * c, *before.shape[1:]))
     for i, state in enumerate(states):
         if state == STICK:
-            demand[i], right[i] = g[i], -w[:, i] @ free
+            demand[i], right[i] = g[i], -before[i]
         else:
             demand[i, i] = 1.0
             if state != OPEN:
@@ -55,8 +51,19 @@ def _affine(model, states):
         if state == OPEN:
             demand[c + i, c + i] = 1.0
         else:
-            demand[c + i], right[c + i] = g[c + i], -w[:, c + i] @ free
-    forces = np.linalg.solve(demand, right)
+            demand[c + i], right[c + i] = g[c + i], -before[c + i]
+    return np.linalg.solve(demand, right)
+
+
+def _affine(model, states):
+    """Rates, T, N, tangential and normal accelerations as matrices on (q, v, 1), in the given states of the contacts."""
+    n, c = len(model.mass), model.count
+    inverse = np.linalg.inv(model.mass)
+    free = np.hstack([-inverse @ model.stiffness, -inverse @ model.damping, (inverse @ model.load)[:, None]])
+    w = np.hstack([model.tangential, model.normal])
+    g = w.T @ inverse @ w
+    before = np.stack([direction @ free for direction in w.T])
+    forces = _forces(model, states, g, before)
     acceleration = free + inverse @ w @ forces
     velocity = np.hstack([np.zeros((n, n)), np.eye(n), np.zeros((n, 1))])
     rates = np.vstack([velocity, acceleration, np.zeros((1, 2 * n + 1))])
@@ -128,19 +135,7 @@ def _impact(model, z):
     options = [[OPEN] if model.normal[:, i] @ z[:n] > 1e-11 else [STICK, PLUS, MINUS, OPEN] for i in range(c)]
     best, least = None, np.inf
     for states in itertools.product(*options):
-        demand, right = np.zeros((2 * c, 2 * c)), np.zeros(2 * c)
-        for i, state in enumerate(states):
-            if state == STICK:
-                demand[i], right[i] = g[i], -before[i]
-            else:
-                demand[i, i] = 1.0
-                if state != OPEN:
-                    demand[i, c + i] = -model.mu[i] if state == PLUS else model.mu[i]
-            if state == OPEN:
-                demand[c + i, c + i] = 1.0
-            else:
-                demand[c + i], right[c + i] = g[c + i], -before[c + i]
-        impulse = np.linalg.solve(demand, right)
+        impulse = _forces(model, states, g, before)
         after = before + g @ impulse
         worst = 0.0
         for i, state in enumerate(states):

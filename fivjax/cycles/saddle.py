@@ -16,8 +16,9 @@ from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, slidi
 from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
-from .search import MOST_CROSSINGS, POINTS, SIDE_BY_SIDE, NoLimitCycle, limit_cycle, states_in_contact
+from .search import MOST_CROSSINGS, NoLimitCycle, limit_cycle, states_in_contact
 from .section_map import points_along
+from .torus import POINTS, SIDE_BY_SIDE
 
 # Looks (of `POINTS` points of the section each) at a trajectory before it is taken for one that stays on the boundary.
 MOST_LOOKS = 60

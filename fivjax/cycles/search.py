@@ -19,14 +19,11 @@ from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
-from .torus import on_torus, torus_of
+from .torus import POINTS, SIDE_BY_SIDE, on_torus, torus_of
 
 # Loads that trajectories are released from, in final loads.
 RELEASES = (1.2, 1.5, 2.0, 3.0, 4.5, 6.0)
-# Trajectories that are followed side by side: one number, so that one program is compiled.
-SIDE_BY_SIDE = 8
-# Points of the section between two looks at the trajectories, and how many looks they get.
-POINTS = 96
+# How many looks at trajectories are taken, one after each `POINTS` points of the section.
 LOOKS = 40
 # Points of the section in one period, at most, for it to be tried as a periodic motion.
 MOST_CROSSINGS = 12

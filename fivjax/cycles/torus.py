@@ -33,7 +33,7 @@ from .around import seen_around, word
 from .cycle import LimitCycle, under_final_load
 from .section_map import Point, points_along, return_with_jacobian, sliding_state
 
-# Trajectories side by side and points of the section at a time: the numbers that a search has compiled already.
+# Trajectories side by side and points of the section at a time, in a search, too: one program is compiled for all.
 SIDE_BY_SIDE, POINTS = 8, 96
 # Points of the curve, in multiples of `POINTS`.
 CHUNKS = 12

@@ -1,6 +1,7 @@
 """What maps and critical kicks have in common: their axes and arguments, checked, and what their datasets say of the run."""
 
 import itertools
+import math
 
 import numpy as np
 import xarray as xr
@@ -9,6 +10,9 @@ from ..foundation import arguments
 from ..linear.critical import critical_friction
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
+
+# Trajectories that a map may have: some 10 GB of results, and days of work.
+MOST_TRAJECTORIES = 10**8
 
 
 def add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
@@ -33,6 +37,21 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     for corner in itertools.product(*((values[0], values[-1]) for values in checked.values())):
         scene.replace(**dict(zip(checked, corner, strict=True)))
     return checked
+
+
+def grid_columns(axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The values of one trajectory for each combination of those on the axes, by name.
+
+    **Raises:** `ValueError` for more of them than a map may have.
+    """
+    total = math.prod(len(values) for values in axes.values())
+    if total > MOST_TRAJECTORIES:
+        raise ValueError(
+            f"The axes ask for {total:.3g} trajectories, whose results no memory holds; the most is "
+            f"{MOST_TRAJECTORIES:.0e}. Give fewer values, or make several maps."
+        )
+    grid = np.meshgrid(*axes.values(), indexing="ij")
+    return {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
 
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:

@@ -1,7 +1,5 @@
 """Basins of attraction: where initial states lead, on the map's engine."""
 
-import math
-
 import equinox as eqx
 import numpy as np
 import xarray as xr
@@ -13,8 +11,7 @@ from ..model.scene import Scene, sliding_equilibrium
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import check_run, checked_axes
-from .bistability import MOST_TRAJECTORIES
+from .axes import check_run, checked_axes, grid_columns
 from .datasets import map_dataset
 from .engine import run_to_verdict
 from .shares import wilson
@@ -69,14 +66,8 @@ def basins(
         scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
-    shape = tuple(len(values) for values in axes.values())
-    if math.prod(shape) > MOST_TRAJECTORIES:
-        raise ValueError(
-            f"The axes ask for {math.prod(shape):.3g} trajectories; the most is {MOST_TRAJECTORIES:.0e}. Give fewer values."
-        )
+    columns = grid_columns(axes)
     _check_gap(scene, axes)
-    grid = np.meshgrid(*axes.values(), indexing="ij")
-    columns = {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
     verdicts = run_to_verdict(
         scene, columns, method, t_max=t_max, memory=memory, progress=progress, label="basins", states=states
     )

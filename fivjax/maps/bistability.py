@@ -15,14 +15,11 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from . import store as checkpoint
-from .axes import check_run, checked_axes
+from .axes import check_run, checked_axes, grid_columns
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .refinement import audit_note, finer, refined
 from .results import Verdicts, not_run
-
-# Trajectories that a map may have: some 10 GB of results, and days of work.
-MOST_TRAJECTORIES = 10**8
 
 
 @in_double_precision
@@ -100,13 +97,7 @@ def bistability_map(
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
     shape = tuple(len(values) for values in axes.values())
-    if math.prod(shape) > MOST_TRAJECTORIES:
-        raise ValueError(
-            f"The axes ask for {math.prod(shape):.3g} trajectories, whose results no memory holds; the most is "
-            f"{MOST_TRAJECTORIES:.0e}. Give fewer values, or make several maps."
-        )
-    grid = np.meshgrid(*axes.values(), indexing="ij")
-    columns = {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
+    columns = grid_columns(axes)
     limits = {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
     known, keep = _kept(resume, scene, method, limits, axes)

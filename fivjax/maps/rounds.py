@@ -123,9 +123,7 @@ class Basins:
             one = known[keys[g]]
             self.of_group[int(g)] = list(range(len(self.cycles), len(self.cycles) + len(one.cycles)))
             self.cycles += one.cycles
-            if one.torus is not None:
-                self.torus.crossings[g], self.torus.amplitude[g] = one.torus.states, one.torus.amplitude
-                self.torus_period[g] = one.torus.period
+            self._know_torus(g, one)
 
     def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, report) -> None:
         """Finds attractors from where a few trajectories of each group are that have taken long."""
@@ -153,9 +151,13 @@ class Basins:
                 self.batch, self.shared, self.maps, follower, groups[part], given, report, near=near
             )
             for g, one in zip(groups[part], found, strict=True):
-                if one.torus is not None:
-                    self.torus.crossings[g], self.torus.amplitude[g] = one.torus.states, one.torus.amplitude
-                    self.torus_period[g] = one.torus.period
+                self._know_torus(g, one)
+
+    def _know_torus(self, g: int, found: Attractors) -> None:
+        """From now on trajectories of the group are compared with its torus, if one was found."""
+        if found.torus is not None:
+            self.torus.crossings[g], self.torus.amplitude[g] = found.torus.states, found.torus.amplitude
+            self.torus_period[g] = found.torus.period
 
     def entered(self, pending: np.ndarray, now, undecided: np.ndarray) -> np.ndarray:
         """The place in `cycles` of the cycle that each trajectory is captured by, or -1."""
