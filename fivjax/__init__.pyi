@@ -1,5 +1,6 @@
 # The public names and where they stand; `__init__.py` reads this file.
 
+from . import design as design
 from . import plot as plot
 from .calibration.fit import calibrate as calibrate
 from .calibration.result import Calibration as Calibration
@@ -23,7 +24,6 @@ from .io.recordings import Recording as Recording
 from .io.references import citation as citation
 from .io.structure_files import read_structure as read_structure
 from .linear import cea as cea
-from .linear import design as design
 from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
 from .maps.smallest import NoSquealingKick as NoSquealingKick

@@ -21,7 +21,7 @@ FLOORS = (
     ("cycles",),
     ("verdicts",),
     ("maps", "calibration"),
-    ("plot",),
+    ("plot", "design"),
     ("paper", "notebook"),
 )
 LONGEST, MEDIAN = 400, 150

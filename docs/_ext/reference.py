@@ -110,6 +110,7 @@ ROOMS = {
     "steppers": "simulation",
     "simulation": "simulation",
     "linear": "linear",
+    "design": "linear",
     "cycles": "cycles",
     "verdicts": "maps",
     "maps": "maps",

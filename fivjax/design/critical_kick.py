@@ -1,0 +1,233 @@
+r"""A scene that bears a larger kick: the smallest relative change of its parameters that raises p_crit by a given share.
+
+With $r_i = (θ_i - θ_{i,0}) / |θ_{i,0}|$ the changes are those of
+
+$$ \min_r \tfrac12 |r|^2 \quad\text{with}\quad p_\mathrm{crit}(r) = p_\mathrm{target}, $$
+
+within the bounds, found by sequential quadratic programming: in each step p_crit is replaced by its value and its exact derivatives, and p_crit at
+the end of the step is computed anew. A step that does not keep what its derivatives promised is halved.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..linear.design import DesignOutcome
+from ..maps.critical_derivatives import differentiable
+from ..maps.threshold import critical_perturbation
+from ..model.load import Pulse
+from ..model.scene import Scene
+from .least_change import smallest_change
+
+# The target is met within this share above it, and the change is the smallest when a further step moves it by less than this.
+MET, SETTLED = 1e-6, 1e-3
+# A step is taken when it keeps this share of its promise, or ends this near to the target, as a share of the rise.
+KEPT, NEAR, HALVINGS = 0.2, 0.02, 5
+# A step that promises less than this share of what is missing is not tried.
+PROMISING = 1e-2
+# Width of the brackets that Newton's method begins with.
+BRACKET = 1e-4
+
+
+class RaisedCriticalKick(NamedTuple):
+    """A scene with a larger critical kick, what was changed, and p_crit before and after.
+
+    **Example:**
+
+        >>> raised = fj.design.raise_critical_perturbation(  # doctest: +SLOW
+        ...     scene.replace(belt_speed=1.0), by=0.05, free=["belt_speed"], p_range=(1.0, 1.3)
+        ... )
+        >>> round(float(raised.scene.belt_speed), 4)
+        1.5164
+    """
+
+    scene: Scene
+    before: float  # p_crit
+    after: float  # p_crit
+    target: float
+    before_bracket: tuple[float, float]  # kicks proved to slide, and to end on a limit cycle
+    after_bracket: tuple[float, float]  # the same, bracketed anew without derivatives
+    changes: dict[str, tuple[float, float]]  # by parameter: its value before and after
+    outcome: DesignOutcome
+    why: str  # in a sentence, where the target is not reached
+    steps: int  # at how many scenes p_crit was computed
+
+    @property
+    def reached(self) -> bool:
+        """Whether p_crit is the target's, or above."""
+        return self.outcome is DesignOutcome.TARGET_REACHED
+
+    def __str__(self) -> str:
+        low, high = self.after_bracket
+        changes = ", ".join(
+            f"{name} {old:.6g} -> {new:.6g} ({100 * (new / old - 1):+.2f} %)"
+            for name, (old, new) in self.changes.items()
+        )
+        text = (
+            f"{self.outcome.value.capitalize()}: p_crit {self.before:.6g} -> {self.after:.6g} (target {self.target:.6g}) "
+            f"with {changes}; bracketed anew: {low:.6g} slides, {high:.6g} leads to a limit cycle."
+        )
+        return f"{text} {self.why}" if self.why else text
+
+
+@in_double_precision
+def raise_critical_perturbation(
+    scene: Scene,
+    by: float = 0.2,
+    free: Sequence[str] | str = (),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    p_range: tuple[float, float] = (1.0, 5.0),
+    p_step: float = 0.01,
+    steps: int = 20,
+) -> RaisedCriticalKick:
+    """Raise the critical kick by a share of itself, with the smallest relative change of chosen parameters.
+
+        raised = fj.design.raise_critical_perturbation(scene, by=0.1, free=["k1", "k2", "c1", "c2"])
+        print(raised)
+
+    Each step computes p_crit anew, the first crossing in the range, with its derivatives; the end is bracketed anew without
+    them. The search is local: what it finds is the smallest change near the scene.
+
+    **Arguments:**
+
+    - `scene`, whose load is a `Pulse`.
+    - `by`: the share by which p_crit is to rise; 0.2 asks for 1.2 times as much.
+    - `free`: names of the parameters that may change; those of `bounds` unless given.
+    - `bounds`: lowest and highest value by name; from half to twice the scene's own value unless given.
+    - `p_range`, `p_step`: where p_crit is looked for, as in `critical_perturbation`. The range must hold the target.
+    - `steps`: the most scenes at which p_crit is computed.
+
+    **Returns:** a `RaisedCriticalKick`; printing it says what was changed, and whether the target is reached.
+
+    **Raises:** `ValueError` for names that are not free numbers of the scene, for zero ones (they have no relative change),
+    for bounds that do not hold the scene's own value, and where there is no p_crit with derivatives to start from.
+
+    **Example:**
+
+        >>> still = scene.replace(belt_speed=1.0)
+        >>> raised = fj.design.raise_critical_perturbation(still, by=0.02, free=["c2"], p_range=(1.0, 1.3))  # doctest: +SLOW
+        >>> raised.reached  # doctest: +SLOW
+        True
+    """
+    names, start, low, high = _checked(scene, by, free, bounds)
+    arguments.whole_number("steps", steps, minimum=2)
+    size = np.abs(start)
+
+    def at(r: np.ndarray):
+        changed = scene.replace(**dict(zip(names, (float(x) for x in start + r * size), strict=True)))
+        found = critical_perturbation(
+            changed, p_range=p_range, p_step=p_step, tolerance=BRACKET, derivatives=True, progress=False
+        ).isel(belt_speed=0)
+        slopes = np.array([float(found["d_p_crit"].sel(parameter=name)) for name in names]) * size
+        return _Step(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
+
+    here = first = at(np.zeros(len(names)))
+    if not np.all(np.isfinite([here.p, *here.slopes])):
+        raise ValueError(
+            f"The scene has no critical kick with derivatives to start from: {here.why or 'a derivative does not exist'}. "
+            "Change `p_range`, or the scene."
+        )
+    target = (1 + by) * first.p
+    if target >= p_range[1]:
+        raise ValueError(
+            f"Argument `p_range` must hold the target {target:g}, but ends at {p_range[1]:g}. Raise its upper end."
+        )
+    aim, taken, why = target * (1 + 0.5 * MET), 1, ""
+    while taken < steps:
+        ahead = smallest_change(here.slopes, aim - here.p + here.slopes @ here.r, low, high) - here.r
+        met = target <= here.p <= target * (1 + MET)
+        length = np.linalg.norm(ahead)
+        if met and length <= SETTLED * np.linalg.norm(here.r):
+            break
+        promised, missing = here.slopes @ ahead, abs(aim - here.p)
+        if length <= 1e-9 or (not met and abs(promised) < PROMISING * missing):
+            break
+        following, share = None, 1.0
+        for _ in range(HALVINGS):
+            if taken == steps:
+                break
+            tried, taken = at(here.r + share * ahead), taken + 1
+            # Near the target a step along it misses by what curvature does, which the next one mends.
+            allowed = max(
+                (1 - KEPT * share * abs(promised) / max(missing, MET * target)) * missing, NEAR * by * first.p
+            )
+            if np.all(np.isfinite([tried.p, *tried.slopes])) and abs(aim - tried.p) <= allowed:
+                following = tried
+                break
+            why = tried.why
+            share *= 0.5
+        if following is None:
+            break
+        here, why = following, ""
+    return _concluded(scene, first, here, target, names, start, taken, why, p_range, p_step)
+
+
+class _Step(NamedTuple):
+    """A scene on the way, with its critical kick."""
+
+    scene: Scene
+    r: np.ndarray  # relative changes
+    p: float
+    slopes: np.ndarray  # of p in r
+    bracket: tuple[float, float]
+    why: str  # there is no p_crit with derivatives
+
+
+def _bracket(found) -> tuple[float, float]:
+    return float(found["p_crit_low"]), float(found["p_crit_high"])
+
+
+def _concluded(scene, first, last, target, names, start, taken, why, p_range, p_step) -> RaisedCriticalKick:
+    anew = critical_perturbation(last.scene, p_range=p_range, p_step=p_step, progress=False).isel(belt_speed=0)
+    low, high = _bracket(anew)
+    changes = {
+        name: (float(old), float(np.asarray(last.scene.parameters[name])))
+        for name, old in zip(names, start, strict=True)
+    }
+    if not low <= last.p <= high:
+        outcome, why = DesignOutcome.TARGET_NOT_REACHED, "Bracketing anew contradicts the p_crit that was found."
+    elif last.p >= target:
+        outcome, why = DesignOutcome.TARGET_REACHED, ""
+    else:
+        outcome = DesignOutcome.TARGET_NOT_REACHED
+        beyond = f"beyond, {why}" if why else "p_crit rises no further there, or more steps are needed"
+        why = f"The search ended before the target: {beyond}. Widen `bounds`, or free other parameters."
+    return RaisedCriticalKick(
+        last.scene, first.p, last.p, target, first.bracket, (low, high), changes, outcome, why, taken
+    )
+
+
+def _checked(scene: Scene, by, free, bounds):
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p is raised")
+    arguments.real_number("by", by, above=0)
+    bounds = dict(bounds or {})
+    names = tuple((free,) if isinstance(free, str) else free) or tuple(bounds)
+    if not names:
+        raise ValueError('Argument `free` must name at least one parameter, such as ["k1", "c2"].')
+    known = differentiable(scene)
+    for name in (*names, *bounds):
+        arguments.one_of("free", name, known)
+    for name in bounds:
+        if name not in names:
+            raise ValueError(f"Argument `bounds` names `{name}`, which is not free. Add it to `free`, or leave it out.")
+    start = np.array([float(np.asarray(scene.parameters[name])) for name in names])
+    limits = []
+    for name, own in zip(names, start, strict=True):
+        if own == 0:
+            raise ValueError(
+                f"Parameter `{name}` is zero, so a relative change of it has no meaning. Leave it out of `free`."
+            )
+        pair = arguments.numeric_array(f"bounds[{name!r}]", bounds.get(name, sorted((0.5 * own, 2 * own))))
+        if pair.shape != (2,) or not np.all(np.isfinite(pair)) or not pair[0] <= own <= pair[1] or pair[0] == pair[1]:
+            raise ValueError(
+                f"The bounds of `{name}` must be two numbers that hold its own value {own:g}, the lower one first, but are "
+                f"{pair.tolist()}."
+            )
+        limits.append((pair - own) / abs(own))
+    low, high = np.array(limits).T
+    return names, start, low, high
