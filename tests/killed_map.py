@@ -29,11 +29,11 @@ def run(folder: Path, name: str = "none", delay: float = 0.0, cache: Path | None
 
 def main(folder: str, name: str, delay: str) -> int:
     from fivjax import cli
-    from fivjax.maps import bistability as maps
-    from fivjax.maps import engine
+    from fivjax.maps import checkpoint, plan
 
-    engine.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
-    keep = maps.checkpoint.keep
+    checkpoint.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
+    plan.IN_A_JOB = 16
+    keep = checkpoint.keep
     started = []
 
     def keep_and_arm(*args):
@@ -43,7 +43,7 @@ def main(folder: str, name: str, delay: str) -> int:
             started[0].daemon = True
             started[0].start()
 
-    maps.checkpoint.keep = keep_and_arm
+    checkpoint.keep = keep_and_arm
     out = Path(folder) / "map"
     resume = ["--resume"] if out.with_suffix(".unfinished").exists() else []
     return cli.main(["map", *AXES, "--out", str(out), *resume])

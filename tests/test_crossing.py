@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps import bistability, engine, threshold
+from fivjax.maps import bistability, engine, rounds, threshold
 from fivjax.maps.crossing import first_crossings
 from fivjax.maps.results import counted, not_run
 
@@ -123,7 +123,7 @@ def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkey
         verdicts.verdict[index] = 0
         report(len(index))
 
-    monkeypatch.setattr(engine.rounds, "follow_all", two_rounds)
+    monkeypatch.setattr(rounds, "follow_all", two_rounds)
     fj.bistability_map(paper_scene, p=KICKS, progress=True)
     assert "compiling" not in shown.getvalue().split("\r")[-1]
 

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.maps import engine, rounds
+from fivjax.maps import engine, plan, rounds
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
 TABLE_2 = np.array([1.06, 1.11, 1.17, 1.20, 1.20, 1.20, 1.20])
@@ -129,11 +129,11 @@ def test_speed_dependent_friction_has_verdicts_too():
 
 
 def test_trajectories_do_not_know_each_other(paper_scene, monkeypatch):
-    """Neither their order nor the size of blocks and portions may change a verdict; a poisoned one harms no other."""
+    """Neither their order nor the size of jobs may change a verdict; a poisoned one harms no other."""
     axes = {"mu": [0.1, 0.2, 0.227], "p": [1.1, 1.5, 2.0, 3.0]}
     whole = fj.bistability_map(paper_scene, progress=False, **axes)
-    scene_bytes = engine.bytes_per_trajectory(paper_scene, sharing=4)
-    blocks = fj.bistability_map(paper_scene, progress=False, memory=5 * scene_bytes, **axes)
+    monkeypatch.setattr(plan, "IN_A_JOB", 3)
+    blocks = fj.bistability_map(paper_scene, progress=False, **axes)
     for name in ("verdict", "amplitude", "decided_at", "contact_events"):
         np.testing.assert_array_equal(whole[name], blocks[name])
 

@@ -3,13 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fivjax as fj
 from fivjax import contact as physics
 from fivjax.contact import Mechanics, Status
-from fivjax.maps import engine
+from fivjax.maps import engine, plan
 
 # Few and repeatable: every example runs a trajectory. One compilation serves all of a kind.
 FEW = settings(max_examples=12, deadline=None, derandomize=True)
@@ -197,21 +198,22 @@ def test_an_impact_never_creates_energy_against_a_belt_at_rest(case):
 @settings(max_examples=2, deadline=None, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
 def test_batch_order_and_blocks_change_nothing(seed):
-    """Trajectories of a map in any order, and in portions of any size, are the same, bit for bit."""
+    """Trajectories of a map in any order, and in jobs of any size, are the same, bit for bit."""
     rng = np.random.default_rng(seed)
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
     values = {"mu": rng.choice([0.1, 0.2, 0.227], 24), "p": rng.uniform(1.0, 3.0, 24)}
     order = rng.permutation(24)
 
-    def run(values, memory):
-        with jax.enable_x64(True):
+    def run(values, in_a_job=plan.IN_A_JOB):
+        with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(plan, "IN_A_JOB", in_a_job)
             return engine.run_to_verdict(
-                scene, values, fj.EventExact(), t_max=3.0, memory=memory, progress=False, label=""
+                scene, values, fj.EventExact(), t_max=3.0, memory=1e9, progress=False, label=""
             )
 
-    whole = run(values, 1e9)
-    mixed = run({name: column[order] for name, column in values.items()}, 1e9)
-    blocks = run(values, 7 * engine.bytes_per_trajectory(scene, sharing=8))
+    whole = run(values)
+    mixed = run({name: column[order] for name, column in values.items()})
+    blocks = run(values, in_a_job=7)
     for name in ("verdict", "amplitude", "decided_at", "events", "last_event"):
         expected = getattr(whole, name)
         np.testing.assert_array_equal(getattr(mixed, name), expected[order])

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -10,6 +11,7 @@ from ..foundation import arguments
 from ..linear.critical import critical_friction
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
+from .trajectories import Grid
 
 # Trajectories that a map may have: some 10 GB of results, and days of work.
 MOST_TRAJECTORIES = 10**8
@@ -39,8 +41,8 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     return checked
 
 
-def grid_columns(axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The values of one trajectory for each combination of those on the axes, by name.
+def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Grid:
+    """One trajectory for each combination of values on the axes, of which `states` are initial displacements and velocities.
 
     **Raises:** `ValueError` for more of them than a map may have.
     """
@@ -50,8 +52,7 @@ def grid_columns(axes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             f"The axes ask for {total:.3g} trajectories, whose results no memory holds; the most is "
             f"{MOST_TRAJECTORIES:.0e}. Give fewer values, or make several maps."
         )
-    grid = np.meshgrid(*axes.values(), indexing="ij")
-    return {name: values.ravel() for name, values in zip(axes, grid, strict=True)}
+    return Grid(axes, states)
 
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:

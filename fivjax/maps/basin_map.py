@@ -1,5 +1,8 @@
 """Basins of attraction: where initial states lead, on the map's engine."""
 
+import contextlib
+from pathlib import Path
+
 import equinox as eqx
 import numpy as np
 import xarray as xr
@@ -11,9 +14,11 @@ from ..model.scene import Scene, sliding_equilibrium
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import check_run, checked_axes, grid_columns
+from .axes import check_run, checked_axes, checked_grid
 from .datasets import map_dataset
 from .engine import run_to_verdict
+from .executors import check_executor
+from .resuming import keeper_at
 from .shares import wilson
 
 
@@ -26,6 +31,8 @@ def basins(
     t_max: float = 20.0,
     memory: float = 2e9,
     progress: bool | None = None,
+    executor=None,
+    resume: str | Path | None = None,
     **axes,
 ) -> xr.Dataset:
     """Which attractor each initial state leads to: a map over displacements and velocities, and the share of each basin.
@@ -39,7 +46,7 @@ def basins(
       velocities (m/s) by these with a `d` before them; and, where wanted, any parameter of the scene, as in
       `bistability_map`. Displacements are totals, as `y0` of `simulate` has them, not deviations.
     - `kick`: whether the load goes through its history; unless wanted, it has its final value from the start.
-    - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
+    - `method`, `t_max`, `memory`, `progress`, `executor`, `resume`: as in `bistability_map`.
 
     **Returns:** a dataset like that of `bistability_map`, with `verdict`, `amplitude` and `attractor` over the axes and the
     table of attractors; beside it, over the attractors, `share` of the states that lead there, with `share_low` and
@@ -66,12 +73,25 @@ def basins(
         scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
-    columns = grid_columns(axes)
+    grid = checked_grid(axes, tuple(states))
+    check_executor(executor)
     _check_gap(scene, axes)
-    verdicts = run_to_verdict(
-        scene, columns, method, t_max=t_max, memory=memory, progress=progress, label="basins", states=states
-    )
-    dataset = map_dataset(scene, method, t_max, axes, columns, verdicts, tuple(states))
+    keeper = keeper_at(resume, scene, method, grid, {"t_max": float(t_max), "kick": bool(kick)})
+    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
+        verdicts = run_to_verdict(
+            scene,
+            grid,
+            method,
+            t_max=t_max,
+            memory=memory,
+            progress=progress,
+            label="basins",
+            states=states,
+            executor=executor,
+            verdicts=None if keeper is None else keeper.verdicts,
+            keeper=keeper,
+        )
+    dataset = map_dataset(scene, method, t_max, grid, verdicts)
     for name, place in states.items():
         n = scene.structure.size
         what, unit = ("displacement", "m") if place < n else ("velocity", "m/s")

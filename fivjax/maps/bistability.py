@@ -1,25 +1,24 @@
 """Bi-stability maps: many trajectories, one batch run, labelled results."""
 
-import math
-from importlib import metadata
+import contextlib
+import functools
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..io.datasets import describe
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from . import store as checkpoint
-from .axes import check_run, checked_axes, grid_columns
+from .axes import check_run, checked_axes, checked_grid
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
+from .executors import check_executor
 from .refinement import audit_note, finer, refined
-from .results import Verdicts, not_run
+from .results import not_run
+from .resuming import keeper_at
 
 
 @in_double_precision
@@ -35,6 +34,7 @@ def bistability_map(
     energy: bool = False,
     refine: int = 0,
     audit: float = 0.01,
+    executor=None,
     **axes,
 ) -> xr.Dataset:
     """Where a scene returns to sliding after its kick, and where it ends on a limit cycle; one batch run.
@@ -48,12 +48,16 @@ def bistability_map(
       trajectory is run for each combination, from the sliding equilibrium of its own scene.
     - `method`: how to step, `EventExact()` unless given.
     - `t_max`: time after which a trajectory without a verdict is called undecided, in s.
-    - `memory`: how much memory the trajectories under way may take, in bytes.
+    - `memory`: how much memory the jobs that run at a time in this process may take, in bytes; there is one at least.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
-    - `resume`: a file in which finished trajectories are kept while the map runs, every few seconds. If it exists, the
-      map goes on from there: interrupted in whatever way and called again, the same call gives the same map, bit for bit.
-      The file stays; delete it when the map is saved.
+    - `resume`: a file in which finished jobs are kept while the map runs, every few seconds; or a folder named `*.zarr`, for
+      maps of many million trajectories, in which each job is kept at once and which `xarray.open_zarr` reads at any time (extra
+      `fivjax[zarr]`). If it exists, the map goes on from there: interrupted in whatever way and called again, on this
+      machine or another, the same call gives the same map, bit for bit. It stays; delete it when the map is saved.
+    - `executor`: who computes: threads of this process unless given, or anything like `concurrent.futures.ProcessPoolExecutor`
+      (loky, `mpi4py.futures`), a Dask `Client`, or a function that makes one of these. The map is the same, bit for bit. What
+      lost its worker is handed out anew; what kills its worker three times running alone has the verdict -9.
     - `energy`: whether to keep each trajectory's energy ledger up to its verdict (see `fivjax.energy`): the works, the energy
       lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
       error of the balance on the way, with `energy_exchanged` (the sizes of the works and the loss, net of each line) to
@@ -96,63 +100,36 @@ def bistability_map(
     arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
-    shape = tuple(len(values) for values in axes.values())
-    columns = grid_columns(axes)
+    grid = checked_grid(axes)
+    check_executor(executor)
     limits = {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
-    known, keep = _kept(resume, scene, method, limits, axes)
-    limited = {"t_max": t_max, "memory": memory, "max_steps": max_steps, "progress": progress, "energy": bool(energy)}
-    if not refine:
-        verdicts = run_to_verdict(scene, columns, method, label="map", known=known, keep=keep, **limited)
-        return map_dataset(scene, method, t_max, axes, columns, verdicts)
-    verdicts = not_run(math.prod(shape), bool(energy)) if known is None else known
-    found: dict = {}  # attractors, which another level need not find anew
+    keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))
+    run = functools.partial(
+        run_to_verdict,
+        scene,
+        grid,
+        method,
+        t_max=t_max,
+        memory=memory,
+        max_steps=max_steps,
+        progress=progress,
+        energy=bool(energy),
+        executor=executor,
+        keeper=keeper,
+    )
+    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
+        verdicts = None if keeper is None else keeper.verdicts
+        if not refine:
+            verdicts = run(label="map", verdicts=verdicts)
+            return map_dataset(scene, method, t_max, grid, verdicts)
+        verdicts = not_run(grid.total, bool(energy)) if verdicts is None else verdicts
+        found: dict = {}  # attractors, which another level need not find anew
 
-    def run(places: np.ndarray, what: str) -> None:
-        def write(part: Verdicts) -> None:
-            for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(part), strict=True):
-                whole[places] = own
+        def level(places: np.ndarray, what: str) -> None:
+            run(label=f"map, {what}", verdicts=verdicts, places=places, attractors=found)
 
-        def keep_all(part: Verdicts) -> None:
-            write(part)
-            if keep is not None:
-                keep(verdicts)
-
-        own = {name: column[places] for name, column in columns.items()}
-        mine = jax.tree.map(lambda leaf: leaf[places], verdicts)
-        write(
-            run_to_verdict(
-                scene, own, method, label=f"map, {what}", known=mine, keep=keep_all, attractors=found, **limited
-            )
-        )
-
-    source, checked = refined(shape, refine, audit, verdicts, run)
-    dataset = map_dataset(scene, method, t_max, axes, columns, verdicts, source=source)
+        source, checked = refined(grid.shape, refine, audit, verdicts, level)
+    dataset = map_dataset(scene, method, t_max, grid, verdicts, source=source)
     dataset.attrs.update(audit_note(checked))
     return dataset
-
-
-def _kept(path: str | Path | None, scene: Scene, method: AbstractStepper, limits: dict, axes: dict[str, np.ndarray]):
-    """What an earlier run has left in the file, and how to keep more there."""
-    if path is None:
-        return None, None
-    arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part"')
-    run = {
-        "fivjax": metadata.version("fivjax"),
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "scene": describe(scene),
-        "method": repr(method),
-        **limits,
-        "axes": {name: values.tolist() for name, values in axes.items()},
-    }
-    found = checkpoint.recall(path, run)
-    if found is not None:
-        parts = {name: found.pop(name) for name in Verdicts._fields if name != "energy"}
-        found = Verdicts(**parts, energy=found)
-
-    def keep(verdicts: Verdicts) -> None:
-        parts = verdicts._asdict()
-        checkpoint.keep(path, run, {**parts.pop("energy"), **parts})
-
-    return found, keep

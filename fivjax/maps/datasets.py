@@ -1,7 +1,6 @@
 """The dataset of a map: verdicts, attractors and what the run was, labelled."""
 
 import json
-from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -17,25 +16,23 @@ from .attractors_listed import attractor_table
 from .axes import add_linear_limit
 from .crossing import first_crossings
 from .results import Verdicts
+from .trajectories import Grid
 
 
 def map_dataset(
     scene: Scene,
     method: AbstractStepper,
     t_max: float,
-    axes: dict[str, np.ndarray],
-    columns: dict[str, np.ndarray],
+    grid: Grid,
     verdicts: Verdicts,
-    states: Sequence[str] = (),
     source: Int[np.ndarray, " trajectories"] | None = None,
 ) -> xr.Dataset:
-    """The labelled dataset of one trajectory for each combination of values on the `axes`.
+    """The labelled dataset of a grid of trajectories.
 
-    `columns` are the trajectories' values by name, in the order of `verdicts`; `states` the names of initial ones;
-    `source` of each the one whose result it takes, where not all were computed.
+    `source` is of each the one whose result it takes, where not all were computed.
     """
-    shape = tuple(len(values) for values in axes.values())
-    place, table = attractor_table(columns, verdicts, states)
+    axes, shape = grid.axes, grid.shape
+    place, table = attractor_table(grid.groups, verdicts)
     computed = {}
     if source is not None:
         own = source == np.arange(len(source))

@@ -1,13 +1,15 @@
-"""Many trajectories, each followed until its verdict is known: memory, progress, interruptions and what is kept on the way.
+"""Many trajectories, each followed until its verdict is known: jobs, who runs them, progress, and what is kept on the way.
 
-A trajectory (`progress`, `conclusion`) is one of a group that shares its mechanics (`sharing`); groups are followed in
-blocks of one size, round by round (`rounds`).
+A trajectory (`progress`, `conclusion`) is one of a group that shares its mechanics (`sharing`); some groups are a job (`plan`,
+`jobs`), whose trajectories are followed in blocks of one size, round by round (`rounds`).
 """
 
-import time
+import contextvars
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
 import jax
 import numpy as np
@@ -17,25 +19,37 @@ from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
-from . import rounds
 from .attractors import Attractors
-from .blocks import MANY, workers
+from .blocks import workers as cores
+from .executors import Workers
+from .handing_out import hand_out
+from .jobs import Done, Job, run_job
+from .plan import Plan, planned
 from .results import Verdicts, counted, not_run
-from .sharing import HISTORY, Batch, bytes_per_trajectory, grouped, in_bulk
+from .sharing import grouped
+from .trajectories import Places
 
-# Trajectories of a group that stand side by side in a block: enough to fill a vector unit and to make matrix products pay.
-SIDE_BY_SIDE = 16
-# What a trajectory that shares nothing costs, in trajectories that stand side by side.
-COST_OF_STANDING_ALONE = 4
 # Steps that a trajectory may take: 10⁵ cycles with their events, and some hours of work for a map of them.
 MOST_STEPS = 2**21
-# How often what is finished is handed out to be kept, s: seldom enough to cost nothing, often enough to lose little.
-KEEP_EVERY = 2.0
+
+
+class Keeper(Protocol):
+    """What keeps results on disk while a run goes on."""
+
+    found: dict[int, dict[bytes, Attractors]]  # by earlier jobs, each by its first place
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
+        """Keep what the job of these places has come to; `verdicts` are those of all trajectories."""
+        ...
+
+    def flush(self, verdicts: Verdicts) -> None:
+        """Keep what is not kept yet."""
+        ...
 
 
 def run_to_verdict(
     scene: Scene,
-    values: dict[str, np.ndarray],
+    values: Mapping[str, np.ndarray],
     method: AbstractStepper,
     *,
     t_max: float,
@@ -43,89 +57,150 @@ def run_to_verdict(
     max_steps: int = MOST_STEPS,
     progress: bool | None,
     label: str,
-    known: Verdicts | None = None,
-    keep: Callable[[Verdicts], None] | None = None,
     energy: bool = False,
+    states: Mapping[str, int] | None = None,
     attractors: dict[bytes, Attractors] | None = None,
-    states: dict[str, int] | None = None,
+    executor=None,
+    places: Places | None = None,
+    verdicts: Verdicts | None = None,
+    keeper: Keeper | None = None,
 ) -> Verdicts:
-    """Follow one trajectory for each row of `values` (equally long arrays of parameters by name) until its verdict.
+    """Follow one trajectory for each row of `values` (a `Grid`, or equally long columns by name) until its verdict.
 
     `energy` asks for the ledger of each at its end.
-
-    `known` is what an earlier run of the same trajectories has finished; those are not run again. `keep` is handed
-    everything that is finished, every few seconds and at the end.
-
-    `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
 
     `states` are names of `values` that are no parameters but displacements or velocities at the beginning, with their places in
     the state; others begin at the sliding equilibrium.
 
-    Interrupted by the user, it returns what is decided by then; the rest is `Verdict.NOT_RUN`.
+    `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
+
+    `executor` runs the jobs (`executors`); unless given, threads of this process do, and `memory` bounds how many run at a
+    time.
+
+    `places` are those that are to be run, all unless given. `verdicts` has those of all that an earlier run has left, and gets
+    the others: a job of which any is missing is run as a whole. `keeper` is handed what each job comes to.
+
+    Interrupted by the user, it returns what the finished jobs have decided; the rest is `Verdict.NOT_RUN`.
     """
-    total = len(next(iter(values.values())))
-    verdicts = not_run(total, energy) if known is None else jax.tree.map(np.array, known)
-    already = int(np.sum(~verdicts.pending))
-    bar = tqdm(
-        total=total,
-        initial=already,
-        # Nothing moves until the first round is compiled, which takes longer than many a map.
-        desc=f"{label}, compiling …",
-        unit=" trajectories",
-        disable=None if progress is None else not progress,
-    )
-    kept, new, reports = time.monotonic(), 0, 0
-
-    def finished(count: int) -> None:
-        nonlocal kept, new, reports
-        reports += 1
-        if reports == 2:  # the first one comes before anything was followed
-            bar.set_description(label, refresh=False)
-        bar.update(count)
-        new += count
-        if requested:
-            raise KeyboardInterrupt
-        if keep is not None and new > 0 and time.monotonic() - kept >= KEEP_EVERY:
-            keep(verdicts)
-            kept, new = time.monotonic(), 0
-
-    states = {} if states is None else states
-    distinct, group = grouped(values, tuple(states))
+    plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
+    verdicts = not_run(plan.trajectories.total, energy) if verdicts is None else verdicts
+    total = plan.trajectories.total if places is None else len(places)
+    pending = verdicts.pending if places is None else verdicts.pending[places]
     attractors = {} if attractors is None else attractors
-    # The same in all rounds and portions, because products of other shapes round differently.
-    in_rows = np.sum(-(-np.bincount(group) // SIDE_BY_SIDE)) * SIDE_BY_SIDE
-    width = SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1
-    # Portions that are filled group by group share the most.
-    order = np.argsort(group, kind="stable")
-    portion = max(1, int(memory // bytes_per_trajectory(scene, sharing=total / len(distinct))))
-    batch = Batch(
-        scene=scene,
-        method=method if energy else in_bulk(method, scene),
-        names=tuple(name for name in values if name not in HISTORY and name not in states),
-        history=tuple(name for name in values if name in HISTORY),
-        states=tuple(states.values()),
-        energy=energy,
-        width=width,
-        many=total >= MANY,
-        pool=ThreadPoolExecutor(max_workers=workers()),
-    )
-    with stop_requests() as requested, bar, batch.pool:
+    at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
+    with stop_requests() as requested, _Bar(label, total, total - int(pending.sum()), progress) as bar:
         try:
-            for start in range(0, total, portion):
-                chosen = order[start : start + portion]
-                if np.any(verdicts.pending[chosen]):
-                    rows = {name: column[chosen] for name, column in values.items()}
-                    rounds.follow_all(
-                        batch, rows, tuple(states), attractors, t_max, max_steps, verdicts, chosen, finished
-                    )
+            # By another run of the same trajectories, or by jobs that share a group.
+            needed_later = places is not None or bool(plan.parts[-1])
+            for part in plan.parts:
+                _follow(plan, part, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested)
         except KeyboardInterrupt:
-            left = int(np.sum(verdicts.pending))
+            left = int(np.sum(verdicts.pending if places is None else verdicts.pending[places]))
             warnings.warn(
                 f"Interrupted: of {counted(total, 'trajectory')}, {left} without a verdict, "
                 f"labelled {Verdict.NOT_RUN.value}.",
                 stacklevel=2,
             )
         finally:
-            if keep is not None:
-                keep(verdicts)
+            if keeper is not None:
+                keeper.flush(verdicts)
     return verdicts
+
+
+def _follow(
+    plan: Plan,
+    part: list[int],
+    verdicts: Verdicts,
+    attractors: dict[bytes, Attractors],
+    executor,
+    at_a_time: int,
+    keeper: Keeper | None,
+    needed_later: bool,
+    bar: "_Bar",
+    requested: list[int],
+) -> None:
+    """Has the jobs of a part done whose results are missing, and adds to the attractors what its jobs have found."""
+    missing = [number for number in part if np.any(verdicts.pending[plan.jobs[number]])]
+    found: dict[int, dict[bytes, Attractors]] = {}
+    if keeper is not None and keeper.found:
+        found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
+
+    def job(number: int) -> Job:
+        values = plan.trajectories.columns(plan.jobs[number])
+        keys = [row.tobytes() for row in grouped(values, tuple(plan.task.states))[0]] if attractors else []
+        return Job(plan.task, values, {key: attractors[key] for key in keys if key in attractors})
+
+    def done(number: int, result: Done) -> None:
+        places = plan.jobs[number]
+        for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(result.verdicts), strict=True):
+            whole[places] = own
+        found[number] = result.found
+        if keeper is not None:
+            keeper.keep(places, verdicts, result.found if needed_later else {})
+        if executor is not None:
+            bar.ended(len(places))
+
+    def given_up(number: int) -> None:
+        # Not kept: with more memory, or another machine, the job may well be done.
+        verdicts.verdict[plan.jobs[number]] = Verdict.WORKER_LOST
+        bar.ended(len(plan.jobs[number]))
+
+    def stop() -> bool:
+        return bool(requested)
+
+    if not missing:
+        pass
+    elif executor is None:
+        failed = []
+
+        def report(count: int) -> None:
+            bar.ended(count)
+            if requested or failed:
+                raise KeyboardInterrupt
+
+        with ThreadPoolExecutor(cores()) as blocks, ThreadPoolExecutor(at_a_time) as threads:
+            workers = Workers(threads)
+
+            def here(number: int):
+                return workers.submit(contextvars.copy_context().run, run_job, job(number), blocks, report)
+
+            try:
+                hand_out(missing, here, workers, done, given_up, stop)
+            except BaseException:
+                failed.append(True)
+                raise
+    else:
+        workers = Workers(executor)
+        hand_out(missing, lambda number: workers.submit(run_job, job(number)), workers, done, given_up, stop)
+    for number in part:
+        for key, one in found.get(number, {}).items():
+            attractors.setdefault(key, one)
+
+
+class _Bar:
+    """A bar of trajectories that have ended, which several threads may move."""
+
+    def __init__(self, label: str, total: int, already: int, shown: bool | None):
+        self.label, self.reports, self.lock = label, 0, threading.Lock()
+        self.bar = tqdm(
+            total=total,
+            initial=already,
+            # Nothing moves until the first round is compiled, which takes longer than many a map.
+            desc=f"{label}, compiling …",
+            unit=" trajectories",
+            disable=None if shown is None else not shown,
+        )
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.bar.close()
+
+    def ended(self, count: int) -> None:
+        """So many more have ended."""
+        with self.lock:
+            self.reports += 1
+            if self.reports == 2 or (self.reports == 1 and count):  # the first one comes before anything was followed
+                self.bar.set_description(self.label, refresh=False)
+            self.bar.update(count)

@@ -1,68 +1,206 @@
-"""What a long run has finished, kept on disk while it goes on.
+"""What a long run has finished, kept in a folder of chunks (Zarr) while it goes on: for maps of many million trajectories.
 
-A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is
-written anew as a whole and appears under its name only then (`io.datasets.save`), so at any instant, also that of a power
-cut, the file is some earlier state of the run. A trajectory's result does not depend on which others run beside it; so what a
-resumed run adds is, bit for bit, what the interrupted one would have found.
+The folder is a Zarr group that `xarray.open_zarr` reads at any time: one array per result over the map's axes, in which
+trajectories that have not been run have the verdict `NOT_RUN`. Chunks are the tiles that jobs are made of. Only the process
+that hands the jobs out writes, so a chunk has one writer; a file lock keeps a second process out. A job's verdicts are
+written last, after everything else of it is on the disk: what has a verdict is whole, whenever the process is killed. A
+chunk that cannot be read is taken for one that was not run.
 """
 
+import contextlib
 import json
+import os
+import shutil
+import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
-from ..io.datasets import check_writable, save
+from ..verdicts.verdict import Verdict
+from .attractor_files import from_bytes, to_bytes
+from .attractors import Attractors
+from .checkpoint import refuse_other_run
+from .results import Verdicts, not_run
+from .trajectories import Grid, Places, Tiles
 
-KIND = "fivjax checkpoint"
+KIND = "fivjax store"
+# The folder in it with attractors that later jobs need.
+FOUND = "attractors"
 
 
-def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
-    """The results kept in a checkpoint, by name; None where there is no such file yet.
+def is_store(path: str | Path) -> bool:
+    """Whether results are to be kept in a folder of chunks."""
+    return Path(path).suffix == ".zarr"
 
-    `run` describes the run in plain Python values (what `json` can hold).
 
-    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, and
-    the checkpoint of another run, with the first difference.
+class Store:
+    """The folder of a run: what an earlier one has left in it, and how more is kept there.
+
+    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a folder that is no store, the store
+    of another run (with the first difference), and one that another process is writing; `ImportError` without Zarr.
     """
-    path = check_writable(path)
-    if not path.exists():
-        return None
+
+    def __init__(self, path: str | Path, run: dict, grid: Grid, tile: tuple[int, ...], energy: bool):
+        zarr = _zarr()
+        self.path, self.tiles = Path(path), Tiles(grid.shape, tile)
+        self.found: dict[int, dict[bytes, Attractors]] = {}
+        self.verdicts: Verdicts | None = None
+        run = {**run, "chunk": list(tile)}
+        fields = _fields(not_run(1, energy))
+        with contextlib.suppress(FileExistsError):
+            if not self.path.exists():
+                _create(self.path, run, grid, tile, fields)
+        _refuse_other(self.path, run)
+        self._lock = _locked(self.path)
+        try:
+            group = zarr.open_group(self.path, mode="r+", use_consolidated=False)
+            self.arrays = {name: group[name] for name in fields}
+            self.verdicts = self._recalled(not_run(grid.total, energy))
+            for file in sorted((self.path / FOUND).glob("*.npz")):
+                with contextlib.suppress(Exception):  # half a file, after a power cut
+                    self.found[int(file.stem)] = from_bytes(file.read_bytes())
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _recalled(self, verdicts: Verdicts) -> Verdicts:
+        for number in self._begun():
+            at = self.tiles.slices(number)
+            places = self.tiles[number]
+            try:
+                parts = {name: np.asarray(array[at]).ravel() for name, array in self.arrays.items()}
+            except Exception:  # whatever a broken chunk makes of its decoder
+                continue
+            for name, values in _fields(verdicts).items():
+                values[places] = parts[name]
+        return verdicts
+
+    def _begun(self) -> Iterator[int]:
+        folder = self.path / "verdict" / "c"
+        for number in range(len(self.tiles)):
+            at = np.unravel_index(number, self.tiles.parts)
+            if folder.joinpath(*map(str, at)).exists():
+                yield number
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
+        """Keep what the job of these places has come to."""
+        if found:
+            folder = self.path / FOUND
+            folder.mkdir(exist_ok=True)
+            _write(folder / f"{int(places[0])}.npz", to_bytes(found))
+        fields = _fields(verdicts)
+        numbers = self.tiles.holding(places)
+        for name in sorted(fields, key=lambda name: name == "verdict"):  # that one last
+            for number in numbers:
+                at, own = self.tiles.slices(int(number)), self.tiles[int(number)]
+                values = fields[name][own]
+                if name == "verdict":
+                    values = np.where(values == Verdict.WORKER_LOST, Verdict.NOT_RUN, values).astype(np.int8)
+                self.arrays[name][at] = values.reshape([part.stop - part.start for part in at])
+                self._on_disk(name, int(number))
+
+    def _on_disk(self, name: str, number: int) -> None:
+        chunk = self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
+        # A chunk that holds nothing but the fill value has no file.
+        if chunk.exists():
+            _sync(chunk)
+
+    def flush(self, verdicts: Verdicts) -> None:
+        """Everything is kept already."""
+
+    def close(self) -> None:
+        """Let other processes write."""
+        self._lock.close()
+
+
+def _zarr():
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            kept = file.load()
-        theirs = json.loads(kept.attrs["run"]) if kept.attrs.get("kind") == KIND else None
+        import zarr
+    except ImportError:
+        raise ImportError("Maps are kept in a Zarr store by the package zarr: `pip install fivjax[zarr]`.") from None
+    return zarr
+
+
+def _fields(verdicts: Verdicts) -> dict[str, np.ndarray]:
+    parts = verdicts._asdict()
+    return {**parts.pop("energy"), **parts}
+
+
+def _create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
+    """An empty store, which appears under its name as a whole."""
+    zarr = _zarr()
+    if not path.parent.is_dir():
+        raise ValueError(f"Output folder `{path.parent}` does not exist; create it first.")
+    try:
+        part = Path(tempfile.mkdtemp(dir=path.parent, prefix=".fivjax."))
+    except OSError as error:
+        raise ValueError(f"Output folder `{path.parent}` cannot be written: {error.strerror}.") from error
+    try:
+        group = zarr.create_group(part, zarr_format=3, attributes={"kind": KIND, "run": json.dumps(run)})
+        for name, values in grid.axes.items():
+            group.create_array(name, data=values, chunks=(len(values),), dimension_names=(name,))
+        for name, one in fields.items():
+            group.create_array(
+                name,
+                shape=grid.shape,
+                chunks=tile,
+                dtype=one.dtype,
+                fill_value=one[0],
+                dimension_names=tuple(grid.axes),
+            )
+        with warnings.catch_warnings():
+            # It warns that other programs may not know of it, and xarray that it is slow without it.
+            warnings.simplefilter("ignore", UserWarning)
+            zarr.consolidate_metadata(part)
+        mask = os.umask(0)
+        os.umask(mask)
+        part.chmod(0o777 & ~mask)
+        part.rename(path)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _refuse_other(path: Path, run: dict) -> None:
+    try:
+        attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+        theirs = json.loads(attributes["run"]) if attributes["kind"] == KIND else None
     except (OSError, ValueError, KeyError):
         theirs = None
     if theirs is None:
-        raise ValueError(f"File `{path}` is not a checkpoint of fivjax; give another path for the checkpoint.")
-    ours = json.loads(json.dumps(run))
-    for name in [*ours, *theirs]:
-        if ours.get(name) != theirs.get(name):
-            raise ValueError(
-                f"Checkpoint `{path}` is of another run: {_difference(name, theirs.get(name), ours.get(name))}. "
-                f"Resume it with the arguments it was begun with, or give another path."
-            )
-    return {str(name): kept[name].values for name in kept.data_vars}
+        raise ValueError(f"`{path}` is not a store of fivjax; give another path for the store.")
+    refuse_other_run(f"Store `{path}`", theirs, run)
 
 
-def keep(path: str | Path, run: dict, results: dict[str, np.ndarray]) -> None:
-    """Write the checkpoint; where the disk does not take it, say so and leave the earlier one."""
-    dataset = xr.Dataset({name: ("trajectory", values) for name, values in results.items()})
-    dataset.attrs.update(kind=KIND, run=json.dumps(run))
+def _locked(path: Path):
+    """A lock on the store, which ends with the process at the latest."""
+    file = open(path / ".lock", "a")  # noqa: SIM115
     try:
-        save(dataset, path)
-    except (OSError, ValueError) as error:
-        warnings.warn(
-            f"Checkpoint `{path}` could not be written ({error}); the run goes on and will try again.", stacklevel=3
-        )
+        import fcntl
+    except ImportError:  # Windows
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise ValueError(f"Store `{path}` is being written by another process; wait for it, or end it.") from None
+    except OSError:  # a file system without locks
+        pass
+    return file
 
 
-def _difference(name: str, theirs, ours) -> str:
-    if isinstance(theirs, dict) and isinstance(ours, dict):
-        for inner in [*ours, *theirs]:
-            if theirs.get(inner) != ours.get(inner):
-                return _difference(inner, theirs.get(inner), ours.get(inner))
-    short = [text if len(text) <= 40 else f"{text[:37]}..." for text in map(json.dumps, (theirs, ours))]
-    return f"its `{name}` is {short[0]} and not {short[1]}"
+def _write(path: Path, content: bytes) -> None:
+    part = path.with_suffix(".part")
+    part.write_bytes(content)
+    _sync(part)
+    part.replace(path)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -21,6 +21,7 @@ from .axes import add_linear_limit, check_run, checked_axes
 from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings
 from .engine import run_to_verdict
+from .executors import check_executor
 
 # Points inside a bracket that are tried at once: more of them means fewer rounds, and the rounds are what takes time.
 POINTS_PER_ROUND = 15
@@ -39,6 +40,7 @@ def critical_perturbation(
     progress: bool | None = None,
     energy: bool = False,
     derivatives: bool = False,
+    executor=None,
     **axis,
 ) -> xr.Dataset:
     """The smallest kick that leads to the limit cycle, along one or several axes; all of them bracketed in batch.
@@ -55,7 +57,7 @@ def critical_perturbation(
     - `**axis`: values of any numeric parameters but p, by name.
     - `p_range`, `p_step`: where to look, and how finely.
     - `tolerance`: the width of the bracket at which to stop.
-    - `method`, `t_max`, `memory`, `progress`: as in `bistability_map`.
+    - `method`, `t_max`, `memory`, `progress`, `executor`: as in `bistability_map`.
     - `energy`: whether to add the energies of the critical kick.
     - `derivatives`: whether to compute p_crit to rounding, and differentiate it in every parameter.
 
@@ -110,13 +112,16 @@ def critical_perturbation(
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
     arguments.real_number("tolerance", tolerance, above=0)
     axes = checked_axes(scene, axis)
+    check_executor(executor)
     shape = tuple(len(values) for values in axes.values())
     columns = {
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
 
     # Of the rows, which are the same in the scan and in all that follows.
-    run = functools.partial(run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={})
+    run = functools.partial(
+        run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={}, executor=executor
+    )
     scan = np.linspace(low, high, round((high - low) / p_step) + 1)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)

@@ -24,6 +24,7 @@ class Verdict(enum.IntEnum):
     TOO_MANY_EVENTS = Ending.TOO_MANY_EVENTS
     UNBOUNDED = Ending.UNBOUNDED
     STEP_FAILURE = Ending.STEP_FAILURE
+    WORKER_LOST = -9
 
 
 MEANING = {
@@ -40,6 +41,7 @@ MEANING = {
     "lower the friction or the belt's inclination",
     Verdict.STEP_FAILURE: "its fastest vibration needs more steps than `max_steps` to reach a verdict; raise that, "
     "lower `t_max`, or soften what is stiffest",
+    Verdict.WORKER_LOST: "whoever ran it died of it, three times in a row; give the workers more memory, or run it alone",
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",
 }
 

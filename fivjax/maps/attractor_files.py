@@ -1,0 +1,48 @@
+"""Attractors that jobs have found, as bytes in a file (NumPy's npz, no pickles) and back, bit for bit."""
+
+import io
+import json
+
+import numpy as np
+
+from ..verdicts.capture import Neighbourhood
+from .attractors import Attractors, Torus
+from .captures import Cycle
+
+
+def to_bytes(found: dict[bytes, Attractors]) -> bytes:
+    """The attractors of groups, by the groups' parameters."""
+    arrays, index = {}, []
+    for number, (key, one) in enumerate(found.items()):
+        index.append([key.hex(), len(one.cycles), one.torus is not None])
+        for k, cycle in enumerate(one.cycles):
+            fields = {**cycle._asdict(), **{f"n_{name}": part for name, part in cycle.neighbourhood._asdict().items()}}
+            del fields["neighbourhood"]
+            arrays |= {f"{number}.{k}.{name}": np.asarray(value) for name, value in fields.items()}
+        if one.torus is not None:
+            arrays |= {f"{number}.torus.{name}": np.asarray(value) for name, value in one.torus._asdict().items()}
+    content = io.BytesIO()
+    np.savez_compressed(content, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)
+    return content.getvalue()
+
+
+def from_bytes(content: bytes) -> dict[bytes, Attractors]:
+    """What `to_bytes` was given."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    found = {}
+    for number, (key, cycles, has_torus) in enumerate(json.loads(arrays["index"].tobytes())):
+
+        def of(kind, prefix, own=number, **others):
+            names = [name for name in kind._fields if name not in others]
+            return kind(**others, **{name: _plain(arrays[f"{own}.{prefix}{name}"]) for name in names})
+
+        found[bytes.fromhex(key)] = Attractors(
+            [of(Cycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)],
+            of(Torus, "torus.") if has_torus else None,
+        )
+    return found
+
+
+def _plain(value: np.ndarray):
+    return value if value.ndim else value.item()

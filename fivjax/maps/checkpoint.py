@@ -1,0 +1,131 @@
+"""What a long run has finished, kept in one file while it goes on.
+
+A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is
+written anew as a whole and appears under its name only then (`io.datasets.save`), so at any instant, also that of a power
+cut, the file is some earlier state of the run. A job is in it as a whole or not at all; so what a resumed run adds is, bit for
+bit, what the interrupted one would have found.
+"""
+
+import json
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from ..io.datasets import check_writable, save
+from ..verdicts.verdict import Verdict
+from .attractor_files import from_bytes, to_bytes
+from .attractors import Attractors
+from .results import Verdicts
+from .trajectories import Places
+
+KIND = "fivjax checkpoint"
+# How often what is finished is written, s: seldom enough to cost nothing, often enough to lose little.
+KEEP_EVERY = 2.0
+
+
+class Checkpoint:
+    """The file of a run: what an earlier one has left in it, and how more is kept there.
+
+    `run` describes the run in plain Python values (what `json` can hold).
+
+    **Raises:** as `recall`.
+    """
+
+    def __init__(self, path: str | Path, run: dict):
+        self.path, self.run = path, run
+        self.found: dict[int, dict[bytes, Attractors]] = {}
+        self.verdicts: Verdicts | None = None
+        kept = recall(path, run)
+        if kept is not None:
+            for place, content in json.loads(kept.pop("found", np.zeros(0, np.uint8)).tobytes() or "{}").items():
+                self.found[int(place)] = from_bytes(bytes.fromhex(content))
+            parts = {name: kept.pop(name) for name in Verdicts._fields if name != "energy"}
+            self.verdicts = Verdicts(**parts, energy=kept)
+        self._written, self._new = time.monotonic(), False
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
+        """Keep what a job has come to, if it is time."""
+        if found:
+            self.found[int(places[0])] = found
+        self._new = True
+        if time.monotonic() - self._written >= KEEP_EVERY:
+            self.flush(verdicts)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def flush(self, verdicts: Verdicts) -> None:
+        """Write what is not written yet."""
+        if not self._new:
+            return
+        parts = verdicts._asdict()
+        # Whoever goes on may have other workers.
+        parts["verdict"] = np.where(verdicts.verdict == Verdict.WORKER_LOST, Verdict.NOT_RUN, verdicts.verdict)
+        parts["verdict"] = parts["verdict"].astype(np.int8)
+        found = json.dumps({place: to_bytes(part).hex() for place, part in self.found.items()}).encode()
+        results = {**parts.pop("energy"), **parts, "found": np.frombuffer(found, np.uint8)}
+        keep(self.path, self.run, results)
+        self._written, self._new = time.monotonic(), False
+
+
+def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
+    """The results kept in a checkpoint, by name; None where there is no such file yet.
+
+    `run` describes the run in plain Python values (what `json` can hold).
+
+    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, and
+    the checkpoint of another run, with the first difference.
+    """
+    path = check_writable(path)
+    if not path.exists():
+        return None
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as file:
+            kept = file.load()
+        theirs = json.loads(kept.attrs["run"]) if kept.attrs.get("kind") == KIND else None
+    except (OSError, ValueError, KeyError):
+        theirs = None
+    if theirs is None:
+        raise ValueError(f"File `{path}` is not a checkpoint of fivjax; give another path for the checkpoint.")
+    refuse_other_run(f"Checkpoint `{path}`", theirs, run)
+    return {str(name): kept[name].values for name in kept.data_vars}
+
+
+def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
+    """Refuse what was kept of another run, with the first difference.
+
+    **Raises:** `ValueError`.
+    """
+    ours = json.loads(json.dumps(run))
+    for name in [*ours, *theirs]:
+        if ours.get(name) != theirs.get(name):
+            raise ValueError(
+                f"{what} is of another run: {_difference(name, theirs.get(name), ours.get(name))}. "
+                f"Resume it with the arguments it was begun with, or give another path."
+            )
+
+
+def keep(path: str | Path, run: dict, results: dict[str, np.ndarray]) -> None:
+    """Write the checkpoint; where the disk does not take it, say so and leave the earlier one."""
+    # Attractors are no values of trajectories.
+    over = {name: "byte" if name == "found" else "trajectory" for name in results}
+    dataset = xr.Dataset({name: (over[name], values) for name, values in results.items()})
+    dataset.attrs.update(kind=KIND, run=json.dumps(run))
+    try:
+        save(dataset, path)
+    except (OSError, ValueError) as error:
+        warnings.warn(
+            f"Checkpoint `{path}` could not be written ({error}); the run goes on and will try again.", stacklevel=3
+        )
+
+
+def _difference(name: str, theirs, ours) -> str:
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for inner in [*ours, *theirs]:
+            if theirs.get(inner) != ours.get(inner):
+                return _difference(inner, theirs.get(inner), ours.get(inner))
+    short = [text if len(text) <= 40 else f"{text[:37]}..." for text in map(json.dumps, (theirs, ours))]
+    return f"its `{name}` is {short[0]} and not {short[1]}"

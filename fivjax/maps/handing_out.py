@@ -1,0 +1,105 @@
+"""Jobs handed out to workers that may die, and handed out anew until each is done or proved to kill whoever runs it.
+
+Who runs a job that dies with its worker is not known where several run side by side: a broken pool names no culprit. So a job
+that was lost is first run again behind all others. One that is lost `MOST_LOSSES` times waits until all else is done, and then
+runs alone; if its worker dies `MOST_LOSSES` times again, it is the job's own doing.
+"""
+
+import queue
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from .executors import HANDED_OUT, Workers, is_broken, is_loss, is_proof
+
+MOST_LOSSES = 3
+# How often a request to stop is looked for while nothing comes back, s.
+LOOK_EVERY = 0.2
+
+
+def hand_out(
+    jobs: Sequence[int],
+    submit: Callable[[int], Any],
+    workers: Workers,
+    done: Callable[[int, Any], None],
+    given_up: Callable[[int], None],
+    stop: Callable[[], bool],
+) -> None:
+    """Has all jobs (numbers) done: `submit` hands one out and gives its future, `done` gets its result, in any order.
+
+    `given_up` is told of jobs that kill their workers.
+
+    **Raises:** `KeyboardInterrupt` once `stop()` is true, or where a worker was interrupted; `RuntimeError` where workers
+    cannot be had; and what a job raises.
+    """
+    waiting, suspects = deque(jobs), deque()
+    # Lost side by side with others, and lost alone.
+    lost, lost_alone = Counter(), Counter()
+    under_way: dict[Any, int] = {}  # futures, in the order in which they were handed out
+    alone: int | None = None  # the job that runs alone
+    back: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    try:
+        while waiting or suspects or under_way:
+            room = HANDED_OUT if workers.side_by_side is None else workers.side_by_side + 1
+            chosen = waiting if waiting or under_way else suspects
+            while chosen and len(under_way) < (1 if chosen is suspects else room):
+                number = chosen[0]
+                alone = number if chosen is suspects else None
+                try:
+                    future = submit(number)
+                except Exception as error:
+                    if not is_broken(error):
+                        raise
+                    if not under_way:
+                        workers.renew()
+                        continue
+                    break  # those that are under way will say the same
+                chosen.popleft()
+                under_way[future] = number
+                future.add_done_callback(back.put)
+            try:
+                future = back.get(timeout=LOOK_EVERY)
+            except queue.Empty:
+                future = None
+            if stop():
+                raise KeyboardInterrupt
+            if future is None or future not in under_way:
+                continue
+            running = list(under_way)[: workers.side_by_side]
+            number = under_way.pop(future)
+            try:
+                result = future.result()
+            except BaseException as error:
+                if not is_loss(error):
+                    raise
+            else:
+                done(number, result)
+                workers.progressed()
+                continue
+            error = None if future.cancelled() else future.exception()
+            gone = [(future, number)]
+            if error is not None and is_broken(error):
+                # What was finished before the workers died is still to be heard of.
+                gone += [one for one in under_way.items() if not _finished(one[0])]
+                for one, _ in gone[1:]:
+                    del under_way[one]
+                workers.renew()
+            for one, number in gone:
+                # In a queue that is served in order, only the first ones had begun.
+                blamed = MOST_LOSSES if error is not None and is_proof(error) else int(one in running)
+                if number == alone:
+                    lost_alone[number] += blamed
+                else:
+                    lost[number] += blamed
+                if lost_alone[number] >= MOST_LOSSES:
+                    given_up(number)
+                elif lost[number] >= MOST_LOSSES:
+                    suspects.append(number)
+                else:
+                    waiting.append(number)
+    finally:
+        workers.close(under_way)
+
+
+def _finished(future) -> bool:
+    return future.done() and not future.cancelled() and future.exception() is None

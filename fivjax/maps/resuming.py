@@ -1,0 +1,42 @@
+"""Where a map keeps what is finished, and what makes it the same map when it is resumed."""
+
+from importlib import metadata
+from pathlib import Path
+
+import jax
+
+from ..foundation import arguments
+from ..io.datasets import describe
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper
+from .checkpoint import Checkpoint
+from .plan import in_a_job
+from .sharing import bytes_per_trajectory, in_bulk
+from .store import Store, is_store
+from .trajectories import Grid
+
+
+def keeper_at(
+    path: str | Path | None, scene: Scene, method: AbstractStepper, grid: Grid, limits: dict, energy: bool = False
+) -> Checkpoint | Store | None:
+    """What keeps the results of a map at this path (none without one); `limits` are its other arguments that tell in results.
+
+    **Raises:** `TypeError` for what is no path; `ValueError` for what is there already and is not of this map.
+    """
+    if path is None:
+        return None
+    arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part", or of a folder "map.zarr"')
+    run = {
+        "fivjax": metadata.version("fivjax"),
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "scene": describe(scene),
+        "method": repr(method),
+        **limits,
+        "axes": {name: values.tolist() for name, values in grid.axes.items()},
+    }
+    if not is_store(path):
+        return Checkpoint(path, run)
+    each = bytes_per_trajectory(scene, grid.total / grid.group_count)
+    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each))
+    return Store(path, run, grid, tile, energy)
