@@ -24,6 +24,11 @@ def paper(belt_speed: float, **others) -> fj.Scene:
     return fj.Scene(fj.belt_oscillator(**others), fj.Coulomb(0.227), belt_speed=belt_speed, load=fj.Pulse(p=1.2))
 
 
+def static(belt_speed: float, mu: float) -> fj.Scene:
+    """Static friction above kinetic friction: what just touches sticking squeals."""
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu, mu_static=0.5), belt_speed=belt_speed, load=fj.Pulse(p=1.2))
+
+
 def bisected(scene: fj.Scene, low: float, high: float, width: float = 2e-13) -> tuple[float, float]:
     """The change from sliding to anything else between two kicks, by the independent solver."""
     while high - low > width * high:
@@ -80,13 +85,15 @@ def random() -> None:
 
 
 def derivatives() -> None:
-    for speed in (1.0, 5.0):
-        scene = paper(speed)
+    for scene in (paper(1.0), paper(5.0), static(1.0, 0.227), static(0.3, 0.22)):
         found = fj.critical_perturbation(scene, p_range=(1.0, 1.3), derivatives=True, progress=False).isel(belt_speed=0)
-        p = float(found.p_crit)
+        p, speed = float(found.p_crit), float(scene.belt_speed)
+        low, high = bisected(scene, p - 1e-6, p + 1e-6)
+        print(f"  {found.kind.values} at v = {speed:g}: {p:.12f}, the reference's bracket {low:.12f} to {high:.12f}")
         for name in differentiable(scene):
             value, slope = float(scene.parameters[name]), float(found.d_p_crit.sel(parameter=name))
-            by = 1e-6 * abs(value) if value else 1e-6
+            # Of touching kicks so little that the same swing touches.
+            by = (1e-7 if str(found.kind.values) == "grazing" else 1e-6) * (abs(value) or 1.0)
             kicks = []
             for side in (-by, by):
                 if value + side < 0:

@@ -9,7 +9,9 @@ import pytest
 from catalogue import LOW_ORDER
 
 import fivjax as fj
-from fivjax.contact import Mechanics, Status, status_from_forces
+from fivjax.contact import Contact, Mechanics, Status, status_from_forces
+from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.steppers.core import follow
 
 # One of each order, and others of the same orders.
 RUNGE_KUTTA = [diffrax.Heun, diffrax.Bosh3, diffrax.Tsit5, diffrax.Dopri8]
@@ -270,3 +272,21 @@ def test_a_slip_that_is_small_beside_what_follows_is_no_zero():
     assert run.outcome == fj.Ending.FINISHED
     np.testing.assert_allclose(run.displacement[-1], right.q[-1], rtol=0, atol=1e-9 * np.abs(right.q[-1]).max())
     np.testing.assert_allclose(run.velocity[-1], right.v[-1], rtol=0, atol=1e-9 * np.abs(right.v[-1]).max())
+
+
+def test_a_load_that_jumps_at_rest_does_not_lengthen_the_first_step():
+    """A motion that starts with neither displacement nor velocity is rejected where its series is trusted for a whole period."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=1.0, load=fj.ConstantLoad(100.0))
+    with jax.enable_x64(True):
+        sliding = Contact(jnp.asarray(1, jnp.int32), jnp.asarray(1.0))
+
+        @jax.jit
+        def moved(y, h):
+            mechanics = mechanics_about_sliding(scene)
+            return follow(fj.EventExact(), mechanics, sliding, jnp.asarray(20.0), y, h, kind="lax").y
+
+        once, often = np.asarray(moved(jnp.zeros(6), 0.01)), jnp.zeros(6)
+        for _ in range(50):
+            often = moved(often, 0.01 / 50)
+        often = np.asarray(often)
+    np.testing.assert_allclose(once, often, rtol=0, atol=1e-13 * np.max(np.abs(often)))

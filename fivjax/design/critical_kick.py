@@ -4,8 +4,8 @@ With $r_i = (θ_i - θ_{i,0}) / |θ_{i,0}|$ the changes are those of
 
 $$ \min_r \tfrac12 |r|^2 \quad\text{with}\quad p_\mathrm{crit}(r) = p_\mathrm{target}, $$
 
-within the bounds, found by sequential quadratic programming: in each step p_crit is replaced by its value and its exact derivatives, and p_crit at
-the end of the step is computed anew. A step that does not keep what its derivatives promised is halved.
+within the bounds, found by sequential quadratic programming: in each step p_crit is replaced by its value and its exact
+derivatives, and p_crit at the end of the step is computed anew. A step that does not keep what was promised is halved.
 """
 
 from collections.abc import Mapping, Sequence

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..cycles.stable_manifold import Critical, critical_kick
+from ..cycles.touching_kick import GrazingKick, grazing_kick
 from ..model.scene import Scene
 from ..verdicts.verdict import Verdict
 from .crossing import Crossing
@@ -13,7 +14,8 @@ BESIDE = 1e-9
 
 NO_CHANGE = "no change from sliding to a limit cycle lies in the range"
 NO_SADDLE = (
-    "the motion after the critical kick passes no saddle cycle that closes, or the kind of the border changes here"
+    "the motion after the critical kick passes no saddle cycle that closes and touches no other contact mode, or the kind of "
+    "the border changes here"
 )
 NOT_PROVED = "the verdicts on either side contradict what Newton's method found: the kind of the border changes here"
 
@@ -31,30 +33,33 @@ def with_derivatives(
     `verdicts` are those of rows at their own values of p, as a function of columns, kicks and a label.
     """
     names, rows = differentiable(scene), len(found.middle)
-    kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, "", dtype=object)
-    slopes, exact = np.full((rows, len(names)), np.nan), np.full(rows, np.nan)
-    trajectories = np.zeros(rows, int)
-    for row in range(rows):
-        low, high = found.low[row], found.high[row]
-        if not np.isfinite([low, high]).all():
-            why[row] = NO_CHANGE
-            continue
-        here = scene.replace(**{name: float(column[row]) for name, column in columns.items()})
-        critical: Critical | None = critical_kick(here, (low, high), names)
-        if critical is None:
-            why[row] = NO_SADDLE
-            continue
-        exact[row], trajectories[row] = critical.p, critical.trajectories
-        slopes[row] = [critical.d_p[name] for name in names]
-    known = np.flatnonzero(np.isfinite(exact))
+    kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
+    slopes, trajectories = np.full((rows, len(names)), np.nan), np.zeros(rows, int)
     middle, low, high = found.middle.copy(), found.low.copy(), found.high.copy()
-    if len(known):
-        beside = exact[known, None] * (1 + BESIDE * np.array([-1.0, 1.0]))
-        chosen = {name: column[known] for name, column in columns.items()}
+    left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
+    why[left] = NO_SADDLE
+    # What passes no saddle, or one that is not the border, may just touch another contact mode.
+    for name, method in ((KINDS[1], critical_kick), (KINDS[2], grazing_kick)):
+        critical: dict[int, Critical | GrazingKick] = {}
+        for row in left:
+            here = scene.replace(**{key: float(column[row]) for key, column in columns.items()})
+            answer = method(here, (found.low[row], found.high[row]), names)
+            if answer is not None:
+                critical[row] = answer
+        known = np.array(list(critical), int)
+        if not len(known):
+            continue
+        exact = np.array([critical[row].p for row in known])
+        beside = exact[:, None] * (1 + BESIDE * np.array([-1.0, 1.0]))
+        chosen = {key: column[known] for key, column in columns.items()}
         proved = np.all(verdicts(chosen, beside, "both sides") == [Verdict.SLIDING, Verdict.LIMIT_CYCLE], axis=1)
+        why[known[~proved]] = NOT_PROVED
         held = known[proved]
-        kind[held], middle[held] = KINDS[1], exact[held]
+        kind[held], why[held], middle[held] = name, "", exact[proved]
         low[held], high[held] = beside[proved, 0], beside[proved, 1]
-        why[known[~proved]], slopes[known[~proved]] = NOT_PROVED, np.nan
+        for row in held:
+            trajectories[row] = critical[row].trajectories
+            slopes[row] = [critical[row].d_p[key] for key in names]
+        left = np.setdiff1d(left, held)
     answers = {"kind": kind, "d_p_crit": slopes, "why_none": why.astype(str), "newton_trajectories": trajectories}
     return found._replace(middle=middle, low=low, high=high), answers

@@ -75,10 +75,11 @@ def critical_perturbation(
     With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J: what the sliding
     state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
 
-    With `derivatives`, p_crit is found to rounding by Newton's method where the bracket's motion passes a saddle cycle, and
-    proved anew 1e-9 on either side; then there are also
+    With `derivatives`, p_crit is found to rounding by Newton's method where the bracket's motion passes a saddle cycle, or
+    just touches another contact mode, and proved anew 1e-9 on either side; then there are also
 
-    - `kind`: "manifold" where the critical kick lands on the stable manifold of a saddle cycle, else "none";
+    - `kind`: "manifold" where the critical kick lands on the stable manifold of a saddle cycle, "grazing" where its motion
+      just touches sticking, lifting off or landing (with static friction above kinetic, such a touch may squeal), else "none";
     - `d_p_crit` over `parameter`, per unit of each; NaN where there is none, and `why_none` says why in a sentence;
     - `newton_trajectories`: how many trajectories Newton's method took.
 

@@ -154,13 +154,21 @@ class EventExact(AbstractStepper):
         states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         return jnp.stack(states), unit
 
-    def in_one_mode(self, mechanics: Mechanics, contact: Contact, y: State, h: Float[Array, ""]) -> State:
-        """The motion in one contact mode for a time `h` (s, of either sign), whatever its guards say; under no load."""
+    def in_one_mode(
+        self,
+        mechanics: Mechanics,
+        contact: Contact,
+        y: State,
+        h: Float[Array, ""],
+        load: Float[Array, ""] | float = 0.0,
+    ) -> State:
+        """The motion in one contact mode for a time `h` (s, of either sign) under a load (N), whatever its guards say."""
         unit = _time_unit(mechanics)
+        load = jnp.asarray(load, y.dtype)
 
         def step(carry):
             y, left, _ = carry
-            states, *_ = _series(mechanics, contact, jnp.zeros_like(left), y, self.order_, unit)
+            states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
             trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), LONGEST_STEP) * unit)
             last = jnp.abs(left) <= trusted
             part = jnp.where(last, left, jnp.sign(left) * trusted)
@@ -266,13 +274,16 @@ def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
 
     tiny = float(jnp.finfo(states[0].dtype).tiny)
     moves = (size(0) > 0) | (size(1) > 0)
+    # At rest, but not for long: a load has just jumped.
+    starts = size(2) > 0
 
     def reach(last):
         # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
         # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
         end = jnp.maximum(size(last), tiny)
-        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1)]
-        return jnp.where(moves, jnp.minimum(jnp.maximum(*steps), LONGEST_STEP), jnp.inf)
+        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1, 2)]
+        longest = jnp.where(moves, jnp.maximum(steps[0], steps[1]), jnp.where(starts, steps[2], jnp.inf))
+        return jnp.where(moves | starts, jnp.minimum(longest, LONGEST_STEP), jnp.inf)
 
     return jnp.minimum(reach(order), reach(order - 1))
 
