@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def test_the_module_is_the_program():
 def made_up_map(verdicts):
     """A stand-in for `bistability_map` that finds these verdicts."""
 
-    def make(scene, *, method, t_max, memory, resume, refine, **axes):
+    def make(scene, *, method, t_max, memory, resume, refine, executor=None, **axes):
         dims = tuple(axes)
         fields = {"verdict": (dims, np.array(verdicts, np.int8)), "amplitude": (dims, np.ones(np.shape(verdicts)))}
         return labelled(xr.Dataset(fields, axes), scene)
@@ -95,3 +96,31 @@ def test_a_wait_is_said_on_a_terminal_only(monkeypatch, capsys):
 def test_a_remedy_names_the_option(sentence, expected):
     """`columns` is Python's; a user of the command line looks for `--column`."""
     assert with_options(sentence) == expected
+
+
+def test_where_a_map_is_kept_and_who_computes(monkeypatch, tmp_path, capsys):
+    """`--resume` alone means the file beside the map; with a folder, that folder, which stays."""
+    asked = {}
+
+    def make(scene, *, resume, executor, **options):
+        asked.update(resume=resume, executor=executor)
+        Path(resume).mkdir() if Path(resume).suffix == ".zarr" else Path(resume).touch()
+        return made_up_map([[0, 1], [0, 1]])(
+            scene, method=None, t_max=20.0, memory=1.0, resume=None, refine=0, **{n: options[n] for n in ("mu", "p")}
+        )
+
+    monkeypatch.setattr(fj, "bistability_map", make)
+    command = ["map", "--x", "mu=0.1:0.2:2", "--y", "p=1:2:2", "--out", str(tmp_path / "map")]
+    assert main([*command, "--resume"]) == 0
+    assert asked["resume"] == tmp_path / "map.unfinished" and not asked["resume"].exists()
+    folder = tmp_path / "kept.zarr"
+    assert main([*command, "--overwrite", "--resume", str(folder), "--workers", "2"]) == 0
+    assert asked["resume"] == folder and folder.exists() and callable(asked["executor"])
+    capsys.readouterr()
+    for options, said in (
+        (["--resume", str(tmp_path / "kept")], "ends in .zarr"),
+        (["--workers", "-1"], "must not be negative"),
+        (["--workers", "1", "--dask", "tcp://127.0.0.1:1"], "give one of them"),
+    ):
+        assert main([*command, "--overwrite", *options]) == 2
+        assert said in capsys.readouterr().err

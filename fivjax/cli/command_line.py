@@ -1,11 +1,9 @@
-"""The program: which commands there are, what exit code each end has, where compiled code is kept."""
+"""The program: which commands there are, what exit code each end has."""
 
 import contextlib
-import os
 import signal
 import sys
 import threading
-from pathlib import Path
 
 import tyro
 
@@ -13,6 +11,7 @@ import fivjax as fj
 
 from .analysis_commands import Calibrate, Cea
 from .branch_command import Branch
+from .compiled_code import keep_compiled_code
 from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
@@ -83,13 +82,3 @@ def _terminated_like_interrupted():
     finally:
         if mine:
             signal.signal(signal.SIGTERM, before)
-
-
-def keep_compiled_code() -> None:
-    """Keep compiled code in the user's cache folder, unless JAX was told where to keep it."""
-    import jax
-
-    if jax.config.jax_compilation_cache_dir is None:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "fivjax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

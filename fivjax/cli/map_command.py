@@ -12,6 +12,26 @@ import fivjax as fj
 from .options import MethodOptions, SceneOptions
 from .outputs import Failure, Interrupted, Overwrite, output_paths, say
 from .parsing import axis, number
+from .workers import workers_of
+
+
+def _folder(words: list[str]) -> Path:
+    if len(words) > 1:
+        raise ValueError(f"it takes one folder, but there are {len(words)}")
+    return Path(*words)
+
+
+# Without a word after it, an empty path.
+Resume = Annotated[
+    Path | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[FOLDER.zarr]",
+        instance_from_str=_folder,
+        is_instance=lambda instance: instance is None or isinstance(instance, Path),
+        str_from_instance=lambda instance: [] if instance is None else [str(instance)],
+    ),
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +51,13 @@ class Map:
     """time after which a trajectory without a verdict is called undecided (s)"""
     memory: float = 2e9
     """memory for trajectories under way (bytes)"""
-    resume: bool = False
-    """go on with the map of the same name that was interrupted"""
+    resume: Resume = None
+    """go on with the map of the same name that was interrupted; with a folder, keep the map there as it runs (Zarr), and go on
+    with what is there"""
+    workers: int = 0
+    """processes that compute; unless given, threads of this one"""
+    dask: str | None = None
+    """address of a Dask scheduler whose workers compute, such as tcp://10.0.0.1:8786"""
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
     method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
 
@@ -41,7 +66,11 @@ class Map:
 
         # Whoever began the map that is gone on with was asked whether its files may be overwritten.
         (unfinished,) = output_paths(self.out, True, ".unfinished")
-        going_on = self.resume and unfinished.exists()
+        asked = self.resume is not None
+        folder = None if self.resume == Path() else self.resume
+        if folder is not None and folder.suffix != ".zarr":
+            raise ValueError(f"Option `--resume` must name a folder that ends in .zarr, but is `{folder}`.")
+        going_on = asked and (folder or unfinished).exists()
         data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
         scene, method = self.scene.scene(), self.method.stepper()
         axes = dict(map(axis, (self.x, self.y)))
@@ -51,12 +80,12 @@ class Map:
             raise ValueError(
                 "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."
             )
-        if unfinished.exists() and not self.resume:
+        if unfinished.exists() and not asked:
             raise ValueError(
                 f"An interrupted map is kept in `{unfinished}`. Go on with it by `--resume`, or delete the file to begin anew."
             )
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), workers_of(self.workers, self.dask) as executor:
                 # What is said of an interrupted map here is more.
                 warnings.filterwarnings("ignore", message="Interrupted:")
                 dataset = fj.bistability_map(
@@ -64,8 +93,9 @@ class Map:
                     method=method,
                     t_max=self.t_max,
                     memory=self.memory,
-                    resume=unfinished,
+                    resume=folder or unfinished,
                     refine=self.refine,
+                    executor=executor,
                     **axes,
                 )
             if np.any(dataset["verdict"] == fj.Verdict.NOT_RUN):
@@ -73,8 +103,9 @@ class Map:
             fj.save(dataset, data)
             fj.save_figure(fj.plot.bistability(dataset), picture)
         except KeyboardInterrupt:
-            raise Interrupted(_how_to_resume(unfinished)) from None
-        unfinished.unlink(missing_ok=True)
+            raise Interrupted(_how_to_resume(folder, unfinished)) from None
+        if folder is None:
+            unfinished.unlink(missing_ok=True)
         say(data, picture)
         counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
         for verdict, count in counts.items():
@@ -89,7 +120,9 @@ def _in_words(verdict) -> str:
     return verdict.name.lower().replace("_", " ")
 
 
-def _how_to_resume(unfinished: Path) -> str:
+def _how_to_resume(folder: Path | None, unfinished: Path) -> str:
+    if folder is not None:
+        return f"Interrupted; what is finished is kept in `{folder}`. Go on with the same command."
     if not unfinished.exists():
         return "Interrupted before any trajectory was finished; nothing was written."
     return f"Interrupted; what is finished is kept in `{unfinished}`. Go on with the same command and `--resume`."

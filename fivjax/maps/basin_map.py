@@ -17,12 +17,13 @@ from ..verdicts.verdict import Verdict
 from .axes import check_run, checked_axes, checked_grid
 from .datasets import map_dataset
 from .engine import run_to_verdict
-from .executors import check_executor
+from .executors import with_workers
 from .resuming import keeper_at
 from .shares import wilson
 
 
 @in_double_precision
+@with_workers
 def basins(
     scene: Scene,
     *,
@@ -74,7 +75,6 @@ def basins(
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
     grid = checked_grid(axes, tuple(states))
-    check_executor(executor)
     _check_gap(scene, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": float(t_max), "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):

@@ -15,13 +15,14 @@ from ..steppers.event_exact import EventExact
 from .axes import check_run, checked_axes, checked_grid
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
-from .executors import check_executor
+from .executors import with_workers
 from .refinement import audit_note, finer, refined
 from .results import not_run
 from .resuming import keeper_at
 
 
 @in_double_precision
+@with_workers
 def bistability_map(
     scene: Scene,
     *,
@@ -101,7 +102,6 @@ def bistability_map(
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = checked_grid(axes)
-    check_executor(executor)
     limits = {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
     keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))

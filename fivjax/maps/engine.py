@@ -60,7 +60,7 @@ def run_to_verdict(
     energy: bool = False,
     states: Mapping[str, int] | None = None,
     attractors: dict[bytes, Attractors] | None = None,
-    executor=None,
+    executor: Workers | None = None,
     places: Places | None = None,
     verdicts: Verdicts | None = None,
     keeper: Keeper | None = None,
@@ -74,7 +74,7 @@ def run_to_verdict(
 
     `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
 
-    `executor` runs the jobs (`executors`); unless given, threads of this process do, and `memory` bounds how many run at a
+    `executor` runs the jobs; unless given, threads of this process do, and `memory` bounds how many run at a
     time.
 
     `places` are those that are to be run, all unless given. `verdicts` has those of all that an earlier run has left, and gets
@@ -112,7 +112,7 @@ def _follow(
     part: list[int],
     verdicts: Verdicts,
     attractors: dict[bytes, Attractors],
-    executor,
+    workers: Workers | None,
     at_a_time: int,
     keeper: Keeper | None,
     needed_later: bool,
@@ -137,7 +137,7 @@ def _follow(
         found[number] = result.found
         if keeper is not None:
             keeper.keep(places, verdicts, result.found if needed_later else {})
-        if executor is not None:
+        if workers is not None:
             bar.ended(len(places))
 
     def given_up(number: int) -> None:
@@ -150,7 +150,7 @@ def _follow(
 
     if not missing:
         pass
-    elif executor is None:
+    elif workers is None:
         failed = []
 
         def report(count: int) -> None:
@@ -159,19 +159,19 @@ def _follow(
                 raise KeyboardInterrupt
 
         with ThreadPoolExecutor(cores()) as blocks, ThreadPoolExecutor(at_a_time) as threads:
-            workers = Workers(threads)
+            mine = Workers(threads)
 
             def here(number: int):
-                return workers.submit(contextvars.copy_context().run, run_job, job(number), blocks, report)
+                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report)
 
             try:
-                hand_out(missing, here, workers, done, given_up, stop)
+                hand_out(missing, here, mine, done, given_up, stop)
             except BaseException:
                 failed.append(True)
                 raise
     else:
-        workers = Workers(executor)
-        hand_out(missing, lambda number: workers.submit(run_job, job(number)), workers, done, given_up, stop)
+        them = workers
+        hand_out(missing, lambda number: them.submit(run_job, job(number)), them, done, given_up, stop)
     for number in part:
         for key, one in found.get(number, {}).items():
             attractors.setdefault(key, one)

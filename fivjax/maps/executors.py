@@ -12,15 +12,34 @@ A `concurrent.futures.ProcessPoolExecutor` that broke is made anew from what it 
 """
 
 import contextlib
+import functools
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from ..foundation import arguments
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # Jobs that are handed out before the first is back, where the number of workers is not known.
 HANDED_OUT = 512
 MOST_BREAKS = 32
+
+
+def with_workers(function: Callable[P, R]) -> Callable[P, R]:
+    """`function`, with `Workers` in place of what a user gives it as `executor`, until it ends."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        executor = kwargs.get("executor")
+        if executor is None or isinstance(executor, Workers):
+            return function(*args, **kwargs)
+        check_executor(executor)
+        with contextlib.closing(Workers(executor)) as workers:
+            return function(*args, **{**kwargs, "executor": workers})
+
+    return wrapped
 
 
 def check_executor(executor) -> None:
@@ -50,7 +69,7 @@ class Workers:
         self._made_here = _makes_one(executor)
         self._make: Callable[[], Any] | None = executor if self._made_here else None
         self._executor = _adopted(executor() if self._made_here else executor)
-        self._breaks = 0
+        self._breaks, self._left_running = 0, False
 
     @property
     def side_by_side(self) -> int | None:
@@ -89,13 +108,22 @@ class Workers:
         """A job is done: the workers can do them."""
         self._breaks = 0
 
-    def close(self, futures=()) -> None:
-        """Takes back what has not begun, and ends an executor that was made here."""
+    def take_back(self, futures) -> None:
+        """Nobody waits for these any more."""
         for future in futures:
             future.cancel()
-        if self._made_here:
-            with contextlib.suppress(TypeError):
-                self._executor.shutdown(wait=False, cancel_futures=True)
+            self._left_running |= not future.done()
+
+    def close(self) -> None:
+        """Ends an executor that was made here, and what it still runs."""
+        if not self._made_here:
+            return
+        # Else the program would wait at its end for work that nobody wants.
+        processes = dict(getattr(self._executor, "_processes", None) or {}) if self._left_running else {}
+        with contextlib.suppress(TypeError):
+            self._executor.shutdown(wait=False, cancel_futures=True)
+        for process in processes.values():
+            process.terminate()
 
 
 def _makes_one(executor) -> bool:

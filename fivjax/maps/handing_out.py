@@ -98,7 +98,7 @@ def hand_out(
                 else:
                     waiting.append(number)
     finally:
-        workers.close(under_way)
+        workers.take_back(under_way)
 
 
 def _finished(future) -> bool:

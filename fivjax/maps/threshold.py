@@ -21,13 +21,14 @@ from .axes import add_linear_limit, check_run, checked_axes
 from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings
 from .engine import run_to_verdict
-from .executors import check_executor
+from .executors import with_workers
 
 # Points inside a bracket that are tried at once: more of them means fewer rounds, and the rounds are what takes time.
 POINTS_PER_ROUND = 15
 
 
 @in_double_precision
+@with_workers
 def critical_perturbation(
     scene: Scene,
     *,
@@ -113,7 +114,6 @@ def critical_perturbation(
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
     arguments.real_number("tolerance", tolerance, above=0)
     axes = checked_axes(scene, axis)
-    check_executor(executor)
     shape = tuple(len(values) for values in axes.values())
     columns = {
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)

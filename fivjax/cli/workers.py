@@ -1,0 +1,47 @@
+"""Who computes for a command: processes of this machine, or the workers of a Dask scheduler."""
+
+import contextlib
+import multiprocessing
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+from .compiled_code import keep_compiled_code
+
+
+@contextlib.contextmanager
+def workers_of(count: int, dask: str | None) -> Iterator:
+    """An executor for `fivjax.bistability_map` (None: its own threads) while the command runs.
+
+    **Raises:** `ValueError` for counts below zero, both kinds at once, and a scheduler that does not answer.
+    """
+    if count < 0:
+        raise ValueError(f"Option `--workers` must not be negative, but is {count}.")
+    if count and dask is not None:
+        raise ValueError("Options `--workers` and `--dask` are two places to compute in; give one of them.")
+    if dask is not None:
+        with contextlib.closing(_client(dask)) as client:
+            yield client
+    elif count:
+        context = multiprocessing.get_context("spawn")
+        # A function, so that the map makes them, has others when they die, and ends them when it is interrupted.
+        yield lambda: ProcessPoolExecutor(count, mp_context=context, initializer=_begin)
+    else:
+        yield None
+
+
+def _begin() -> None:
+    """In each process: Ctrl-C is answered by the one that hands the jobs out."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    keep_compiled_code()
+
+
+def _client(address: str):
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ValueError("Option `--dask` needs the package distributed: `pip install fivjax[dask]`.") from None
+    try:
+        return Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"Option `--dask`: no scheduler answers at {address} ({error}).") from None
