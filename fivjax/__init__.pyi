@@ -26,9 +26,10 @@ from .io.structure_files import read_structure as read_structure
 from .linear import cea as cea
 from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
-from .maps.smallest import NoSquealingKick as NoSquealingKick
 from .maps.smallest import SmallestKick as SmallestKick
 from .maps.smallest import smallest_kick as smallest_kick
+from .maps.smallest_perturbation import NoSquealingKick as NoSquealingKick
+from .maps.smallest_perturbation import SmallestPerturbation as SmallestPerturbation
 from .maps.threshold import critical_perturbation as critical_perturbation
 from .maps.tradeoff_study import tradeoff as tradeoff
 from .model.belt import belt_oscillator as belt_oscillator

@@ -58,7 +58,7 @@ GROUPS = {
     "maps": (
         "Maps and critical kicks",
         "Many trajectories at once, each with a verdict.",
-        ["bistability_map", "critical_perturbation", "smallest_kick", "basins", "Verdict"],
+        ["bistability_map", "critical_perturbation", "smallest_kick", "SmallestKick", "SmallestPerturbation", "basins", "Verdict"],
     ),
     "cycles": (
         "Limit cycles",

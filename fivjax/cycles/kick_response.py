@@ -49,13 +49,35 @@ def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
     """Crossings after the kick of the scene's load, from steady sliding on; as many as asked for, if there are."""
     start = Point(jnp.zeros(2 * scene.structure.size), Contact(jnp.asarray(1, jnp.int32), jnp.sign(scene.belt_speed)))
-    return _cut(_kicked(scene, stepper, directions, start, jnp.asarray(crossings, jnp.int32), MOST_CROSSINGS))
+    return _followed(scene, stepper, directions, start, None, crossings)
 
 
 def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:
     """Crossings from a point of the section on, without a kick."""
     quiet = scene.replace(p=1.0, duration=0.0)
-    return _cut(_kicked(quiet, stepper, directions, point, jnp.asarray(crossings, jnp.int32), MOST_CROSSINGS))
+    return _followed(quiet, stepper, directions, point, None, crossings)
+
+
+def started(
+    scene: Scene, stepper: EventExact, start: Point, directions: Float[np.ndarray, "d state"], crossings: int
+) -> Crossings:
+    """Crossings from any state on, without a kick, with derivatives along directions in that state."""
+    quiet = scene.replace(p=1.0, duration=0.0)
+    fixed = jax.tree.map(lambda leaf: np.zeros((len(directions), *np.shape(leaf))), quiet)
+    return _followed(quiet, stepper, fixed, start, directions, crossings)
+
+
+def _followed(
+    scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings: int
+) -> Crossings:
+    if of_start is None:
+        count = len(jax.tree.leaves(directions)[0])
+        of_start = np.zeros((count, start.y.shape[0]))
+    return _cut(
+        _kicked(
+            scene, stepper, directions, start, jnp.asarray(of_start), jnp.asarray(crossings, jnp.int32), MOST_CROSSINGS
+        )
+    )
 
 
 def _cut(found) -> Crossings:
@@ -64,19 +86,19 @@ def _cut(found) -> Crossings:
 
 
 @compiled
-def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, crossings, most: int):
-    def of(scene: Scene) -> tuple[Float[Array, "k state"], _Record]:
+def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings, most: int):
+    def of(scene: Scene, y: Float[Array, " state"]) -> tuple[Float[Array, "k state"], _Record]:
         load = scene.load
         assert isinstance(load, Pulse)
         mechanics = mechanics_about_sliding(scene)
         # Loads are deviations, too.
         more = (load.p - 1.0) * load.force
-        begin = physics.status_from_forces(mechanics, more, start.y)
+        begin = physics.status_from_forces(mechanics, more, y)
         quiet = load.duration <= 0
         begin = jax.tree.map(lambda a, b: jnp.where(quiet, a, b), start.contact, begin)
-        after = follow(stepper, mechanics, begin, more, start.y, load.duration, most=64 * MOST_SEGMENTS, kind="lax")
+        after = follow(stepper, mechanics, begin, more, y, load.duration, most=64 * MOST_SEGMENTS, kind="lax")
         empty = _Record(
-            jnp.full((most, len(start.y)), jnp.nan),
+            jnp.full((most, len(y)), jnp.nan),
             Contact(jnp.zeros(most, jnp.int32), jnp.ones(most)),
             jnp.zeros(most, jnp.int32),
             jnp.zeros((), jnp.int32),
@@ -98,11 +120,11 @@ def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, 
         ).total
         return found.y, found
 
-    def along(direction: Scene):
-        _, tangent, found = jax.jvp(of, (scene,), (direction,), has_aux=True)
+    def along(direction: Scene, of_start: Float[Array, " state"]):
+        _, tangent, found = jax.jvp(of, (scene, start.y), (direction, of_start), has_aux=True)
         return tangent, found
 
-    tangents, found = jax.vmap(along, out_axes=(0, None))(directions)
+    tangents, found = jax.vmap(along, out_axes=(0, None))(directions, of_start)
     return found.y, tangents, found.contact.status, found.contact.direction, found.events, found.count
 
 

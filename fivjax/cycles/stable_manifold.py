@@ -14,6 +14,7 @@ way from the kick to the saddle, and $l^T x_{s,θ} = l^T P_θ / (1 - Λ)$.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +24,8 @@ from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .closing import Closed, close
-from .kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned
+from .kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned, started
+from .search import states_in_contact
 from .section_map import Point
 
 # Trajectories that Newton's method may take, and where it has converged, relative to p.
@@ -180,3 +182,25 @@ def _derivatives(
         # flight and the next impact press less: to first order nothing changes.
         found["restitution"] = 0.0
     return found
+
+
+@in_double_precision
+def manifold_normal(
+    scene: Scene, y: Float[np.ndarray, " state"], saddle: Saddle | None = None
+) -> tuple[Float[np.ndarray, " state"], Saddle] | None:
+    """The normal of the stable manifold at a state close to it, and the saddle it belongs to; none where no saddle is passed.
+
+    **Arguments:** `scene`; `y`, a deviation from the sliding equilibrium under the final load; `saddle`, if it is known.
+    """
+    stepper, weights = EventExact(), np.asarray(scene.structure.weights)
+    start = jax.tree.map(lambda leaf: leaf[0], states_in_contact(scene, jnp.asarray(y)[None]))
+    directions = np.eye(len(y))[np.minimum(np.arange(len(y) + -len(y) % 16), len(y) - 1)]
+    path = started(scene, stepper, start, directions, MOST_CROSSINGS)
+    saddle = saddle_passed(scene, stepper, path) if saddle is None else saddle
+    if saddle is None:
+        return None
+    near = approach(path, saddle, weights)
+    if not len(near.place):
+        return None
+    place = int(near.place[np.argmin(near.distance)])
+    return (weights * path.y_parameter[: len(y), place]) @ saddle.left, saddle

@@ -9,7 +9,8 @@ for ever. Between two durations $h$ apart $P$ is at most the larger one plus $h 
 derivative.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +25,14 @@ from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..model.sliding import sliding_states
 from ..verdicts.sliding_proof import envelope_peak, sliding_modes
+from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
 from .threshold import critical_perturbation
 
 # Durations at which the bound is evaluated, and from which the smallest kick is sought.
 GRID, STARTS = 4096, 24
 # Steps of the search about the best start; derivatives of p_crit that count as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
-OVER = ("p", "duration", "start")
+OVER = ("p", "duration", "start", "state", "history")
 
 
 class SmallestKick(NamedTuple):
@@ -62,37 +64,58 @@ class SmallestKick(NamedTuple):
         )
 
 
-class NoSquealingKick(ValueError):
-    """No kick in the bounds leads to a limit cycle.
+@overload
+def smallest_kick(
+    scene: Scene,
+    over: Literal["state", "history"],
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+) -> SmallestPerturbation: ...
 
-    **Example:**
 
-        >>> try:
-        ...     fj.smallest_kick(scene, over="p", bounds={"p": (1.0, 1.02)})  # doctest: +SLOW
-        ... except fj.NoSquealingKick:
-        ...     print("none up to 1.02")
-        none up to 1.02
-    """
+@overload
+def smallest_kick(
+    scene: Scene,
+    over: Sequence[str] = ("p", "duration"),
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+) -> SmallestKick: ...
 
 
 @in_double_precision
 def smallest_kick(
-    scene: Scene, over=("p", "duration"), bounds: dict[str, tuple[float, float]] | None = None, *, p_step: float = 0.01
-) -> SmallestKick:
-    """The smallest p of a kick that leads to a limit cycle, over its duration too, and a certified bound below it.
+    scene: Scene,
+    over: Sequence[str] = ("p", "duration"),
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+) -> "SmallestKick | SmallestPerturbation":
+    """The smallest perturbation that leads to a limit cycle, and a certified bound below which none does.
+
+        print(fj.smallest_kick(scene))                  # the p of a kick, over its duration
+        print(fj.smallest_kick(scene, over="state"))    # the energy of an initial state
+        print(fj.smallest_kick(scene, over="history"))  # how far a load may leave its value
 
     **Arguments:**
 
     - `scene`, whose load is a `Pulse` and whose friction is constant.
     - `over`: what of the kick is free: "p" always, "duration", and "start", which changes nothing, because steady sliding
-      waits as it is.
-    - `bounds`: by name; p from 1 to 5 and durations up to twice the scene's unless given.
+      waits as it is. Or "state": the deviation from steady sliding of a contact that slides, without a kick, in the norm of its
+      energy. Or "history": a load that keeps one value in each of some equal pieces of time, and its final one after them.
+    - `bounds`: by name; p from 1 to 5 and durations up to twice the scene's unless given. A history lasts as long as the
+      longest duration, the scene's own unless given.
     - `p_step`: how finely p is scanned, as in `critical_perturbation`. A window of kicks narrower than it is not seen.
+    - `pieces`: of a history.
 
-    **Returns:** a `SmallestKick`; printing it says the gap.
+    **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it says the gap.
 
     **Raises:** `ValueError` for a load without a pulse, friction that varies with speed, sliding that is not stable, and
-    names or bounds that make no sense; `NoSquealingKick` where no kick leads to a limit cycle.
+    names or bounds that make no sense; `NoSquealingKick` where nothing that was tried leads to a limit cycle.
 
     **Example:**
 
@@ -105,6 +128,8 @@ def smallest_kick(
     refuse_several_contacts(scene.structure, "`smallest_kick`")
     if not scene.friction.constant:
         raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
+    if over in ("state", "history"):
+        return _other(scene, str(over), bounds or {}, pieces)
     free = (over,) if isinstance(over, str) else tuple(over)
     for name in free:
         arguments.one_of("over", name, OVER)
@@ -144,6 +169,21 @@ def smallest_kick(
     else:
         duration, p = float(starts[best]), float(row["p_crit"])
     return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]))
+
+
+def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], pieces: int) -> SmallestPerturbation:
+    """The smallest initial state or history of the load."""
+    arguments.whole_number("pieces", pieces, minimum=1)
+    allowed = ("duration",) if over == "history" else ()
+    unknown = sorted(set(bounds) - set(allowed))
+    if unknown:
+        what = "the duration alone" if allowed else "nothing"
+        raise ValueError(f"Argument `bounds` must name {what} where {over!r} is free, but has {unknown[0]!r}.")
+    if over == "state":
+        return smallest_state(scene)
+    time = bounds.get("duration", (0.0, float(scene.load.duration)))[1]
+    arguments.real_number("bounds['duration'][1]", time, above=0)
+    return smallest_history(scene, pieces, float(time))
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:

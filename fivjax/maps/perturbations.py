@@ -1,0 +1,268 @@
+r"""What may be smallest about a perturbation of steady sliding: an initial state, or a history of the load.
+
+Both are vectors $u$ with a norm, and both move, as long as the contact slides under constant friction, the two signals that end
+sliding linearly: a signal's change at the time $t$ is $κ(t) · u$. No $u$ smaller than the margin over $\sup_t |κ(t)|_*$, of the dual
+norm, ever ends it: such a perturbation is proved to slide for ever. The supremum is bounded between instants, too.
+"""
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..contact import Contact, Status
+from ..cycles.section_map import MOST_SEGMENTS, mechanics_about_sliding
+from ..foundation.compiling import compiled
+from ..linear.linearisation import LinearSliding, linear_sliding
+from ..model.scene import Scene
+from ..model.sliding import sliding_states
+from ..steppers.core import follow
+from ..steppers.event_exact import EventExact
+from ..verdicts.sliding_proof import SlidingModes, sliding_modes
+
+# Instants in a period of the fastest mode, while a history lasts and afterwards.
+FINE, COARSE = 1500, 128
+# Instants that are looked at together, and histories that are followed together.
+CHUNK, SIDE_BY_SIDE = 4096, 64
+MOST_INSTANTS = 2_000_000
+
+Vectors = Float[np.ndarray, "k m"]
+
+
+class Certificate(NamedTuple):
+    """A norm below which every perturbation slides for ever, and the shapes (of norm one) that come closest to ending that."""
+
+    size: float
+    shapes: Vectors
+
+
+class Perturbation(Protocol):
+    """A kind of perturbation, as a search for the smallest one wants it."""
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]: ...
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """The vector of norm one whose product with a gradient is largest."""
+        ...
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        """Deviations from sliding when all is over but the motion."""
+        ...
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        """The gradient in u from that in the state."""
+        ...
+
+    def certificate(self) -> Certificate: ...
+
+
+class _Sliding(NamedTuple):
+    modes: SlidingModes
+    linear: LinearSliding
+    signals: tuple[tuple[np.ndarray, float], ...]  # shares of modes in each signal, and its margin
+
+
+def stable_sliding(scene: Scene) -> _Sliding:
+    """Sliding in modal coordinates, without the leading axis of groups.
+
+    **Raises:** `ValueError` where steady sliding does not exist or is not stable.
+    """
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], _linear(scene))
+    modes = sliding_modes(batch)
+    if not bool(modes.stable[0]) or not bool(batch.exists[0]):
+        raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
+    own: SlidingModes = jax.tree.map(lambda leaf: leaf[0], modes)
+    linear = own.linear
+    margins = float(np.asarray(linear.slip_margin)), float(np.asarray(linear.pressing_margin))
+    return _Sliding(own, linear, ((own.slip, margins[0]), (own.pressing, margins[1])))
+
+
+@compiled
+def _linear(scene: Scene) -> LinearSliding:
+    return linear_sliding(scene)
+
+
+class InitialStates:
+    """Deviations from sliding of a contact that stays closed; the norm is the square root of their energy, in √J."""
+
+    def __init__(self, scene: Scene):
+        self.scene, n = scene, scene.structure.size
+        self.sliding = stable_sliding(scene)
+        self.places = sliding_states(n, scene.structure.normal)
+        free = self.places[: len(self.places) // 2]
+        energy = np.zeros((2 * len(free), 2 * len(free)))
+        energy[: len(free), : len(free)] = np.asarray(scene.structure.stiffness)[np.ix_(free, free)]
+        energy[len(free) :, len(free) :] = np.asarray(scene.structure.mass)[np.ix_(free, free)]
+        # Half of z · energy z is the energy; `root` times a unit vector is a state of one joule.
+        self.energy = 0.5 * energy
+        self.root = np.linalg.inv(np.linalg.cholesky(self.energy)).T
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
+        return np.sqrt(np.einsum("ki,ij,kj->k", u, self.energy, u))
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        along = gradient @ self.root
+        return self.root @ along / np.linalg.norm(along)
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        full = np.zeros((len(u), 2 * self.scene.structure.size))
+        full[:, self.places] = u
+        return full
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        del u
+        return gradient[self.places]
+
+    def certificate(self) -> Certificate:
+        modes = self.sliding.modes
+        to_modal, rates = np.asarray(modes.to_modal) @ self.root, np.asarray(modes.eigenvalues)
+        # How fast the energy may grow, whatever the state: what can happen between two instants.
+        inner = np.linalg.solve(self.root, np.asarray(self.sliding.linear.matrix) @ self.root)
+        growth = max(float(np.max(np.linalg.eigvalsh(0.5 * (inner + inner.T)))), 0.0)
+        step = 2 * np.pi / (COARSE * np.max(np.abs(rates)))
+        size, shapes = np.inf, []
+        for shares, margin in self.sliding.signals:
+            rows = np.asarray(shares)[:, None] * to_modal
+            sizes, vectors = _later(rows, rates, step, 0.0, lambda rows: np.linalg.norm(rows, axis=-1))
+            size = min(size, margin / (float(np.max(sizes)) * np.exp(growth * step)))
+            chosen = vectors[_highest(sizes)]
+            shapes.append(-(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)) @ self.root.T)
+        return Certificate(size, np.concatenate(shapes))
+
+
+class Histories:
+    """Factors on the load in equal pieces of a time, less one; the norm is the largest size of any."""
+
+    def __init__(self, scene: Scene, pieces: int, time: float):
+        self.scene, self.pieces, self.time = scene, pieces, time
+        self.sliding = stable_sliding(scene)
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
+        return np.max(np.abs(u), axis=-1)
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        return np.sign(gradient)
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        found = []
+        for start in range(0, len(u), SIDE_BY_SIDE):
+            # Filled up with copies, so that one size is compiled.
+            rows = np.minimum(np.arange(start, start + SIDE_BY_SIDE), len(u) - 1)
+            found.append(np.asarray(_after(self.scene, EventExact(), jnp.asarray(u[rows]), self.time)))
+        return np.concatenate(found)[: len(u)]
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        return gradient @ np.asarray(_after_with_jacobian(self.scene, EventExact(), jnp.asarray(u), self.time))
+
+    def certificate(self) -> Certificate:
+        modes = self.sliding.modes
+        rates = np.asarray(modes.eigenvalues)
+        shift = np.asarray(self.sliding.linear.equilibrium)[
+            sliding_states(self.scene.structure.size, self.scene.structure.normal)
+        ]
+        modal = np.asarray(modes.to_modal) @ shift.astype(complex)
+        edges, fastest = np.linspace(0.0, self.time, self.pieces + 1), np.max(np.abs(rates))
+        count = int(np.ceil(FINE * fastest * self.time / (2 * np.pi * self.pieces)))
+        inside = np.linspace(0.0, self.time / self.pieces, count + 1)
+        size, shapes = np.inf, []
+        for row, (shares, margin) in enumerate(self.sliding.signals):
+            own = np.asarray(shares) * modal
+            steady = float(np.real(np.sum(own)))
+            # The load presses by itself while it lasts.
+            direct = margin - steady if row == 1 else 0.0
+
+            def response(t, own=own, jump=direct + steady):
+                """Of the signal to a load that is twice as high from t = 0 on."""
+                return jump - np.real(np.exp(np.multiply.outer(t, rates)) @ own)
+
+            def bending(t, own=own):
+                return -np.real(np.exp(np.multiply.outer(t, rates)) @ (own * rates**2))
+
+            vectors, second = (
+                np.concatenate([self._of_pieces(of, piece, edges, inside) for piece in range(self.pieces)])
+                for of in (response, bending)
+            )
+            during = np.sum(np.abs(vectors), axis=-1)
+            crude = 2 * self.pieces * float(np.sum(np.abs(own) * np.abs(rates) ** 4))
+            peak = _peak(during, np.sum(np.abs(second), axis=-1), crude, inside[1] - inside[0])
+            rows = own[:, None] * (np.exp(np.outer(rates, -edges[1:])) - np.exp(np.outer(rates, -edges[:-1])))
+            step = 2 * np.pi / (COARSE * fastest)
+            sizes, later = _later(rows, rates, step, self.time, _sum_of_sizes)
+            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, self.time, _sum_of_sizes)
+            ends = np.exp(rates.real * self.time)[:, None]
+            crude = float(np.sum(np.abs(rows) * ends * np.abs(rates[:, None]) ** 4))
+            size = min(size, margin / max(peak, _peak(sizes, bends, crude, step)))
+            for values, rows in ((during, vectors), (sizes, later)):
+                shapes.append(-np.sign(rows[_highest(values)]))
+        shapes = np.concatenate(shapes)
+        return Certificate(float(size), np.where(shapes == 0, 1.0, shapes))
+
+    def _of_pieces(self, of, piece: int, edges: np.ndarray, inside: np.ndarray) -> np.ndarray:
+        """What each piece of the history so far adds to a signal during one of them, from its response to a step."""
+        since = edges[piece] + inside[:, None] - edges[: piece + 1]
+        before = np.arange(piece + 1) < piece
+        ended = np.where(before, of(np.where(before, since - self.time / self.pieces, 0.0)), 0.0)
+        return np.pad(of(since) - ended, ((0, 0), (0, self.pieces - piece - 1)))
+
+
+def _peak(sizes: np.ndarray, bends: np.ndarray, crude: float, step: float) -> float:
+    """A bound on a signal between instants, too: it leaves its chord by what its second derivative allows, which in turn leaves
+    its own by what a crude bound on the fourth does.
+    """
+    chord = step**2 / 8
+    return float(np.max(sizes)) + chord * (float(np.max(bends)) + chord * crude)
+
+
+def _sum_of_sizes(rows: np.ndarray) -> np.ndarray:
+    return np.sum(np.abs(rows), axis=-1)
+
+
+def _later(rows: np.ndarray, rates: np.ndarray, step: float, begin: float, norm) -> tuple[np.ndarray, np.ndarray]:
+    """A row of signals and its norm at even instants from `begin` on, up to where what is left is smaller than what was."""
+    whole = float(np.sum(norm(np.abs(rows)) * np.exp(rates.real * begin)))
+    sizes, vectors, most, count = [], [], 0.0, 0
+    while not count or np.max(np.exp(rates.real * step * count)) * whole >= most:
+        if count > MOST_INSTANTS:
+            raise ValueError(
+                "Steady sliding decays too slowly here for a certified bound. Go further from the critical friction."
+            )
+        t = begin + step * np.arange(count, count + CHUNK)
+        found = np.real(np.exp(np.outer(t, rates)) @ rows)
+        vectors.append(found)
+        sizes.append(norm(found))
+        most, count = max(most, float(np.max(sizes[-1]))), count + CHUNK
+    return np.concatenate(sizes), np.concatenate(vectors)
+
+
+def _highest(sizes: np.ndarray) -> list[int]:
+    """Where a norm is largest, before that and after that."""
+    top = int(np.argmax(sizes))
+    parts = ((0, len(sizes)), (0, top // 2), (min(top + top // 2 + 1, len(sizes)), len(sizes)))
+    return [low + int(np.argmax(sizes[low:high])) for low, high in parts if high > low]
+
+
+@compiled
+def _after(scene: Scene, stepper: EventExact, factors, time):
+    return jax.vmap(lambda one: _after_one(scene, stepper, one, time))(factors)
+
+
+@compiled
+def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
+    return jax.jacfwd(lambda one: _after_one(scene, stepper, one, time))(factors)
+
+
+def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
+    """The state after a history of the load, from steady sliding on."""
+    mechanics, n = mechanics_about_sliding(scene), scene.structure.size
+
+    def piece(carry, factor):
+        y, contact = carry
+        # Loads are deviations, too.
+        more, part = factor * scene.load.final, time / len(factors)
+        after = follow(stepper, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
+        return (after.y, after.contact), None
+
+    sliding = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.sign(scene.belt_speed))
+    return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0]

@@ -1,0 +1,176 @@
+r"""The smallest perturbation of a kind that leads to a limit cycle, between a certified bound and one that was found.
+
+Along a ray, verdicts say where the first one squeals. There the motion lands on the saddle's stable manifold, whose normal,
+carried back to the perturbation, says in which direction the manifold comes closer: the shape that is steepest in the norm. The
+search goes there as far as it gains, from the best of the shapes that linear sliding nominates.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..cycles.stable_manifold import Saddle, manifold_normal
+from ..model.load import ConstantLoad
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from ..verdicts.verdict import Verdict
+from .attractors import Attractors
+from .crossing import Crossing, first_crossings
+from .engine import run_to_verdict
+from .perturbations import Histories, InitialStates, Perturbation, Vectors, stable_sliding
+
+# How far above the certified bound a ray is looked along at first, and at how many sizes; then around where it was, and inside
+# a bracket.
+FARTHEST, SCANNED, AROUND, INSIDE = 4.0, 60, 16, 15
+# Relative widths of brackets while searching, and of the last one.
+ROUGH, EXACT = 1e-5, 1e-8
+SHARES = np.array([1.0, 0.5, 0.25, 0.1, 0.04, 0.015])
+MOST_STEPS, GAINED = 12, 1e-6
+
+
+class SmallestPerturbation(NamedTuple):
+    """The smallest initial state, or load history, found that leads to a limit cycle, and a certified bound below it.
+
+    Sizes are norms: of an initial state the square root of the energy of its deviation from steady sliding (√J), of a history
+    the largest share by which the load leaves its final value.
+
+    **Example:**
+
+        >>> found = fj.smallest_kick(scene.replace(belt_speed=1.0), over="state")  # doctest: +SLOW
+        >>> bool(0.5 < found.ratio < 1.0)  # doctest: +SLOW
+        True
+    """
+
+    over: str  # "state" or "history"
+    size: float  # of the smallest found that leads to a limit cycle
+    certified: float  # every smaller one slides for ever
+    proved_low: float  # the same shape with this size was proved to slide, and
+    proved_high: float  # with this size to end on a limit cycle
+    values: np.ndarray  # displacements (m) and velocities (m/s), the `y0` of `simulate`; or the factor p of each piece
+    trajectories: int  # that the search took
+
+    @property
+    def ratio(self) -> float:
+        """The certified bound's share of what was found: one would close the gap."""
+        return self.certified / self.size
+
+    def __str__(self) -> str:
+        if self.over == "state":
+            found = f"smallest initial state found: {self.size**2:.6g} J about steady sliding lead to a limit cycle"
+            bound = f"certified: every state in contact with less than {self.certified**2:.6g} J slides for ever"
+        else:
+            found = f"smallest history found: a load within {100 * self.size:.6g} % of its own leads to a limit cycle"
+            bound = f"certified: every history within {100 * self.certified:.6g} % slides for ever"
+        return f"{found}\n{bound}\ngap: the bound is {100 * self.ratio:.3g} % of what was found, as a norm"
+
+
+class NoSquealingKick(ValueError):
+    """No kick, state or history in the bounds leads to a limit cycle.
+
+    **Example:**
+
+        >>> try:
+        ...     fj.smallest_kick(scene, over="p", bounds={"p": (1.0, 1.02)})  # doctest: +SLOW
+        ... except fj.NoSquealingKick:
+        ...     print("none up to 1.02")
+        none up to 1.02
+    """
+
+
+def smallest_state(scene: Scene) -> SmallestPerturbation:
+    """The initial state of least energy, on the belt and sliding, that leads to a limit cycle."""
+    kind = InitialStates(scene)
+    return _smallest(scene, "state", kind, np.inf)
+
+
+def smallest_history(scene: Scene, pieces: int, time: float) -> SmallestPerturbation:
+    """The history of the load, in equal pieces of a time (s), that leaves the final load least and leads to a limit cycle."""
+    return _smallest(scene, "history", Histories(scene, pieces, time), 1.0)
+
+
+class _Rays:
+    """Where perturbations along rays squeal first."""
+
+    def __init__(self, scene: Scene, kind: Perturbation):
+        self.kind = kind
+        self.scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
+        names = scene.structure.coordinates
+        self.places = {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
+        self.rest = np.asarray(stable_sliding(scene).linear.equilibrium)
+        self.attractors: dict[bytes, Attractors] = {}
+        self.trajectories = 0
+
+    def verdicts(self, u: Vectors) -> np.ndarray:
+        states = self.kind.states(u) + self.rest
+        self.trajectories += len(u)
+        values = {name: np.ascontiguousarray(states[:, place]) for name, place in self.places.items()}
+        return run_to_verdict(
+            self.scene,
+            values,
+            EventExact(),
+            t_max=30.0,
+            memory=2e9,
+            progress=False,
+            label="states",
+            states=self.places,
+            attractors=self.attractors,
+        ).verdict
+
+    def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> Crossing:
+        """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to a relative width."""
+        found = first_crossings(sizes, self._along(shapes, sizes))
+        while True:
+            wide = np.flatnonzero(found.high - found.low > width * found.high)
+            if not len(wide):
+                return found
+            inner = np.linspace(found.low[wide], found.high[wide], INSIDE + 2, axis=1)
+            verdicts = self._along(shapes[wide], inner[:, 1:-1])
+            ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(wide), 2))
+            now = first_crossings(inner, np.concatenate([ends[:, :1], verdicts, ends[:, 1:]], axis=1))
+            stuck = now.high - now.low >= 0.9 * (found.high[wide] - found.low[wide])
+            for whole, part in zip(found, now, strict=True):
+                whole[wide] = part
+            # Undecided ones keep the two apart.
+            found.low[wide[stuck]] = np.nan
+
+    def _along(self, shapes: Vectors, sizes: np.ndarray) -> np.ndarray:
+        return self.verdicts((shapes[:, None] * sizes[..., None]).reshape(-1, shapes.shape[1])).reshape(sizes.shape)
+
+
+def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> SmallestPerturbation:
+    certificate, rays = kind.certificate(), _Rays(scene, kind)
+    shapes = certificate.shapes
+    largest = min(FARTHEST * certificate.size, most)
+    sizes = np.tile(np.linspace(0.99 * certificate.size, largest, SCANNED), (len(shapes), 1))
+    found = rays.first(shapes, sizes, ROUGH)
+    if not np.any(np.isfinite(found.low)):
+        raise NoSquealingKick(
+            f"None of the {len(shapes)} shapes that were tried leads to a limit cycle at up to "
+            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`, or kick harder."
+        )
+    best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
+    shape, low, high = shapes[best], float(found.low[best]), float(found.high[best])
+    saddle: Saddle | None = None
+    for _ in range(MOST_STEPS):
+        u = low * shape
+        normal = manifold_normal(scene, kind.states(u[None])[0], saddle)
+        if normal is None:
+            break
+        gradient, saddle = kind.pulled_back(u, normal[0]), normal[1]
+        steepest = kind.steepest(gradient * np.sign(gradient @ shape))
+        tried = shape + SHARES[:, None] * (steepest - shape)
+        tried = tried / kind.norm(tried)[:, None]
+        around = np.tile(np.linspace(max(0.9 * low, 0.99 * certificate.size), 1.001 * high, AROUND), (len(tried), 1))
+        found = rays.first(tried, around, ROUGH)
+        if not np.any(np.isfinite(found.low)):
+            break
+        best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
+        if found.high[best] >= high * (1 - GAINED):
+            break
+        shape, low, high = tried[best], float(found.low[best]), float(found.high[best])
+    ends = rays.first(shape[None], np.array([[low, high]]), EXACT)
+    if np.isfinite(ends.low[0]):
+        low, high = float(ends.low[0]), float(ends.high[0])
+    values = rays.rest + kind.states(high * shape[None])[0] if over == "state" else 1.0 + high * shape
+    return SmallestPerturbation(over, high, certificate.size, low, high, values, rays.trajectories)
