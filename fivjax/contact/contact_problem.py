@@ -67,8 +67,10 @@ def forces_of(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[A
     return forces[: len(state)], forces[len(state) :]
 
 
-def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " c"]:
-    """How far each contact is from being admissible in these states, relative to the terms in its conditions; zero if it is."""
+def margins(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """By how much the conditions of these states on forces and on accelerations are met, relative to the terms in them;
+    infinite where there is none.
+    """
     holding, normal_force = forces_of(problem, state)
     g_tt, g_tn, g_nn = problem.mechanics.compliance
     along = problem.tangential + g_tt @ holding + g_tn @ normal_force
@@ -78,15 +80,21 @@ def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " 
     edges = jnp.stack([edge - holding, edge + holding], axis=-1) + problem.cone_edges
     in_cone = jnp.minimum(jnp.min(edges, axis=-1), pressed)
     sign = jnp.where(state == FORWARD, 1.0, -1.0)
-    sliding = (state == FORWARD) | (state == BACKWARD)
-    tie, infinite = TIE[along.dtype.name], jnp.inf
+    sliding, infinite = (state == FORWARD) | (state == BACKWARD), jnp.inf
     force_margin = jnp.where(state == STICK, in_cone, jnp.where(sliding, pressed, infinite)) / problem.force_size
     change_margin = jnp.where(sliding & ~problem.slips, -sign * along, infinite)
     change_margin = jnp.where((state == OPEN) & ~problem.away, apart, change_margin) / problem.change_size
+    return force_margin, change_margin
+
+
+def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " c"]:
+    """How far each contact is from being admissible in these states, relative to the terms in its conditions; zero if it is."""
+    force_margin, change_margin = margins(problem, state)
+    tie = TIE[problem.normal.dtype.name]
     need = jnp.where(state == problem.ended, tie, -tie)
     violation = jnp.maximum(jnp.maximum(need - force_margin, need - change_margin), 0.0)
     forbidden = ~jnp.any(problem.allowed & (state[:, None] == np.arange(4)), axis=-1)
-    return jnp.where(forbidden | jnp.isnan(violation), infinite, violation)
+    return jnp.where(forbidden | jnp.isnan(violation), jnp.inf, violation)
 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:

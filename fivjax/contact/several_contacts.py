@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .contact_problem import BACKWARD, FORWARD, NONE, OPEN, STICK, ContactProblem, forces_of, settled_states
+from .contact_problem import BACKWARD, FORWARD, NONE, OPEN, STICK, ContactProblem, forces_of, margins, settled_states
 from .coordinates import spread
 from .forces import State, degrees_of_freedom, free_acceleration, gap, gap_rate, relative_velocity
 from .mechanics import Mechanics
@@ -23,24 +23,8 @@ def modes_from_forces(
 
     `before` is a guess, and `ended` what `ContactProblem` says: states that must not go on by a hair.
     """
-    slip = relative_velocity(mechanics, y)
-    free = free_acceleration(mechanics, load, y)
-    away = (gap(mechanics, y) > 0) | (gap_rate(mechanics, y) > 0)
-    slips = slip != 0
-    sizes = _sizes_of_free(mechanics, load, y)
-    problem = _problem(
-        mechanics,
-        free[mechanics.tangential],
-        free[mechanics.normal],
-        sizes,
-        sliding=mechanics.friction(jnp.abs(slip)),
-        static=mechanics.friction.static,
-        allowed=_allowed(away, slips, slip < 0),
-        slips=slips,
-        away=away,
-        ended=jnp.full_like(away, NONE, jnp.int32) if ended is None else ended,
-        with_rest=True,
-    )
+    problem = _mode_problem(mechanics, load, y, ended)
+    away, slips, slip = problem.away, problem.slips, relative_velocity(mechanics, y)
     guess = jnp.where(away, OPEN, jnp.where(slips, jnp.where(slip < 0, FORWARD, BACKWARD), STICK))
     if before is not None:
         going_on = state_of(before)
@@ -56,7 +40,42 @@ def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Arra
 
     Every contact on the belt takes part: what strikes one may lift, stop or turn another.
     """
-    n = degrees_of_freedom(y)
+    n, frictionless = degrees_of_freedom(y), mechanics.impact_law == "frictionless"
+    problem = _impact_problem(mechanics, y)
+    away = problem.away
+    guess = jnp.where(away, OPEN, FORWARD if frictionless else STICK)
+    found = settled_states(problem, guess.astype(jnp.int32))
+    tangential_impulse, normal_impulse = forces_of(problem, found)
+    kick = spread(mechanics.from_tangential, tangential_impulse) + spread(mechanics.from_normal, normal_impulse)
+    return y.at[n:].add(kick), found != OPEN, found == STICK
+
+
+def _mode_problem(
+    mechanics: Mechanics, load: Float[Array, ""], y: State, ended: Int[Array, " c"] | None = None
+) -> ContactProblem:
+    """The problem of the forces in a state on its constraints."""
+    slip = relative_velocity(mechanics, y)
+    free = free_acceleration(mechanics, load, y)
+    away = (gap(mechanics, y) > 0) | (gap_rate(mechanics, y) > 0)
+    slips = slip != 0
+    sizes = _sizes_of_free(mechanics, load, y)
+    return _problem(
+        mechanics,
+        free[mechanics.tangential],
+        free[mechanics.normal],
+        sizes,
+        sliding=mechanics.friction(jnp.abs(slip)),
+        static=mechanics.friction.static,
+        allowed=_allowed(away, slips, slip < 0),
+        slips=slips,
+        away=away,
+        ended=jnp.full_like(away, NONE, jnp.int32) if ended is None else ended,
+        with_rest=True,
+    )
+
+
+def _impact_problem(mechanics: Mechanics, y: State) -> ContactProblem:
+    """The problem of the impulses in a state whose gaps have closed."""
     approach, slip = gap_rate(mechanics, y), relative_velocity(mechanics, y)
     away = gap(mechanics, y) > 0
     demanded = (1.0 + mechanics.restitution) * approach
@@ -65,7 +84,7 @@ def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Arra
     if frictionless:
         mu = jnp.zeros_like(mu)
     nobody = jnp.zeros_like(away)
-    problem = _problem(
+    return _problem(
         mechanics,
         slip,
         demanded,
@@ -79,11 +98,18 @@ def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Arra
         ended=jnp.full_like(away, NONE, jnp.int32),
         with_rest=False,
     )
-    guess = jnp.where(away, OPEN, FORWARD if frictionless else STICK)
-    found = settled_states(problem, guess.astype(jnp.int32))
-    tangential_impulse, normal_impulse = forces_of(problem, found)
-    kick = spread(mechanics.from_tangential, tangential_impulse) + spread(mechanics.from_normal, normal_impulse)
-    return y.at[n:].add(kick), found != OPEN, found == STICK
+
+
+def clearness_of_modes(mechanics: Mechanics, load: Float[Array, ""], y: State, contact: Contact) -> Float[Array, " c"]:
+    """By how much the modes that a state on its constraints is in are admissible, relative to the terms in their conditions."""
+    return jnp.abs(jnp.minimum(*margins(_mode_problem(mechanics, load, y), state_of(contact))))
+
+
+def clearness_of_impact(mechanics: Mechanics, y: State) -> Float[Array, " c"]:
+    """The same of the impulses that follow where gaps have closed."""
+    problem = _impact_problem(mechanics, y)
+    found = settled_states(problem, jnp.where(problem.away, OPEN, STICK).astype(jnp.int32))
+    return jnp.abs(jnp.minimum(*margins(problem, found)))
 
 
 def state_of(contact: Contact) -> Int[Array, " c"]:

@@ -66,6 +66,20 @@ def transition(
     )
 
 
+def stopped(mechanics: Mechanics, contact: Contact, y: State, ended: Bool[Array, "*contacts 2"]) -> State:
+    """The state with gaps that have closed, and slip that has run out, at exactly zero; sticking has none to begin with."""
+    n = degrees_of_freedom(y)
+    touched = (contact.status == Status.DETACH) & ended[..., 0]
+    at_rest = ((contact.status == Status.SLIDE) & ended[..., 1]) | (contact.status == Status.STICK)
+    return with_contact_coordinates(
+        mechanics,
+        y,
+        gap=jnp.where(touched, 0.0, gap(mechanics, y)),
+        gap_rate=gap_rate(mechanics, y),
+        tangential_velocity=jnp.where(at_rest, mechanics.belt_speed, y[n + mechanics.tangential]),
+    )
+
+
 def _following(
     mechanics: Mechanics,
     contact: Contact,
@@ -74,21 +88,9 @@ def _following(
     ended: Bool[Array, "*contacts 2"],
     resolution,
 ) -> tuple[Contact, State]:
-    n = degrees_of_freedom(y)
-    detached = contact.status == Status.DETACH
-    sliding = contact.status == Status.SLIDE
-    lifted = sliding & ended[..., 0]
-    touched = detached & ended[..., 0]
-    # Slip that has run out is put at exactly zero; sticking has none to begin with.
-    stopped = (sliding & ended[..., 1]) | (contact.status == Status.STICK)
-    stopped_velocity = jnp.where(stopped, mechanics.belt_speed, y[n + mechanics.tangential])
-    y_stopped = with_contact_coordinates(
-        mechanics,
-        y,
-        gap=jnp.where(touched, 0.0, gap(mechanics, y)),
-        gap_rate=gap_rate(mechanics, y),
-        tangential_velocity=stopped_velocity,
-    )
+    lifted = (contact.status == Status.SLIDE) & ended[..., 0]
+    touched = (contact.status == Status.DETACH) & ended[..., 0]
+    y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck():
         return _resting(mechanics, contact, load, impact(mechanics, y_stopped), touched, resolution)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Mechanics
+from ..contact import Contact, Mechanics, ModeForces, Status
 from ..foundation.linear_solve import solve
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
@@ -20,20 +20,21 @@ LOWEST_SLIP = 0.5
 class LinearSliding(eqx.Module):
     """The sliding motion linearised about its equilibrium, with the two signals that end it.
 
-    `m` is twice the number of coordinates that sliding leaves free: the structure's without the normal one.
+    `m` is twice the number of coordinates that sliding leaves free: the structure's without the normal one. Of several
+    contacts everything about a contact has an axis over them, and the pressing signals are the normal forces in N.
     """
 
     equilibrium: Float[Array, " state"]  # the state about which the deviation z is measured
     matrix: Float[Array, "m m"]
     frictionless: Float[Array, "m m"]  # the same without friction
-    pressing: Float[Array, " m"]  # row: how z changes the pressing acceleration, the free one towards the belt
-    pressing_margin: Float[Array, ""]  # its size at equilibrium, m/s²
-    slip: Float[Array, " m"]  # row: how z changes the slip speed
-    slip_margin: Float[Array, ""]  # its size at equilibrium, m/s
-    remainder: Float[Array, " m"]  # direction in which the remainder of the friction law acts
-    remainder_slope: Float[Array, ""]  # bounds on that remainder, see `decays_nonlinearly`
-    remainder_curvature: Float[Array, ""]
-    direction: Float[Array, ""]  # of the friction force
+    pressing: Float[Array, "*contacts m"]  # row: how z changes the pressing acceleration, the free one towards the belt
+    pressing_margin: Float[Array, "*contacts"]  # its size at equilibrium, m/s²
+    slip: Float[Array, "*contacts m"]  # row: how z changes the slip speed
+    slip_margin: Float[Array, "*contacts"]  # its size at equilibrium, m/s
+    remainder: Float[Array, "*contacts m"]  # direction in which the remainder of the friction law acts
+    remainder_slope: Float[Array, "*contacts"]  # bounds on that remainder, see `decays_nonlinearly`
+    remainder_curvature: Float[Array, "*contacts"]
+    direction: Float[Array, "*contacts"]  # of the friction force
     exists: Bool[Array, ""]  # steady sliding exists and presses
     solvable: Bool[Array, ""]  # the contact problem has one solution in either direction of slip
 
@@ -45,6 +46,8 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     are derivatives of `contact`, by automatic differentiation.
     """
     mechanics = Mechanics(scene)
+    if mechanics.several:
+        return _of_several(scene, mechanics)
     n, load = scene.structure.size, scene.load.final
     q, normal_force = steady_sliding(scene, load)
     equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
@@ -85,6 +88,64 @@ def linear_sliding(scene: Scene) -> LinearSliding:
         direction=direction,
         exists=(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
         solvable=(compliance > 0) & (mechanics.normal_compliance(-direction, static) > 0),
+    )
+
+
+def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
+    r"""`linear_sliding` of several contacts.
+
+    With $D = \mathrm{diag}(σ_i μ_i)$, the coefficients at equilibrium in $D_0$, $A_0 = G_{nn} + G_{nt} D_0$ and the forces
+    $N_0(z) = -A_0^{-1} a_n(z)$ under those, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$, and
+    friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
+    `remainder` has the columns of $M^{-1} P$. What linearisation leaves out of column i is at most `remainder_slope` plus half
+    `remainder_curvature`, times the square of a size by which all signals stay within their margins (`decays_nonlinearly`).
+    """
+    n, load, law = scene.structure.size, scene.load.final, mechanics.friction
+    q, normal_force = steady_sliding(scene, load)
+    equilibrium = jnp.concatenate([q, jnp.zeros(n, q.dtype)])
+    direction, speed = jnp.sign(mechanics.belt_speed), jnp.abs(mechanics.belt_speed)
+    keep = sliding_states(n, mechanics.normal)
+    contact = Contact(jnp.full(direction.shape, Status.SLIDE, jnp.int32), direction)
+    mu = law(speed)
+    dragging = direction * mu
+    mass, damping, stiffness = sliding_matrices(scene.structure, dragging)
+    if not law.constant:
+        _, slopes = jax.jvp(lambda v: law(v), (speed,), (jnp.ones_like(speed),))
+        free = sliding_coordinates(n, mechanics.normal)
+        along = jnp.asarray(free[:, None] == mechanics.tangential, damping.dtype)
+        damping = damping + (along * (normal_force * slopes)) @ along.T
+    mode = ModeForces(mechanics, contact, mu)
+
+    def pressing(z):
+        y = equilibrium.at[keep].add(z)
+        return mode.added(mechanics, physics.free_acceleration(mechanics, load, y))[1]
+
+    def slip(z):
+        return -direction * physics.relative_velocity(mechanics, equilibrium.at[keep].add(z))
+
+    rest = jnp.zeros(len(keep), q.dtype)
+    _, g_tn, g_nn = mechanics.compliance
+    handed_on = jnp.linalg.solve(g_nn + g_tn.T * dragging, g_tn.T)
+    columns = mechanics.from_tangential - (mechanics.from_tangential * dragging + mechanics.from_normal) @ handed_on
+    slope, curvature = law.variation(LOWEST_SLIP * speed)
+    forces = jnp.abs(normal_force)
+    changes = jnp.abs(handed_on) * (slope * speed)
+    most = LOWEST_SLIP * jnp.max(jnp.sum(changes, axis=1))
+    added = jnp.max(forces + changes @ forces) / jnp.where(most < 0.9, 1 - most, 0.0)
+    return LinearSliding(
+        equilibrium=equilibrium,
+        matrix=state_matrix(mass, damping, stiffness),
+        frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(dragging))),
+        pressing=jax.jacfwd(pressing)(rest),
+        pressing_margin=pressing(rest),
+        slip=jax.jacfwd(slip)(rest),
+        slip_margin=slip(rest),
+        remainder=jnp.concatenate([jnp.zeros((n, len(direction)), q.dtype), columns])[keep].T,
+        remainder_slope=slope * speed * added,
+        remainder_curvature=curvature * speed**2 * forces,
+        direction=direction,
+        exists=jnp.all((normal_force >= 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
+        solvable=physics.slides_uniquely(mechanics),
     )
 
 

@@ -254,9 +254,14 @@ def refuse_several_contacts(structure: Structure, who: str) -> None:
         raise ValueError(
             f"{who} takes structures with one contact, but this one has {len(structure.contacts)}. `simulate` takes several."
         )
+    refuse_vector_contacts(structure, who)
+
+
+def refuse_vector_contacts(structure: Structure, who: str) -> None:
+    """Refuse, for `who` takes only that, contacts that are not at coordinates."""
     if not structure.contacts_at_coordinates:
         raise ValueError(
-            f"{who} takes a contact whose directions are coordinates, but this one's are vectors. Give the structure as "
+            f"{who} takes contacts whose directions are coordinates, but some of these are vectors. Give the structure as "
             f"`fivjax.in_contact_coordinates(structure)`."
         )
 

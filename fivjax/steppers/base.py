@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..model.scene import Scene
-from .section import Rise, rise_between, section_coordinate
+from .section import Rise, rise_between
 
 # Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
 MOST_ADVANCES = 4096
@@ -77,7 +77,7 @@ def advance_between(
 ) -> Advance:
     """An advance from one state to another that knows of what lay between only what these two say."""
     speed = jnp.abs(y[y.shape[0] // 2 + mechanics.tangential])
-    rise = rise_between(before, y, section_coordinate(mechanics))
+    rise = rise_between(mechanics, before, y)
     return Advance(y, contact, h, jnp.max(speed) if mechanics.several else speed, rise, end, ended)
 
 

@@ -24,7 +24,7 @@ from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
-from .section import section_coordinate
+from .section import before_section, section_speed
 
 # No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
 # Powers of a longer one would be out of range.
@@ -99,11 +99,13 @@ class EventExact(AbstractStepper):
         # Of several contacts the two guards of the first come first, then those of the second, …
         guards, rounding = [guard.ravel() for guard in guards], [row.ravel() for row in rounding]
         exact = physics.exactly_zero(contact).T.ravel()
-        n, count, section = y.shape[0] // 2, 2 * len(mechanics.places), section_coordinate(mechanics)
+        n, count = y.shape[0] // 2, 2 * len(mechanics.places)
         if at_section:
             # One more row watches the tangential velocity rise through zero: not an event of the contact.
-            guards = [jnp.append(guard, -state[n + section]) for guard, state in zip(guards, states, strict=True)]
-            rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, False)
+            rows = [-section_speed(mechanics, state) for state in states]
+            guards = [jnp.append(guard, row) for guard, row in zip(guards, rows, strict=True)]
+            # Of several contacts what is not on the section is before it, however little.
+            rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, mechanics.several)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
@@ -113,7 +115,7 @@ class EventExact(AbstractStepper):
             [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
         )
         if at_section:
-            watching = jnp.arange(count + 1) < count + (guards[0][count] > 0)
+            watching = jnp.arange(count + 1) < count + before_section(mechanics, y)
             safe, fires = jnp.where(watching, safe, 1.0), fires & watching
         first = jnp.min(safe)
         # Guards that run out at the same instant, but for rounding, do so together.
@@ -126,8 +128,8 @@ class EventExact(AbstractStepper):
         x = jnp.where(jnp.any(fires), _implicit(scaled, fires, first), first)
         ended = fires[:count].reshape(*contact.status.shape, 2)
         reached, _ = value_and_slope(states, x * reach)
-        if at_section:
-            reached = jnp.where((jnp.arange(2 * n) == n + section) & fires[count], 0.0, reached)
+        if at_section and not mechanics.several:
+            reached = jnp.where((jnp.arange(2 * n) == n + mechanics.tangential) & fires[count], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)

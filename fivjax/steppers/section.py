@@ -1,29 +1,64 @@
-"""The Poincaré section: the rises of the tangential velocity through zero, where motions are compared."""
+"""The Poincaré section: the rises of the tangential velocity through zero, where motions are compared.
+
+Of several contacts it is a weighted sum of their tangential velocities that rises through zero. Over a period the mean of each
+is zero, and so is that of the sum. The weights are no two alike, so that contacts which move against each other do not cancel.
+"""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from ..contact import Mechanics, State
 
+GOLDEN = 0.5 * (5**0.5 - 1)
+# A sum of velocities this much smaller than the motion is zero: the state is on the section.
+ON_SECTION = {"float64": 1e-13, "float32": 1e-6}
+
 
 class Rise(NamedTuple):
-    """A rise of the tangential velocity through zero, where orbits are compared."""
+    """A rise of the tangential velocity through zero, where motions are compared."""
 
     happened: Bool[Array, ""]
     at: State  # the state there; anything if there was none
 
 
-def section_coordinate(mechanics: Mechanics) -> int:
-    """The coordinate whose velocity defines the section: the tangential one, of several contacts that of the first."""
-    return mechanics.places[0][0]
+def section_weights(contacts: int) -> Float[np.ndarray, " c"]:
+    """What each contact's tangential velocity counts in the section: 1 of one contact."""
+    return 1.0 + np.mod(GOLDEN * np.arange(contacts), 1.0)
 
 
-def rise_between(before: State, after: State, tangential: int) -> Rise:
+def section_row(mechanics: Mechanics, size: int) -> Float[np.ndarray, " n"]:
+    """The same as a row for the velocities of all coordinates."""
+    row = np.zeros(size)
+    row[[place[0] for place in mechanics.places]] = section_weights(len(mechanics.places))
+    return row
+
+
+def section_speed(mechanics: Mechanics, y: State) -> Float[Array, ""]:
+    """What rises through zero on the section, in m/s; linear in the state."""
+    n = y.shape[0] // 2
+    if mechanics.several:
+        return jnp.dot(jnp.asarray(section_weights(len(mechanics.places)), y.dtype), y[n + mechanics.tangential])
+    return y[n + mechanics.tangential]
+
+
+def before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
+    """Whether the section is still to come: not where a state is on it. A sum of velocities is zero but for rounding there."""
+    speed = section_speed(mechanics, y)
+    if not mechanics.several:
+        return speed < 0
+    n = y.shape[0] // 2
+    rate = jnp.sqrt(jnp.max(jnp.abs(mechanics.free_position)))
+    size = jnp.max(jnp.abs(y[n:])) + rate * jnp.max(jnp.abs(y[:n]))
+    return speed < jax.lax.stop_gradient(-ON_SECTION[y.dtype.name] * size)
+
+
+def rise_between(mechanics: Mechanics, before: State, after: State) -> Rise:
     """The rise between two states close to each other, on a straight line."""
-    velocity = before.shape[0] // 2 + tangential
-    speed = before[velocity], after[velocity]
-    rose = (speed[0] < 0) & (speed[1] >= 0)
+    speed = section_speed(mechanics, before), section_speed(mechanics, after)
+    rose = before_section(mechanics, before) & ~before_section(mechanics, after) & jnp.isfinite(speed[1])
     share = speed[0] / jnp.where(rose, speed[0] - speed[1], 1.0)
     return Rise(rose, before + jnp.where(rose, share, 0.0) * (after - before))

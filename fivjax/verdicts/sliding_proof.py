@@ -32,9 +32,10 @@ class SlidingModes(eqx.Module):
     linear: LinearSliding
     eigenvalues: Complex[Array | np.ndarray, "*groups k"]  # 1/s
     to_modal: Complex[Array | np.ndarray, "*groups k m"]  # rows of V⁻¹
-    pressing: Complex[Array | np.ndarray, "*groups k"]  # shares of the modes in the two signals
-    slip: Complex[Array | np.ndarray, "*groups k"]
-    remainder: Complex[Array | np.ndarray, "*groups k"]
+    # Shares of the modes in the two signals; of several contacts, in the two of each.
+    pressing: Complex[Array | np.ndarray, "*groups_contacts k"]
+    slip: Complex[Array | np.ndarray, "*groups_contacts k"]
+    remainder: Complex[Array | np.ndarray, "*groups_contacts k"]
     envelope: "Envelope"
     slowest_decay: Float[
         Array | np.ndarray, "*groups"
@@ -78,9 +79,9 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         linear=linear,
         eigenvalues=eigenvalues.astype(complex),
         to_modal=inverse,
-        pressing=count * np.einsum("li,lik->lk", linear.pressing, vectors),
-        slip=count * np.einsum("li,lik->lk", linear.slip, vectors),
-        remainder=np.einsum("lki,li->lk", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        pressing=count * np.einsum("l...i,lik->l...k", linear.pressing, vectors),
+        slip=count * np.einsum("l...i,lik->l...k", linear.slip, vectors),
+        remainder=np.einsum("lki,l...i->l...k", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         slowest_decay=_slowest_decay(linear.frictionless),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
@@ -107,18 +108,24 @@ def slides_forever(
     under_final_load: Bool[Array, ""] | bool,
 ) -> Bool[Array, ""]:
     """Whether a bound shows that a contact which slides now, `under_final_load`, never stops sliding; from the state's
-    deviation from the equilibrium.
+    deviation from the equilibrium. Several contacts do so together: all slide now, and none of them ever stops.
     """
     linear = modes.linear
     z = deviation[sliding_states(deviation.shape[0] // 2, mechanics.normal)]
     modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
-    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & under_final_load
+    slides = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
+    sliding = (jnp.all(slides) if mechanics.several else slides) & under_final_load
     sliding = sliding & modes.stable & linear.exists
     if not mechanics.friction.constant:
-        return sliding & decays_nonlinearly(modes, modal)
+        decays = decays_nonlinearly_together if mechanics.several else decays_nonlinearly
+        return sliding & decays(modes, modal)
     members = modes.envelope.members
     signals = [modes.pressing * modal, modes.slip * modal]
     margins = [linear.pressing_margin, linear.slip_margin]
+    if mechanics.several:
+        signals, margins = (
+            [part[i] for part in parts for i in range(len(mechanics.places))] for parts in (signals, margins)
+        )
     # The bound is dear. In a batch a loop runs only if one of the trajectories wants it: where both signals, each cluster of
     # modes at its largest, are within their margins now.
     for shares, margin in zip(signals, margins, strict=True):
@@ -127,7 +134,9 @@ def slides_forever(
     def prove(carry):
         _, _, signals = carry
         peaks = [envelope_peak(shares, modes.envelope) for shares in signals]
-        proved = (peaks[0] < margins[0]) & (peaks[1] < margins[1])
+        proved = jnp.asarray(True)
+        for peak, margin in zip(peaks, margins, strict=True):
+            proved = proved & (peak < margin)
         # The signals change, so that XLA cannot take what depends on them out of the loop and compute it every time.
         return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
 
@@ -199,3 +208,21 @@ def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool
     bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
     rate = -jnp.max(modes.eigenvalues.real)
     return (drive * bend * size < rate) & (size < LOWEST_SLIP * linear.slip_margin)
+
+
+def decays_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
+    r"""The same of several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any signal, relative to
+    the signal's margin. No signal then changes by more than $E$ of its margin, the remainders are at most $c_i E^2$, and
+    $\dot E ≤ -r E + \sum_i F_i c_i E^2$ with $F_i = \sum_k e_k |f_{ki}|$.
+    """
+    linear = modes.linear
+    shares = [
+        jnp.abs(modes.slip) / linear.slip_margin[:, None],
+        jnp.abs(modes.pressing) / linear.pressing_margin[:, None],
+    ]
+    weights = jnp.max(jnp.concatenate(shares), axis=0)
+    size = jnp.sum(weights * jnp.abs(modal))
+    drive = jnp.sum(weights * jnp.abs(modes.remainder), axis=-1)
+    bend = linear.remainder_slope + 0.5 * linear.remainder_curvature
+    rate = -jnp.max(modes.eigenvalues.real)
+    return (jnp.sum(drive * bend) * size < rate) & (size < LOWEST_SLIP)

@@ -1,0 +1,295 @@
+r"""How close a trajectory comes to another sequence of contact events.
+
+At an event a guard $g$ crosses zero with slope $\dot g$; it would turn back at a depth of $\dot g^2 / (2 |\ddot g|)$ (to
+second order). Between events it may come down to a smallest value and recover. Both, relative to the largest size of that
+guard on the trajectory, say how far the event is from vanishing, or a new one from appearing. Two events at one instant,
+or one on a jump of the load or at the very end, would swap their order; a friction cone that an impact or a contact at
+rest just touches would be left. How far these are is looked at likewise.
+
+Of several contacts, those that the mass matrix couples feel each other's events at once: there the order of two events matters,
+and an event of one may leave next to nothing of another's guard. Events of contacts that only springs and dampers couple may
+fall together: in either order the motion after them is the same to first order.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, Status
+from ..foundation.compiling import compiled
+from ..model.scene import Scene
+from ..steppers.base import AbstractStepper, rates
+
+# Looks at the guards within one advance; between two of them a guard is told from its derivatives.
+LOOKS = 32
+GUARDS = {
+    (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
+    (Status.STICK, 1): "the friction force reaching the other edge of the friction cone",
+    (Status.SLIDE, 0): "the contact losing its normal force",
+    (Status.SLIDE, 1): "the slip running out",
+    (Status.DETACH, 0): "the gap closing",
+}
+# What an event decides beside itself, and what a decision by a hair says.
+DECISIONS = (
+    "an impact at the edge of the friction cone, where it either ends slip or does not",
+    "the slip running out at the edge of the friction cone, where the contact either sticks or slips back",
+    "sliding that begins without a normal force",
+)
+# The first two of several contacts, which are decided together.
+DECISIONS_OF_SEVERAL = (
+    "impulses of several contacts at the edge of a friction cone, or of none",
+    "an event of one contact that decides by a hair what another does",
+    DECISIONS[2],
+)
+
+
+class ClosestCall(eqx.Module):
+    """The closest call of a trajectory."""
+
+    events: int
+    closest: float  # relative; infinite without any
+    at: float  # s
+    event: str
+
+
+def closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> ClosestCall:
+    """Follow the trajectory advance by advance and look at the guards of each."""
+    mechanics = Mechanics(scene)
+    jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
+    ends = [*jumps, t1]
+    y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
+    seen = _Seen(mechanics)
+    for end in ends:
+        load = scene.load(jnp.asarray(0.5 * (t + end)))
+        begin = t
+        while t < end:
+            look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
+            arrives = bool(look.h >= end - t)
+            happened = seen.add(np.atleast_1d(contact.status), look, t, 0 < t == begin, arrives)
+            at = t + float(look.h)
+            t = end if arrives else at
+            y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
+            if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not happened):
+                return ClosestCall(seen.events, 0.0, t, "the motion stopping to be finite")
+    return seen.closest()
+
+
+class _Look(eqx.Module):
+    """One advance, and the guards of each contact at even instants of it."""
+
+    y: Float[Array, " state"]
+    contact: Contact
+    h: Float[Array, ""]
+    turned: Bool[Array, " c"]  # whether it slides the other way now
+    ended: Bool[Array, " c"]  # whether one of its own guards ran out
+    guards: Float[Array, "l c 2"]
+    turns: Bool[Array, "l c 2"]  # whether the guard has its smallest value about this look, and recovers
+    lowest: Float[Array, "l c 2"]  # that value
+    slope: Float[Array, "c 2"]  # of the guards at the end, per s, and per s²
+    bend: Float[Array, "c 2"]
+    size: Float[Array, "c 2"]  # of the terms that the guards are sums of
+    # How clearly what follows was decided at the end, relative; infinite if it was not asked.
+    decisions: Float[Array, "3"]
+
+
+class _Seen:
+    """What was seen of a trajectory so far."""
+
+    def __init__(self, mechanics: Mechanics):
+        self.mechanics, self.several = mechanics, mechanics.several
+        count = len(mechanics.places)
+        self.coupled = np.ones((1, 1), bool)
+        if self.several:
+            self.coupled = np.asarray(
+                jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(count, dtype=jnp.int32))
+            )
+        # Of each guard, by contact, status and number.
+        self.largest: dict[tuple[int, int, int], float] = {}
+        # Distances by guard, in its own unit, and decisions, which are relative already.
+        self.calls: list[tuple[tuple[int, int, int], float, float]] = []
+        self.decisions: list[tuple[float, float, str]] = []
+        self.events = 0
+        # Contacts that have just felt an event of another in the same status, and their guards before it.
+        self.struck = np.zeros(count, bool)
+        self.before = np.zeros((count, 2))
+
+    def add(self, status: np.ndarray, look: _Look, t: float, after_jump: bool, arrives: bool) -> bool:
+        """Add an advance; whether it ended in an event."""
+        after = np.atleast_1d(look.contact.status)
+        at = t + float(look.h)
+        relevant = [self._of_contact(i, int(s), look, t, after_jump) for i, s in enumerate(status)]
+        fired = [i for i in range(len(status)) if relevant[i] and self._fires(i, int(status[i]), int(after[i]), look)]
+        for i in fired:
+            key = (i, int(status[i]))
+            # What ran out is the guard that is nearest to zero at the end, in units of its size.
+            which = min(
+                relevant[i], key=lambda k, i=i, key=key: abs(look.guards[-1, i, k]) / max(self.largest[*key, k], 1e-300)
+            )
+            # One that a jump of the load used up was passed by far, not turned round.
+            passed = abs(float(look.guards[0, i, which])) if look.h == 0 else 0.0
+            depth = float(look.slope[i, which] ** 2 / (2 * max(abs(look.bend[i, which]), 1e-300)))
+            self.calls.append(((*key, which), max(depth, passed), at))
+            # The others at that instant: were one of them zero as well, either might be the first. One of another contact that
+            # rises has been zero when its status began, and that event has been looked at.
+            for j in np.flatnonzero(self.coupled[i]):
+                others = [k for k in relevant[j] if (j, k) != (i, which) and (j == i or look.slope[j, k] < 0)]
+                self.calls += [((int(j), int(status[j]), k), abs(float(look.guards[-1, j, k])), at) for k in others]
+        if fired:
+            names = DECISIONS_OF_SEVERAL if self.several else DECISIONS
+            self.decisions += [(float(m), at, name) for m, name in zip(look.decisions, names, strict=True)]
+            self.events += 1
+        elif arrives:
+            # An event on the jump of the load, or at the end, has it on either side of it.
+            for i, own in enumerate(relevant):
+                self.calls += [((i, int(status[i]), k), abs(float(look.guards[-1, i, k])), at) for k in own]
+        felt = np.any(self.coupled[fired], axis=0)
+        felt[fired] = False
+        self.struck, self.before = felt & (after == status), look.guards[-1]
+        return bool(fired)
+
+    def _of_contact(self, i: int, status: int, look: _Look, t: float, after_jump: bool) -> list[int]:
+        """Adds what the guards of one contact do inside an advance; which of them are any."""
+        # A guard that is zero but for rounding of what it is a sum of is none: friction without a coefficient.
+        relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
+        relevant = relevant[:1] if status == Status.DETACH else relevant
+        for which in relevant:
+            guard, key = look.guards[:, i, which], (i, status, which)
+            self.largest[key] = max(self.largest.get(key, 0.0), float(np.abs(guard).max()))
+            turns = np.flatnonzero(look.turns[:, i, which])
+            self.calls += [(key, float(look.lowest[at, i, which]), t + float(look.h) * at / LOOKS) for at in turns]
+            # What a jump of the load leaves of a guard, or another contact's event: next to nothing, and it might as well be
+            # less than that.
+            jumped = abs(float(guard[0]) - self.before[i, which]) > 1e-6 * self.largest[key]
+            if after_jump or (self.struck[i] and jumped):
+                self.calls.append((key, abs(float(guard[0])), t))
+        return relevant
+
+    def _fires(self, i: int, status: int, after: int, look: _Look) -> bool:
+        """Whether an event of this contact ended the advance."""
+        if self.several:
+            return bool(look.ended[i])
+        # Detached before and after, but put on the belt in between: a rebound.
+        bounced = status == Status.DETACH == after and look.y[self.mechanics.normal] == 0
+        return status != after or bool(look.turned[i]) or bounced
+
+    def closest(self) -> ClosestCall:
+        """The closest of all calls."""
+
+        def name(contact: int, status: int, which: int) -> str:
+            event = GUARDS[Status(status), which]
+            return f"{event} (contact {contact})" if self.several else event
+
+        closest = [(value / max(self.largest[key], 1e-300), at, name(*key)) for key, value, at in self.calls]
+        return ClosestCall(self.events, *min(closest + self.decisions, default=(float("inf"), float("nan"), "none")))
+
+
+@compiled
+def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
+    after = method.advance(mechanics, contact, load, y, h)
+    # Just short of the end the status is still the same.
+    shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
+    inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
+    states = jnp.concatenate([y[None], inside])
+
+    def along(function):
+        return lambda state: jax.jvp(function, (state,), (rates(mechanics, contact, load, state),))[1]
+
+    # With an axis over the contacts, also where there is one.
+    orders = [lambda state: physics.guards(mechanics, contact, load, state).reshape(-1, 2)]
+    for _ in range(3):
+        orders.append(along(orders[-1]))
+    value, slope, bend, third = (jax.vmap(order)(states) for order in orders)
+    # Where the slope comes to zero, by the parabola; half a look to either side, but not beyond the ends.
+    to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
+    spacing = after.h / LOOKS
+    near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
+    look = jnp.arange(LOOKS + 1)[:, None, None]
+    near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
+    # A guard that begins at zero, because the status has just begun there, does not turn at its own start.
+    begins = jnp.abs(value[0]) <= 1e-9 * jnp.max(jnp.abs(value), axis=0)
+    near = near & ~(begins & (look <= 1))
+    lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
+    turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
+    turned = jnp.atleast_1d(turned & (after.contact.status == Status.SLIDE))
+    ended = jnp.any(after.ended.reshape(-1, 2), axis=-1)
+    size, _ = physics.magnitudes(mechanics, contact, load, jnp.max(jnp.abs(states), axis=0))
+    if mechanics.several:
+        decisions = _decisions_of_several(mechanics, contact, load, after)
+    else:
+        decisions = _decisions(mechanics, contact, load, states[-1], after.contact, after.y)
+    return _Look(
+        after.y,
+        after.contact,
+        after.h,
+        turned,
+        ended,
+        value,
+        near,
+        lowest,
+        slope[-1],
+        bend[-1],
+        size.reshape(-1, 2),
+        decisions,
+    )
+
+
+def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: Contact, after) -> Float[Array, "3"]:
+    """Margins of the questions that an event asks, in the order of `DECISIONS`: the friction cone at an impact, the
+    friction cone at rest on the belt, and the pressing force where it goes on to slide."""
+    n = before.shape[0] // 2
+    landed = (contact.status == Status.DETACH) & (following.status != Status.DETACH)
+    # An impulse takes the place of a force, and changes of velocity that of accelerations.
+    demanded = jnp.zeros(n).at[mechanics.tangential].set(physics.relative_velocity(mechanics, before))
+    demanded = demanded.at[mechanics.normal].set((1 + mechanics.restitution) * before[n + mechanics.normal])
+    dragged = mechanics.friction(jnp.abs(physics.relative_velocity(mechanics, before)))
+    at_impact = _margin(dragged, *physics.sticking_forces(mechanics, demanded))
+    by_impulse = landed & (mechanics.impact_law == "coulomb")
+    came_to_rest = (contact.status != Status.STICK) & (physics.relative_velocity(mechanics, after) == 0)
+    holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, after))
+    at_rest = _margin(mechanics.friction.static, *holding)
+    pressed = physics.guards(mechanics, following, load, after)[0]
+    terms, _ = physics.magnitudes(mechanics, following, load, jnp.abs(after))
+    slides = (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
+    return jnp.stack(
+        [
+            jnp.where(by_impulse, at_impact, jnp.inf),
+            jnp.where(came_to_rest & (following.status != Status.DETACH), at_rest, jnp.inf),
+            jnp.where(slides, jnp.abs(pressed) / jnp.where(terms[0] > 0, terms[0], 1.0), jnp.inf),
+        ]
+    )
+
+
+def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -> Float[Array, "3"]:
+    """The same of several contacts: how clearly the states that they are found in are admissible, of the contacts that feel
+    the event.
+    """
+    own = jnp.any(after.ended, axis=-1)
+    rows = jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(len(own), dtype=jnp.int32))
+    feels = jnp.any(rows & own[:, None], axis=0)
+    touched = (contact.status == Status.DETACH) & after.ended[:, 0]
+    struck = jnp.any(rows & touched[:, None], axis=0) & (mechanics.impact_law == "coulomb")
+    at_impact = physics.clearness_of_impact(mechanics, physics.stopped(mechanics, contact, after.end, after.ended))
+    following = after.contact
+    at_rest = physics.clearness_of_modes(mechanics, load, after.y, following)
+    # What sticking ends in, and sliding without a force, begins at the edge.
+    lifted = (contact.status == Status.SLIDE) & after.ended[:, 0]
+    asked = feels & ~(own & ((contact.status == Status.STICK) | lifted))
+    begins = own & (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
+    pressed = physics.guards(mechanics, following, load, after.y)[:, 0]
+    terms, _ = physics.magnitudes(mechanics, following, load, jnp.abs(after.y))
+    pressing = jnp.abs(pressed) / jnp.where(terms[:, 0] > 0, terms[:, 0], 1.0)
+    return jnp.stack(
+        [
+            jnp.min(jnp.where(which, margin, jnp.inf))
+            for which, margin in ((struck, at_impact), (asked, at_rest), (begins, pressing))
+        ]
+    )
+
+
+def _margin(mu, tangential, normal) -> Float[Array, ""]:
+    """How far a force is from the edge of the friction cone, relative; infinite without friction and without force."""
+    held, need = mu * jnp.abs(normal), jnp.abs(tangential)
+    return jnp.where(held + need > 0, jnp.abs(held - need) / jnp.where(held + need > 0, held + need, 1.0), jnp.inf)
