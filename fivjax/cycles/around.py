@@ -12,6 +12,7 @@ from ..contact import Contact, Mechanics, Status
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from .section_map import Point, flow_with_jacobian, mechanics_about_sliding
@@ -25,7 +26,7 @@ HARMONICS = 16
 class Phase(NamedTuple):
     """One letter of a cycle's word: a contact mode and how long it lasts."""
 
-    status: Status
+    status: Status | tuple[Status, ...]  # of several contacts, of each
     duration: float  # s
 
 
@@ -36,20 +37,20 @@ class Round(NamedTuple):
     h: Float[Array, " s"]  # how long it lasts, s; zero where empty
     y: Float[Array, "s state"]  # where it begins
     contact: Contact
-    ended: Bool[Array, "s 2"]  # which guard ended it
+    ended: Bool[Array, "s *contacts 2"]  # which guard ended it
     count: Int[Array, ""]
 
 
 def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period: Float[Array, ""], most: int) -> Round:
     """The segments of a motion that starts at a point, over a time `period` (s); at most `most` of them are kept."""
     n2 = point.y.shape[0]
-    none = jnp.zeros(most, point.y.dtype)
+    none, shape = jnp.zeros(most, point.y.dtype), point.contact.status.shape
     empty = Round(
         none,
         none,
         jnp.zeros((most, n2), point.y.dtype),
-        Contact(jnp.zeros(most, jnp.int32), jnp.ones(most, point.y.dtype)),
-        jnp.zeros((most, 2), bool),
+        Contact(jnp.zeros((most, *shape), jnp.int32), jnp.ones((most, *shape), point.y.dtype)),
+        jnp.zeros((most, *shape, 2), bool),
         jnp.zeros((), jnp.int32),
     )
 
@@ -65,8 +66,13 @@ def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period:
 
 
 def peak_speed(stepper: EventExact, mechanics: Mechanics, segments: Round) -> Float[Array, ""]:
-    """The largest tangential speed in any of the segments, in m/s, to rounding."""
-    velocity = segments.y.shape[1] // 2 + mechanics.tangential
+    """The largest tangential speed in any of the segments, of any contact, in m/s, to rounding."""
+    speeds = [_peak_of(stepper, mechanics, segments, tangential) for tangential, _ in mechanics.places]
+    return speeds[0] if len(speeds) == 1 else jnp.max(jnp.stack(speeds))
+
+
+def _peak_of(stepper: EventExact, mechanics: Mechanics, segments: Round, tangential: int) -> Float[Array, ""]:
+    velocity = segments.y.shape[1] // 2 + tangential
     zero = jnp.zeros((), segments.y.dtype)
 
     def of_segment(y, contact, h):
@@ -143,8 +149,10 @@ def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, 
 def word(segments: Round) -> tuple[Phase, ...]:
     """The contact modes of a cycle in order, with their durations; a mode that the section cuts in two counts once.
 
-    Sliding that reverses its direction is two phases.
+    Sliding that reverses its direction is two phases. Of several contacts a phase lasts until the mode of one of them ends.
     """
+    if segments.contact.status.ndim > 1:
+        return word_of_several(segments)
     count = int(segments.count)
     letters: list[tuple[tuple[int, float], float]] = []
     for k in range(count):
@@ -162,29 +170,49 @@ def word(segments: Round) -> tuple[Phase, ...]:
     return tuple(Phase(Status(status), duration) for (status, _), duration in letters)
 
 
+def word_of_several(segments: Round) -> tuple[Phase, ...]:
+    """`word` of several contacts."""
+    letters: list[tuple[tuple, float]] = []
+    for k in range(int(segments.count)):
+        status, duration = np.asarray(segments.contact.status[k]), float(segments.h[k])
+        direction = np.where(status == Status.SLIDE, segments.contact.direction[k], 0.0)
+        key = (*status.tolist(), *direction.tolist())
+        broken = k > 0 and bool(np.any(segments.ended[k - 1]))
+        if letters and letters[-1][0] == key and not broken:
+            letters[-1] = key, letters[-1][1] + duration
+        elif duration > 0:
+            letters.append((key, duration))
+    if len(letters) > 1 and letters[0][0] == letters[-1][0]:
+        letters = [(letters[0][0], letters[0][1] + letters[-1][1]), *letters[1:-1]]
+    count = segments.contact.status.shape[1]
+    return tuple(Phase(tuple(map(Status, key[:count])), duration) for key, duration in letters)
+
+
 def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
     It is taken in the middle of the longest segment that does not stick, on what that segment's contact mode leaves free:
     sticking holds more, and would hide multipliers that are 0.
     """
-    moving = np.where(segments.contact.status != Status.STICK, 1.0, 1e-9)
+    stuck = segments.contact.status == Status.STICK
+    moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
     contact = jax.tree.map(lambda leaf: jnp.asarray(leaf[longest]), segments.contact)
     start = Point(jnp.asarray(segments.y[longest]), contact)
     middle, _ = flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
     _, matrix = flow_with_jacobian(scene, stepper, middle, period)
-    free = free_coordinates(scene, Status(int(segments.contact.status[longest])))
+    free = free_coordinates(scene, segments.contact.status[longest])
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
 
 
-def free_coordinates(scene: Scene, status: Status) -> Int[np.ndarray, " m"]:
+def free_coordinates(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:
     """Places in the state that a contact mode leaves free."""
-    structure = scene.structure
-    n, held = structure.size, []
-    if status != Status.DETACH:
-        held += [structure.normal, n + structure.normal]
-    if status == Status.STICK:
-        held.append(n + structure.tangential)
+    n, held = scene.structure.size, []
+    places = contact_coordinates(scene.structure)
+    for tangential, normal, one in zip(*map(np.atleast_1d, (*places, status)), strict=True):
+        if one != Status.DETACH:
+            held += [normal, n + normal]
+        if one == Status.STICK:
+            held.append(n + tangential)
     return np.delete(np.arange(2 * n), held)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..contact import Status
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .section_map import Point, Return, return_with_jacobian
@@ -65,7 +66,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
         best, since = (float(closure), point, found, jacobian), 0
         if closure <= EXACT:
             break
-        step = _newton_step(jacobian, gap)
+        step = _newton_step(jacobian, gap, len(scene.structure.contacts))
         if step is None:
             break
         point = Point(jnp.asarray(y + step), point.contact)
@@ -89,11 +90,15 @@ def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -
 
 
 def _same_mode(a: Point, b: Point) -> bool:
-    same = int(a.contact.status) == int(b.contact.status)
-    return same and (int(a.contact.status) != 1 or float(a.contact.direction) == float(b.contact.direction))
+    one, other = (np.asarray(point.contact.status) for point in (a, b))
+    alike = np.asarray(a.contact.direction) == np.asarray(b.contact.direction)
+    return bool(np.all((one == other) & ((one != Status.SLIDE) | alike)))
 
 
-def _newton_step(jacobian: np.ndarray, gap: np.ndarray) -> np.ndarray | None:
+def _newton_step(jacobian: np.ndarray, gap: np.ndarray, contacts: int) -> np.ndarray | None:
+    if contacts > 1:
+        # Oscillators that do not feel each other may be shifted against each other in time: of all steps, the shortest.
+        return np.linalg.lstsq(np.eye(len(gap)) - jacobian, gap, rcond=1e-9)[0]
     try:
         return np.linalg.solve(np.eye(len(gap)) - jacobian, gap)
     except np.linalg.LinAlgError:

@@ -16,7 +16,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..io.datasets import labelled
-from ..model.scene import Scene
+from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.event_exact import EventExact
 from .around import seen_around
 from .closing import Closed
@@ -87,6 +87,7 @@ def continue_cycle(
     import xarray as xr
 
     arguments.instance("scene", scene, Scene, "a Scene")
+    refuse_several_contacts(scene.structure, "`continue_cycle`")
     final = under_final_load(scene)
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
     arguments.one_of("parameter", parameter, tuple(known))

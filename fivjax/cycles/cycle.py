@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..contact import Contact
+from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.load import ConstantLoad
@@ -18,6 +18,10 @@ from .section_map import Point, return_with_jacobian, sliding_state
 
 # A multiplier this much inside the unit circle is taken to be inside.
 MARGIN = 1e-9
+
+
+# A multiplier of the section's return map this close to 1 is taken for 1.
+FAMILY = 1e-7
 
 
 class LimitCycle(eqx.Module):
@@ -65,6 +69,15 @@ class LimitCycle(eqx.Module):
         values = section_multipliers(self.return_jacobian)
         return int(np.sum(np.abs(values) > 1.0))
 
+    @property
+    def in_family(self) -> bool:
+        """Whether a second multiplier is 1, so that neighbouring motions are periodic, too: oscillators that do not feel each
+        other may be shifted against each other in time. Such a motion is neither stable nor unstable.
+        """
+        if self.kind != "periodic" or np.ndim(self.contact.status) == 0:
+            return False
+        return bool(np.any(np.abs(section_multipliers(self.return_jacobian) - 1.0) < FAMILY))
+
     def trajectory(self, points: int = 1000, *, periods: int = 1, energy: bool = False) -> Trajectory:
         """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section.
 
@@ -82,7 +95,10 @@ class LimitCycle(eqx.Module):
             multiplier_real=("multiplier", self.multipliers.real),
             multiplier_imaginary=("multiplier", self.multipliers.imag),
             section_point=(("point", "state"), np.asarray(self.points)),
-            word_status=("phase", [int(phase.status) for phase in self.word]),
+            word_status=(
+                ("phase", "contact")[: 1 + np.ndim(self.contact.status)],
+                np.array([phase.status for phase in self.word], int),
+            ),
             word_duration=("phase", [phase.duration for phase in self.word]),
         ).assign_attrs(
             kind=self.kind,
@@ -103,13 +119,19 @@ class LimitCycle(eqx.Module):
 
     def __str__(self) -> str:
         stability = "stable" if self.stable else f"unstable in {self.unstable_directions} direction(s)"
-        modes = " ".join(f"{phase.status.name.lower()} {1e3 * phase.duration:.4g} ms" for phase in self.word)
+        if self.in_family:
+            stability = "one of a family: a second multiplier is 1"
+        modes = " ".join(f"{_named(phase.status)} {1e3 * phase.duration:.4g} ms" for phase in self.word)
         largest = ", ".join(f"{abs(value):.6g}" for value in self.multipliers[:4])
         return (
             f"limit cycle ({self.kind}, {stability}): {self.frequency:.6g} Hz, peak tangential speed "
             f"{self.amplitude:.6g} m/s\n  word: {modes}\n  sizes of the multipliers: {largest}\n"
             f"  closes to {self.residual:.1e} of its size"
         )
+
+
+def _named(status: Status | tuple[Status, ...]) -> str:
+    return status.name.lower() if isinstance(status, Status) else "+".join(one.name.lower() for one in status)
 
 
 def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[np.ndarray, " state"]:
@@ -131,7 +153,7 @@ def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCy
         contact=Contact(np.asarray(closed.point.contact.status), np.asarray(closed.point.contact.direction)),
         word=word(seen.segments),
         multipliers=floquet_multipliers(scene, stepper, seen.segments, closed.period),
-        stable=bool(largest < 1 - MARGIN),
+        stable=bool(largest < 1 - (MARGIN if np.ndim(closed.point.contact.status) == 0 else FAMILY)),
         amplitude=float(seen.amplitude),
         residual=closed.residual,
         crossings=closed.crossings,

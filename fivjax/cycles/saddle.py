@@ -12,7 +12,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, sliding_equilibrium
+from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
 from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
@@ -49,7 +49,7 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
         1
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "`saddle_cycle`")
+    refuse_vector_contacts(scene.structure, "`saddle_cycle`")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
     cycle = limit_cycle(scene) if cycle is None else cycle

@@ -13,7 +13,8 @@ from ..contact import Contact, State, Status, status_from_forces
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
-from ..model.scene import Scene, refuse_painleve, refuse_several_contacts, sliding_equilibrium
+from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
+from ..model.sliding import contact_coordinates
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
 from .closing import close
@@ -35,6 +36,10 @@ SAME = 1e-6
 FADED = 1e-6
 # Every so many looks a motion that is neither periodic nor fading is tried as a torus.
 TORUS_AFTER = 8
+
+
+# Why a motion that closes is not returned as a limit cycle.
+FAMILY_MET = "periodic, but one of a family of such motions: a second multiplier is 1"
 
 
 class NoLimitCycle(ValueError):
@@ -75,13 +80,15 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
     _check(scene)
     stepper = EventExact()
     if start is None:
-        found = limit_cycles(scene)
-        if not found:
+        met = attractors_met(scene, stepper, _released(scene, ()))
+        if not met or met[0].cycle is None:
+            family = " Some came to periodic motions that are one of a family each: a second multiplier is 1."
             raise NoLimitCycle(
-                f"No limit cycle was met: none of the {len(RELEASES)} trajectories released ended on one. "
+                f"No limit cycle was met: none of the {len(RELEASES)} trajectories released ended on one."
+                f"{family if any(one.why == FAMILY_MET for one in met) else ''} "
                 f"If you know a motion near one, give it as `start`."
             )
-        return found[0]
+        return met[0].cycle
     guess, crossings = _guess(scene, stepper, start)
     for count in crossings:
         closed = close(scene, stepper, guess, count)
@@ -133,7 +140,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
     found: list[LimitCycle] = []
     open_ = np.arange(many)
     now, begun = starts, None
-    given_up = 0
+    families = 0
     for look in range(LOOKS):
         if not len(open_):
             break
@@ -152,7 +159,12 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             if _known(scene, found, weights, y[k]):
                 continue
             cycle = _closed_near(scene, stepper, here, weights * y[k])
-            if cycle is None and look % TORUS_AFTER == TORUS_AFTER - 1 and _keeps_its_size(sizes[k]):
+            if cycle is not None and cycle.in_family:
+                families += 1
+                continue
+            # A torus is looked for of one contact only.
+            turn = look % TORUS_AFTER == TORUS_AFTER - 1 and len(scene.structure.contacts) == 1
+            if cycle is None and turn and _keeps_its_size(sizes[k]):
                 cycle = torus_of(scene, stepper, here)
             if cycle is not None and cycle.stable and not _among(found, cycle):
                 found.append(cycle)
@@ -167,7 +179,8 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             open_ = np.flatnonzero(keep)
     given_up = len(open_)
     met = [Met(cycle, "computed") for cycle in sorted(found, key=lambda cycle: -cycle.amplitude)]
-    return met + [Met(None, "sustained, neither periodic nor a torus")] * given_up
+    met += [Met(None, "sustained, neither periodic nor a torus")] * given_up
+    return met + [Met(None, FAMILY_MET)] * families
 
 
 def _merged(parts: list[list[Met]]) -> list[Met]:
@@ -181,22 +194,26 @@ def _merged(parts: list[list[Met]]) -> list[Met]:
 
 def _check(scene: Scene) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "A search for limit cycles")
+    refuse_vector_contacts(scene.structure, "A search for limit cycles")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
 
 
 def _moves(scene: Scene, point: Point) -> bool:
-    structure = scene.structure
-    weights = np.asarray(structure.weights)
-    yardstick = weights[structure.size + structure.tangential] * abs(float(scene.belt_speed))
-    return bool(np.linalg.norm(weights * np.asarray(point.y)) > FADED * yardstick)
+    return bool(
+        np.linalg.norm(np.asarray(scene.structure.weights) * np.asarray(point.y)) > FADED * _belt_s_motion(scene)
+    )
+
+
+def _belt_s_motion(scene: Scene) -> float:
+    """The weighted size of the belt's motion; of several contacts that of the fastest belt."""
+    tangential, _ = contact_coordinates(scene.structure)
+    weights = np.asarray(scene.structure.weights)[scene.structure.size + tangential]
+    return float(np.max(weights * np.abs(np.asarray(scene.belt_speed))))
 
 
 def _has_faded(scene: Scene, sizes: np.ndarray, begun: float, look: int) -> bool:
-    structure = scene.structure
-    yardstick = np.asarray(structure.weights)[structure.size + structure.tangential] * abs(float(scene.belt_speed))
-    small = sizes[-1] < FADED * min(yardstick, begun)
+    small = sizes[-1] < FADED * min(_belt_s_motion(scene), begun)
     # Without events the motion is the linear one, or close to it: shrinking for this long, it will not grow again.
     return bool(small or (look > 1 and sizes[-1] < 0.5 * sizes[len(sizes) // 2] < 0.25 * sizes[0]))
 
@@ -292,7 +309,8 @@ def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
     y = jnp.asarray(_state_of(scene, start) - rest)
     contact = jax.tree.map(lambda leaf: leaf[0], _in_contact_mode(scene, y[None]))
     if status is not None:
-        contact = Contact(jnp.asarray(int(Status(int(status))), jnp.int32), contact.direction)
+        known = [int(Status(int(one))) for one in np.atleast_1d(status)]
+        contact = Contact(jnp.asarray(known, jnp.int32).reshape(contact.status.shape), contact.direction)
     returns = points_along(scene, stepper, Point(y[None], Contact(contact.status[None], contact.direction[None])), 24)
     path = np.asarray(returns.point.y)[0] * np.asarray(scene.structure.weights)
     if not np.all(np.isfinite(path)):

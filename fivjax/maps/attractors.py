@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from ..contact import Status
 from ..verdicts import ensemble as nominating
 from ..verdicts import tube
+from ..verdicts.tube_of_several import starts_of_several
 from ..verdicts.verdict import Verdict
 from .captures import Cycle, captured, distinct, stable_cycles
 from .flattened import Flattened, flatten
@@ -77,7 +78,7 @@ def search(
     trajectories = rounds.begun(batch, shared, own, each, np.tile(nominating.RELEASES, len(groups)))
     if near is not None:
         starts = [_about(maps, state)[:members] for state in near]
-        trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.structure.normal)
+        trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.normal)
     if near is None:
         tests, within = nominating.TESTS, BACK_WITHIN
     else:
@@ -162,15 +163,15 @@ def _add_tori(
     batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, within: int, report
 ) -> None:
     """Which of the sets that ensembles have met on (with the group's place) are tori."""
-    structure, weights = maps.structure, maps.weights
+    weights = maps.weights
     starts = [_about(maps, states[:: len(states) // tube.STARTS] / weights) for _, (states, _) in sets]
     count = tube.STARTS
     own = np.repeat([groups[k] for k, _ in sets], count)
     each = np.repeat(np.stack([columns[k] for k, _ in sets]), count, axis=0)
     y = np.concatenate(starts) / weights
-    trajectories = _at(rounds.begun(batch, shared, own, each, np.ones(len(own))), y, structure.normal)
+    trajectories = _at(rounds.begun(batch, shared, own, each, np.ones(len(own))), y, maps.normal)
     running, ok, home = np.arange(len(own)), np.ones(len(sets), bool), np.zeros(len(own), bool)
-    last = Section(np.zeros_like(y), np.zeros(len(y), np.int32), np.ones(len(y)))
+    last = _section_at(np.zeros_like(y), maps.normal)
     ends = np.full((tube.HOME, len(own), y.shape[1]), np.nan)
     for looks in range(nominating.SEEN, within + 1, nominating.SEEN):
         report(0)
@@ -205,16 +206,19 @@ def _add_tori(
 def _about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
     """Weighted starts on the edge of the tube about states of the section, or about one."""
     structure = maps.structure
+    if len(structure.contacts) > 1:
+        section = maps.section / maps.weights[structure.size :]
+        return starts_of_several(maps.weights * np.atleast_2d(states), section, np.asarray(maps.normal))
     velocity, rate = structure.size + structure.tangential, structure.size + structure.normal
     return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate)
 
 
-def _section_at(y, normal: int) -> Section:
+def _section_at(y, normal: int | np.ndarray) -> Section:
     status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
-    return Section(y, status, np.ones(len(y)))
+    return Section(y, status, np.ones(status.shape))
 
 
-def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int) -> Flattened:
+def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray) -> Flattened:
     """Trajectories that have begun, put to these states of the section."""
     columns, now = begun.tree
     contact = eqx.tree_at(

@@ -9,7 +9,7 @@ import xarray as xr
 
 from ..foundation import arguments
 from ..linear.critical import critical_friction
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.scene import Scene, refuse_vector_contacts
 from ..steppers.base import AbstractStepper
 from .trajectories import Grid
 
@@ -57,10 +57,11 @@ def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Gri
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "A map")
+    refuse_vector_contacts(scene.structure, "A map")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t_max", t_max, above=0)
     arguments.real_number("memory", memory, above=0)
-    batched = [name for name, value in scene.parameters.items() if np.shape(value) != ()]
+    per_contact = ("belt_speed", "restitution") if len(scene.structure.contacts) > 1 else ()
+    batched = [name for name, value in scene.parameters.items() if np.shape(value) != () and name not in per_contact]
     if batched:
         raise ValueError(f"Parameter `{batched[0]}` of the scene must be one number; pass its values as an axis.")

@@ -11,6 +11,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.load import ConstantLoad
 from ..model.scene import Scene, sliding_equilibrium
+from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
@@ -114,16 +115,18 @@ def _places(scene: Scene, axes: dict) -> dict[str, int]:
 
 
 def _check_gap(scene: Scene, axes: dict[str, np.ndarray]) -> None:
-    name = scene.structure.coordinates[scene.structure.normal]
-    gap = axes.get(name, np.array([float(sliding_equilibrium(scene)[scene.structure.normal])]))
-    rate = axes.get(f"d{name}", np.zeros(1))
-    if gap[0] < 0:
-        raise ValueError(f"Axis `{name}` must not go below the belt, but holds {gap[0]:g} m.")
-    if gap[0] == 0 and rate[0] < 0:
-        raise ValueError(
-            f"Axis `d{name}` must not hold velocities into the belt where the contact is closed, but holds {rate[0]:g} m/s. "
-            f"Start a little above the belt: give `{name}` positive values."
-        )
+    equilibrium = sliding_equilibrium(scene)
+    for place in np.atleast_1d(contact_coordinates(scene.structure)[1]):
+        name = scene.structure.coordinates[place]
+        gap = axes.get(name, np.array([float(equilibrium[place])]))
+        rate = axes.get(f"d{name}", np.zeros(1))
+        if gap[0] < 0:
+            raise ValueError(f"Axis `{name}` must not go below the belt, but holds {gap[0]:g} m.")
+        if gap[0] == 0 and rate[0] < 0:
+            raise ValueError(
+                f"Axis `d{name}` must not hold velocities into the belt where the contact is closed, but holds {rate[0]:g} "
+                f"m/s. Start a little above the belt: give `{name}` positive values."
+            )
 
 
 def _with_shares(dataset: xr.Dataset) -> xr.Dataset:

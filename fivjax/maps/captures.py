@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
+from ..verdicts.capture_of_several import free_directions, trial_of_several
 from .section import SEGMENTS, ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
@@ -113,7 +114,8 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         with np.errstate(invalid="ignore", divide="ignore"):
             missed = np.linalg.norm(weights * gap, axis=1) / np.linalg.norm(weights * at.y, axis=1)
             better = missed < closure[running]
-        better &= (image.at.status == at.status) & (image.at.direction == at.direction)
+        alike = (image.at.status == at.status) & (image.at.direction == at.direction)
+        better &= np.all(alike.reshape(len(alike), -1), axis=1)
         better &= np.all(np.isfinite(derived), axis=(1, 2))
         rows = running[better]
         closure[rows], best[rows], jacobian[rows] = missed[better], at.y[better], derived[better]
@@ -128,6 +130,11 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
 
 def _trial(maps: ReturnMaps, closed: _Closed, now: Section, row: int) -> Trial | None:
     structure = maps.structure
+    if len(structure.contacts) > 1:
+        own = now.status[row], now.direction[row]
+        places = np.asarray(maps.tangential), np.asarray(maps.normal)
+        basis = free_directions(maps.weights, maps.section, *places, own[0])
+        return trial_of_several(closed.y[row], *own, closed.jacobian[row], maps.weights, basis)
     status, direction = int(now.status[row]), float(now.direction[row])
     free = free_on_section(structure.size, structure.tangential, structure.normal, status)
     return trial(closed.y[row], status, direction, closed.jacobian[row], maps.weights, free)
@@ -143,8 +150,8 @@ def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial]) -> 
         counts = np.array([len(part) for part in states])
         at = Section(
             np.concatenate(states),
-            np.repeat([trials[k].status for k in open_], counts),
-            np.repeat([trials[k].direction for k in open_], counts),
+            np.repeat(np.array([trials[k].status for k in open_]), counts, axis=0),
+            np.repeat(np.array([trials[k].direction for k in open_]), counts, axis=0),
         )
         image = maps.returns(np.repeat(group[open_], counts), at, np.repeat(crossings[open_], counts))
         images = Returned(*image.at, image.events)

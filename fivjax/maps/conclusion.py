@@ -30,10 +30,14 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
     scene, mechanics, modes = setting.scene, setting.mechanics, setting.modes
     structure = scene.structure
     weights = structure.weights
-    equilibrium, velocity = modes.linear.equilibrium, structure.size + structure.tangential
-    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + weights[velocity] * jnp.abs(scene.belt_speed)
+    equilibrium, velocity = modes.linear.equilibrium, structure.size + mechanics.tangential
+    belt = weights[velocity] * jnp.abs(scene.belt_speed)
+    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + (jnp.max(belt) if mechanics.several else belt)
     grown = jnp.max(jnp.abs(weights * now.y)) > GROWTH * yardstick
-    jammed = sticks_forever(setting.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
+    # That several contacts jam is not proved.
+    jammed = jnp.asarray(False)
+    if setting.drift is not None:
+        jammed = sticks_forever(setting.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
     quiet_load = jnp.all(scene.load.jumps <= now.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),

@@ -52,7 +52,7 @@ class Setting(eqx.Module):
     mechanics: Mechanics  # see `mechanics_about_sliding`
     prepared: Any  # the method's own, see `AbstractStepper.prepare`
     modes: SlidingModes
-    drift: StickingDrift
+    drift: StickingDrift | None  # of several contacts, none
     attractor: Attractor
 
 
@@ -133,6 +133,7 @@ def step(setting: Setting, now: Progress) -> Progress:
     y, contact, h, peak, rise, *_ = after
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
+    changed = jnp.any(changed) if setting.mechanics.several else changed
     # What comes back under the kick's load says nothing of the motion after it.
     crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
     return Progress(

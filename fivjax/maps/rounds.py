@@ -16,7 +16,7 @@ from ..foundation.compiling import compiled
 from ..verdicts.verdict import Verdict
 from . import attractors
 from .attractors import Attractors, Follower
-from .blocks import in_blocks
+from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .captures import Cycle, captured, distinct, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
@@ -201,7 +201,7 @@ def _begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarr
     def function(*block):
         return _begin_block(batch.scene, batch.names, batch.history, batch.states, batch.energy, *block)
 
-    return in_blocks(function, shared, group, flatten((columns, releases)), batch.width, batch.pool)
+    return in_blocks(function, shared, group, flatten((columns, releases)), batch.width, batch.pool, size=_block(batch))
 
 
 def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int) -> None:
@@ -211,7 +211,11 @@ def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Fl
     def function(*block):
         return follow_block(batch.scene, batch.method, batch.names, batch.history, np.int32(looks), *block)
 
-    in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True)
+    in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True, size=_block(batch))
+
+
+def _block(batch: Batch) -> int | None:
+    return BLOCK_OF_SEVERAL if len(batch.scene.structure.contacts) > 1 else None
 
 
 @compiled

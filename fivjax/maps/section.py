@@ -14,8 +14,10 @@ from ..contact import Contact
 from ..cycles.around import once_around, peak_speed
 from ..cycles.section_map import Point, moved
 from ..foundation.compiling import compiled
+from ..model.sliding import contact_coordinates
 from ..steppers.event_exact import EventExact
-from .blocks import in_blocks
+from ..steppers.section import section_weights
+from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .sharing import Batch
 
@@ -30,8 +32,8 @@ class Section(NamedTuple):
     """States on the section or on the way to it, in rows; deviations from the sliding equilibrium."""
 
     y: Float[np.ndarray, "m 2n"]
-    status: Int[np.ndarray, " m"]
-    direction: Float[np.ndarray, " m"]
+    status: Int[np.ndarray, "m *contacts"]
+    direction: Float[np.ndarray, "m *contacts"]
 
     def rows(self, chosen) -> "Section":
         return Section(*(part[chosen] for part in self))
@@ -56,10 +58,20 @@ class ReturnMaps:
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)
+        self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
+        # Of several contacts, places of all of them.
+        self.tangential, self.normal = contact_coordinates(self.structure)
+
+    @property
+    def section(self) -> Float[np.ndarray, " n"]:
+        """The row of velocities that is zero on the section."""
+        row = np.zeros(self.structure.size)
+        row[self.tangential] = section_weights(len(self.structure.contacts))
+        return row
 
     def returns(self, group, at: Section, crossings) -> Images:
         """The `crossings`-th crossing from each row."""
-        found = in_blocks(_returned, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=BLOCK).tree
+        found = in_blocks(_returned, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=self.block).tree
         return _images(found)
 
     def derived(self, group, at: Section, crossings) -> tuple[Images, Float[np.ndarray, "m 2n 2n"]]:
@@ -75,7 +87,7 @@ class ReturnMaps:
 
 def _rows(at: Section, last, kind: type = np.int32) -> Flattened:
     status, direction = np.asarray(at.status, np.int32), np.asarray(at.direction, float)
-    return flatten((np.asarray(at.y), status, direction, np.broadcast_to(np.asarray(last, kind), status.shape).copy()))
+    return flatten((np.asarray(at.y), status, direction, np.broadcast_to(np.asarray(last, kind), len(status)).copy()))
 
 
 def _images(found) -> Images:

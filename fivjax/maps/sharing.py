@@ -41,7 +41,7 @@ class Shared(eqx.Module):
     mechanics: Mechanics
     prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
     modes: SlidingModes
-    drift: StickingDrift
+    drift: StickingDrift | None  # of several contacts, none
     attractor: Attractor
     longest_return: Float[Array, ""]  # of the section's return map, s
 
@@ -62,7 +62,8 @@ class Batch(NamedTuple):
 
 def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
     """The stepper that does the same for many trajectories in less time, where there is one."""
-    return Windowed() if method == EventExact() and scene.friction.constant else method
+    one = len(scene.structure.contacts) == 1
+    return Windowed() if method == EventExact() and scene.friction.constant and one else method
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
@@ -115,7 +116,8 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
     def one(row):
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)
-        return mechanics, method.prepare(mechanics), linear_sliding(own), sticking_drift(own), longest_return(own)
+        drift = None if mechanics.several else sticking_drift(own)
+        return mechanics, method.prepare(mechanics), linear_sliding(own), drift, longest_return(own)
 
     return jax.vmap(one)(values)
 

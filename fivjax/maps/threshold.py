@@ -11,7 +11,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..io.datasets import labelled
 from ..model.load import Pulse
-from ..model.scene import Scene
+from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
@@ -96,6 +96,8 @@ def critical_perturbation(
     check_run(scene, method, t_max, memory)
     arguments.truth("energy", energy)
     arguments.truth("derivatives", derivatives)
+    if derivatives:
+        refuse_several_contacts(scene.structure, "`critical_perturbation` with derivatives")
     if derivatives and not isinstance(method, EventExact):
         raise ValueError(
             "Argument `derivatives` needs the method EventExact(), whose trajectories are exact through events."
@@ -104,7 +106,9 @@ def critical_perturbation(
     if "p" in axis:
         raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
     if not axis:
-        axis = {"belt_speed": np.asarray(scene.belt_speed)[None]}
+        # Any parameter will do that is one number.
+        name = "belt_speed" if np.ndim(scene.belt_speed) == 0 else "force"
+        axis = {name: np.asarray(scene.parameters[name])[None]}
     if not isinstance(p_range, tuple | list) or len(p_range) != 2:
         kind = TypeError if not isinstance(p_range, tuple | list) else ValueError
         raise kind(f"Argument `p_range` must be a pair of numbers, such as (1.0, 5.0), but is {p_range!r}.")

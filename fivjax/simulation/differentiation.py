@@ -25,7 +25,7 @@ from ..foundation.precision import in_double_precision, known_to_numpy
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .closest_call import closest_call
+from .event_distance import closest_call
 from .start import start_state
 from .trajectory import Trajectory, simulate
 

@@ -30,13 +30,6 @@ def section_weights(contacts: int) -> Float[np.ndarray, " c"]:
     return 1.0 + np.mod(GOLDEN * np.arange(contacts), 1.0)
 
 
-def section_row(mechanics: Mechanics, size: int) -> Float[np.ndarray, " n"]:
-    """The same as a row for the velocities of all coordinates."""
-    row = np.zeros(size)
-    row[[place[0] for place in mechanics.places]] = section_weights(len(mechanics.places))
-    return row
-
-
 def section_speed(mechanics: Mechanics, y: State) -> Float[Array, ""]:
     """What rises through zero on the section, in m/s; linear in the state."""
     n = y.shape[0] // 2

@@ -57,9 +57,9 @@ class Neighbourhood(NamedTuple):
     """An ellipsoid on the section about a stable periodic cycle, checked to be mapped into itself."""
 
     centre: Float[np.ndarray, " state"]  # the cycle's state, as a deviation from the sliding equilibrium
-    status: int  # the contact mode there
-    direction: float  # and the way friction points, if it slides
-    norm: Float[np.ndarray, "state state"]  # sizes are lengths of norm @ (y - centre)
+    status: int | Int[np.ndarray, " c"]  # the contact mode there; of several contacts, of each
+    direction: float | Float[np.ndarray, " c"]  # and the way friction points, if it slides
+    norm: Float[np.ndarray, "k state"]  # sizes are lengths of norm @ (y - centre)
     radius: float  # in that norm, which is never less than the weighted deviation's length
     contraction: float  # the largest that was seen in one period, in that norm
     points: int  # how many were checked
@@ -76,8 +76,8 @@ class Returned(NamedTuple):
     """Where a return map leads from several states (leading axis); NaN where it does not come back."""
 
     y: Float[np.ndarray, "m state"]
-    status: Int[np.ndarray, " m"]
-    direction: Float[np.ndarray, " m"]
+    status: Int[np.ndarray, "m *contacts"]
+    direction: Float[np.ndarray, "m *contacts"]
     events: Int[np.ndarray, " m"]  # contact events on the way
 
 
@@ -116,9 +116,9 @@ class Trial(NamedTuple):
     """A stable cycle with the norm of the module's text, about which a neighbourhood is sought."""
 
     centre: Float[np.ndarray, " state"]
-    status: int
-    direction: float
-    norm: Float[np.ndarray, "state state"]
+    status: int | Int[np.ndarray, " c"]
+    direction: float | Float[np.ndarray, " c"]
+    norm: Float[np.ndarray, "k state"]
     steps: Float[np.ndarray, "m state"]  # deviations of the points to be checked, for a radius of one
     sizes: Float[np.ndarray, " m"]  # of these, in the norm
     allowed: float  # the contraction asked for
@@ -159,8 +159,7 @@ def trial(
     if found is None or size == 0:
         return None
     root, rate = found
-    directions = _directions(len(free))
-    shells = np.concatenate([share * directions for share in SHELLS])
+    shells = np.concatenate([share * directions(len(free)) for share in SHELLS])
     # Of unit size in the norm, as deviations of the state.
     steps = np.zeros((len(shells), len(centre)))
     steps[:, free] = np.linalg.solve(root, shells.T).T / scale
@@ -187,11 +186,12 @@ def neighbourhood(attempt: Trial | None, returned: ReturnMap) -> Neighbourhood |
     return None
 
 
-def _same_mode(status, direction, other: int, other_direction: float):
-    return (status == other) & ((other != Status.SLIDE) | (direction == other_direction))
+def _same_mode(status, direction, other, other_direction):
+    same = (status == other) & ((other != Status.SLIDE) | (direction == other_direction))
+    return np.all(same, axis=-1) if np.ndim(other) else same
 
 
-def _directions(dimension: int) -> Float[np.ndarray, "d f"]:
+def directions(dimension: int) -> Float[np.ndarray, "d f"]:
     """Directions that fill the unit sphere evenly, in opposite pairs, the axes among them."""
     from scipy.special import ndtri
     from scipy.stats import qmc

@@ -1,0 +1,44 @@
+"""Starts in a tube about a set of crossing states, of several contacts (`tube` has those of one)."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .tube import RADIUS, STARTS
+
+
+def starts_of_several(
+    states: Float[np.ndarray, "k 2n"],
+    section: Float[np.ndarray, " n"],
+    gaps: Int[np.ndarray, " c"],
+) -> Float[np.ndarray, "m 2n"]:
+    """States on the edge of the tube about weighted deviations `states`.
+
+    `section` is what the section's row of velocities is in weighted ones; `gaps` are the places of the normal displacements,
+    which are zero in contact like the velocities there.
+    """
+    n = len(section)
+    chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
+    size = np.mean(np.linalg.norm(states, axis=-1))
+    # Shares of rounding are contact.
+    open_ = chosen[:, gaps] > 1e-6 * size
+    random = np.random.default_rng(0).normal(size=chosen.shape)
+    kind = np.arange(STARTS) % 4
+    away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
+    away = _on_section(_closed(away, open_, gaps), section)
+    found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    found[:, gaps] = np.where(open_, np.maximum(found[:, gaps], 1e-6 * size), 0.0)
+    found[:, n + gaps] = np.where(open_, found[:, n + gaps], 0.0)
+    return found
+
+
+def _closed(states, open_, gaps):
+    states, n = states.copy(), states.shape[1] // 2
+    for places in (gaps, n + gaps):
+        states[:, places] = np.where(open_, states[:, places], 0.0)
+    return states
+
+
+def _on_section(states, section):
+    states, n = states.copy(), len(section)
+    states[:, n:] -= np.outer(states[:, n:] @ section, section) / (section @ section)
+    return states
