@@ -237,10 +237,12 @@ def test_a_run_of_several_contacts_is_saved_and_drawn_with_one_panel_each(tmp_pa
 
 
 @pytest.mark.parametrize("act", [
-    lambda scene: fj.bistability_map(scene, mu_0=[0.1, 0.2], p=[1.0, 2.0]),
-    fj.limit_cycle,
+    lambda scene: fj.continue_cycle(scene, "force", (50.0, 150.0)),
+    lambda scene: fj.critical_perturbation(scene, derivatives=True),
+    fj.smallest_kick,
+    fj.tradeoff,
     fj.explorer,
-], ids=["map", "limit cycle", "explorer"])  # fmt: skip
+], ids=["branch", "critical kick", "smallest kick", "tradeoff", "explorer"])  # fmt: skip
 def test_what_takes_one_contact_says_so(act):
     """A sentence, before anything is compiled, and not a broadcast that goes through by chance."""
     with pytest.raises(ValueError, match=r"one contact, but this one has 2\."):

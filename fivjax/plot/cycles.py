@@ -21,7 +21,7 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     """A limit cycle in the phase plane, coloured by contact mode, and its Floquet multipliers beside the unit circle.
 
     Of a torus the points of the section stand beside it instead of the multipliers. `others` (the saddle cycle, say) are drawn
-    dashed into the same plane.
+    dashed into the same plane. Of several contacts the one that moves fastest is shown.
 
     **Raises:** `TypeError` for anything but a `LimitCycle`.
     """
@@ -29,11 +29,11 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
         arguments.instance("cycle", one, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
     figure = new_figure(figure, 9.6, 4.6)
     plane, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    _phase_plane(plane, cycle)
-    handles = [Line2D([], [], color=COLOURS[status], label=NAMES[status]) for status in _statuses(cycle)]
+    contact = _phase_plane(plane, cycle)
+    handles = [Line2D([], [], color=COLOURS[status], label=NAMES[status]) for status in _statuses(cycle, contact)]
     for other in others:
         run = other.trajectory(ROWS)
-        x, v = _tangential(run)
+        x, v = _tangential(run, contact)
         plane.plot(1e3 * x, v, color=BLACK, ls="--", lw=0.9)
         label = "another cycle" if other.stable else "saddle cycle"
         handles.append(Line2D([], [], color=BLACK, ls="--", label=f"{label}, {other.amplitude:.4g} m/s"))
@@ -46,30 +46,34 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     return figure
 
 
-def _statuses(cycle: LimitCycle) -> list[Status]:
-    return sorted({phase.status for phase in cycle.word})
+def _statuses(cycle: LimitCycle, contact: int) -> list[Status]:
+    return sorted({s if isinstance(s := phase.status, Status) else s[contact] for phase in cycle.word})
 
 
-def _tangential(run) -> tuple[np.ndarray, np.ndarray]:
-    tangential = run.scene.structure.tangential
-    return np.asarray(run.displacement)[:, tangential], np.asarray(run.velocity)[:, tangential]
+def _tangential(run, contact: int) -> tuple[np.ndarray, np.ndarray]:
+    along = run.scene.structure.tangential_directions[:, contact]
+    return np.asarray(run.displacement) @ along, np.asarray(run.velocity) @ along
 
 
-def _phase_plane(axes: Axes, cycle: LimitCycle) -> None:
+def _phase_plane(axes: Axes, cycle: LimitCycle) -> int:
+    """Draws the cycle; which of its contacts is shown."""
     # Of a torus, some beats.
     periods = 1 if cycle.kind == "periodic" else 40
     run = cycle.trajectory(ROWS, periods=periods)
-    x, v = _tangential(run)
-    status = np.asarray(run.status)
-    for mode in _statuses(cycle):
+    speeds = np.abs(np.asarray(run.velocity) @ run.scene.structure.tangential_directions)
+    contact = int(np.argmax(np.max(speeds, axis=0)))
+    x, v = _tangential(run, contact)
+    status = np.asarray(run.status).reshape(len(x), -1)[:, contact]
+    for mode in _statuses(cycle, contact):
         here = status == mode
         # A row belongs to the line before and after it.
         shown = here | np.append(False, here[:-1])
         axes.plot(1e3 * np.where(shown, x, np.nan), np.where(shown, v, np.nan), color=COLOURS[mode], lw=1.3)
-    belt = float(cycle.scene.belt_speed)
+    belt = float(np.broadcast_to(cycle.scene.belt_speed, speeds.shape[1])[contact])
     low, high = axes.get_ylim()
     if low < belt < high:
         axes.axhline(belt, color=BLACK, lw=0.6, ls=":")
+    return contact
 
 
 def _multipliers(axes: Axes, cycle: LimitCycle) -> None:

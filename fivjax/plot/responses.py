@@ -73,24 +73,32 @@ def phase_plane(
 ) -> Figure:
     """Tangential velocity over displacement for the `last` seconds of one run or of several by label (Fig. 17).
 
+    Of several contacts, a panel for each.
+
     **Example:**
 
         >>> figure = fj.plot.phase_plane(run)
     """
     runs = dict(runs) if isinstance(runs, Mapping) else {"": runs}
     check_runs(runs)
-    figure = new_figure(figure, 5.6, 4.6)
-    axes = figure.add_subplot()
+    count = max(len(run.scene.structure.contacts) for run in runs.values())
+    figure = new_figure(figure, 5.6 if count == 1 else 3.6 * count, 4.6)
+    panels = figure.subplots(1, count, squeeze=False)[0]
     styles = [(GREEN, "-"), (PURPLE, "--"), (BLUE, "-."), (ORANGE, ":"), (VERMILION, "-"), (BLACK, "--")]
     for (name, run), (colour, line) in zip(runs.items(), styles * (1 + len(runs) // len(styles)), strict=False):
-        tangential = run.scene.structure.tangential
         end = np.asarray(run.t) >= run.t[-1] - last
-        x, v = np.asarray(run.displacement)[end, tangential], np.asarray(run.velocity)[end, tangential]
-        axes.plot(1e3 * x, v, color=colour, ls=line, lw=0.9, label=name)
-    axes.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
+        along = run.scene.structure.tangential_directions
+        x, v = np.asarray(run.displacement)[end] @ along, np.asarray(run.velocity)[end] @ along
+        for contact, axes in enumerate(panels[: x.shape[1]]):
+            axes.plot(1e3 * x[:, contact], v[:, contact], color=colour, ls=line, lw=0.9, label=name)
+    for contact, axes in enumerate(panels):
+        axes.set(xlabel="tangential displacement (mm)")
+        if count > 1:
+            axes.set_title(f"contact {contact}", loc="right", fontsize="medium")
+    panels[0].set_ylabel("tangential velocity (m/s)")
     if any(runs):
-        # Beside the orbits: they may be anywhere in the plane.
-        legend_above(axes)
+        # Beside the motions: they may be anywhere in the plane.
+        legend_above(panels[0])
     return figure
 
 

@@ -14,6 +14,7 @@ class Ending(enum.IntEnum):
 
     FINISHED = 0
     NOT_FINITE = -2
+    PAINLEVE = -4
     TOO_MANY_EVENTS = -6
     UNBOUNDED = -7
     STEP_FAILURE = -8
@@ -26,6 +27,8 @@ ENDING = {
     Ending.FINISHED: "reached its end",
     Ending.NOT_FINITE: "the state stopped being finite, and the rows from there on are NaN; take a smaller step or check the "
     "parameters",
+    Ending.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé), so the motion is one of several; "
+    "lower the friction or the coupling in the mass matrix",
     Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
     "change the restitution or the belt speed a little",
     Ending.UNBOUNDED: "the motion grew a billionfold beyond its start, the belt's speed and what the load can cause, and the "

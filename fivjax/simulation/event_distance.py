@@ -173,7 +173,7 @@ class _Seen:
             return bool(look.ended[i])
         # Detached before and after, but put on the belt in between: a rebound.
         bounced = status == Status.DETACH == after and look.y[self.mechanics.normal] == 0
-        return status != after or bool(look.turned[i]) or bounced
+        return bool(status != after or look.turned[i] or bounced)
 
     def closest(self) -> ClosestCall:
         """The closest of all calls."""

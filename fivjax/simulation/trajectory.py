@@ -253,7 +253,8 @@ def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int)
     if not is_known(rows["velocity"]):
         finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
         failure = jnp.where(jnp.any(grown), Ending.UNBOUNDED, Ending.NOT_FINITE)
-        return jnp.where(jnp.all(finite), Ending.FINISHED, failure).astype(jnp.int8)
+        outcome = jnp.where(jnp.all(finite), Ending.FINISHED, failure)
+        return jnp.where(physics.slides_uniquely(Mechanics(scene)), outcome, Ending.PAINLEVE).astype(jnp.int8)
     finite = np.all(np.isfinite(rows["velocity"]), axis=-1)
     if np.all(finite):
         return np.int8(Ending.FINISHED)

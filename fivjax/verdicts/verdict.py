@@ -19,7 +19,7 @@ class Verdict(enum.IntEnum):
     UNDECIDED = -1
     NOT_FINITE = Ending.NOT_FINITE
     NO_EQUILIBRIUM = -3
-    PAINLEVE = -4
+    PAINLEVE = Ending.PAINLEVE
     NOT_RUN = -5
     TOO_MANY_EVENTS = Ending.TOO_MANY_EVENTS
     UNBOUNDED = Ending.UNBOUNDED
