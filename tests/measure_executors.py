@@ -114,8 +114,11 @@ def killed() -> None:
 
 def killed_dask() -> None:
     """The same with the workers of a Dask `LocalCluster`."""
+    import dask
     from distributed import Client, LocalCluster
 
+    # Else a worker that takes longer to come back is not expected any more; `cluster.adapt` would have another.
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})
     with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         # A nanny gives up on a worker that dies before it has begun.
         _with_kills("Dask", client, lambda: _begun(cluster))

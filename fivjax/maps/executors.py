@@ -137,8 +137,7 @@ def _adopted(executor):
     **Raises:** `TypeError`, `ValueError` for what a function has made that is no executor.
     """
     if hasattr(executor, "get_executor"):
-        # Not pure: a job that was lost and comes again is not the same task to Dask.
-        return executor.get_executor(pure=False)
+        return _OfDask(executor)
     if not hasattr(executor, "submit"):
         raise TypeError(
             "The function given as `executor` must make an executor, such as `ProcessPoolExecutor`, but what it made is "
@@ -146,6 +145,19 @@ def _adopted(executor):
         )
     check_executor(executor)
     return executor
+
+
+class _OfDask:
+    """A Dask `Client`, used directly: a future of its `get_executor` never ends when its result is lost and its job is not
+    tried again.
+    """
+
+    def __init__(self, client):
+        self._client = client
+
+    def submit(self, function, *given):
+        # Not pure: a job that was lost and comes again is not the same task to Dask.
+        return self._client.submit(function, *given, pure=False)
 
 
 def _like(broken: ProcessPoolExecutor) -> Executor:

@@ -69,16 +69,16 @@ def hand_out(
             number = under_way.pop(future)
             try:
                 result = future.result()
-            except BaseException as error:
-                if not is_loss(error):
+            except BaseException as caught:
+                if not is_loss(caught):
                     raise
+                error = caught
             else:
                 done(number, result)
                 workers.progressed()
                 continue
-            error = None if future.cancelled() else future.exception()
             gone = [(future, number)]
-            if error is not None and is_broken(error):
+            if is_broken(error):
                 # What was finished before the workers died is still to be heard of.
                 gone += [one for one in under_way.items() if not _finished(one[0])]
                 for one, _ in gone[1:]:
@@ -86,7 +86,7 @@ def hand_out(
                 workers.renew()
             for one, number in gone:
                 # In a queue that is served in order, only the first ones had begun.
-                blamed = MOST_LOSSES if error is not None and is_proof(error) else int(one in running)
+                blamed = MOST_LOSSES if is_proof(error) else int(one in running)
                 if number == alone:
                     lost_alone[number] += blamed
                 else:
