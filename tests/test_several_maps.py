@@ -166,3 +166,16 @@ def test_the_limit_cycle_of_a_chain_of_equal_blocks_is_that_of_one_block():
     ] == [(Status.STICK, Status.STICK), (Status.SLIDE, Status.SLIDE)]
     points = cycle.trajectory(50)
     assert np.abs(points.displacement[:, 0] - points.displacement[:, 2]).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_the_torus_of_one_of_two_contacts_is_found_too():
+    """At 3 m/s the paper's cycle beats: the set that the released trajectories meet on is that of one oscillator alone."""
+    axes = {"mu": [0.2], "p": [1.2, 1.5, 2.0]}
+    laws = [fj.Coulomb(0.2), fj.Coulomb(0.02)]
+    one = fj.bistability_map(fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.5)), **axes)
+    scene = fj.Scene(copies(2), laws, 3.0, fj.Pulse(100.0, 1.5))
+    both = fj.bistability_map(scene, t_max=8.0, mu_0=axes["mu"], p=axes["p"])
+    assert np.array_equal(both["verdict"], one["verdict"])
+    assert np.allclose(both["amplitude"], one["amplitude"], rtol=1e-3)
+    assert list(both["attractor_kind"].values) == list(one["attractor_kind"].values) == ["torus"]
