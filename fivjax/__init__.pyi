@@ -14,6 +14,7 @@ from .cycles.saddle import saddle_cycle as saddle_cycle
 from .cycles.search import NoLimitCycle as NoLimitCycle
 from .cycles.search import limit_cycle as limit_cycle
 from .cycles.search import limit_cycles as limit_cycles
+from .cycles.tori_on_branches import tori_along as tori_along
 from .io.datasets import open as open
 from .io.datasets import save as save
 from .io.files import save_figure as save_figure
@@ -26,6 +27,7 @@ from .io.structure_files import read_structure as read_structure
 from .linear import cea as cea
 from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
+from .maps.boundary_plane import boundary_section as boundary_section
 from .maps.smallest import SmallestKick as SmallestKick
 from .maps.smallest import smallest_kick as smallest_kick
 from .maps.smallest_perturbation import NoSquealingKick as NoSquealingKick

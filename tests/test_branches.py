@@ -146,3 +146,21 @@ def test_the_command_writes_branch_and_picture(branch, monkeypatch, tmp_path, ca
     said = capsys.readouterr().out
     assert "fold" in said and "The bound mu = 0.21 is reached." in said
     assert {path.name for path in tmp_path.iterdir()} == {"b-1.nc", "b-2.nc", "b.png"}
+
+
+def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):
+    """The saddle of this branch is unstable in one real direction: nothing is released beside it."""
+    assert fj.tori_along(branch).sizes["point"] == 0
+    with pytest.raises(ValueError, match="must come from"):
+        fj.tori_along(branch.drop_vars("multipliers"))
+
+
+@pytest.mark.slow
+def test_the_torus_beside_a_branch_is_what_the_independent_solver_comes_to():
+    branch = fj.continue_cycle(paper(1.8, 0.227), "belt_speed", (1.79, 3.0), start=fj.limit_cycle(paper(1.8, 0.227)))
+    assert specials(branch) == ["Neimark–Sacker"]
+    tori = fj.tori_along(branch, points=2)
+    stored = next(one for one in REFERENCE["paper"]["peaks"] if one["belt_speed"] == 3.0)
+    assert tori["kind"].values[-1] == "torus" and float(tori["parameter"][-1]) == 3.0
+    assert float(tori["amplitude"][-1]) == pytest.approx(stored["peak_speed"], rel=2e-3)
+    fj.plot.branch(branch, tori=tori)

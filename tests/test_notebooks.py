@@ -41,6 +41,7 @@ MUST_SHOW = {
     "04_speed_and_accuracy": ["good to  1e-09: event-exact", "image/png"],
     "05_calibration": ["converged", "standard deviations away"],
     "06_limit_cycles": ["1.11209 m/s", "unstable in 1 direction", "0.5859 m/s", "image/png"],
+    "07_the_boundary": ["manifold: p_crit = 1.107205808352", "Target reached", "image/png"],
     "08_your_own_structure": ["0.1779 at 76.5 Hz: flutter", "0 rigid-body modes", "found at 0.0807", "image/png"],
 }
 
@@ -52,6 +53,7 @@ SLOW = (
     "04_speed_and_accuracy",
     "05_calibration",
     "06_limit_cycles",
+    "07_the_boundary",
     "08_your_own_structure",
 )
 

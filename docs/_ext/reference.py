@@ -58,7 +58,16 @@ GROUPS = {
     "maps": (
         "Maps and critical kicks",
         "Many trajectories at once, each with a verdict.",
-        ["bistability_map", "critical_perturbation", "smallest_kick", "SmallestKick", "SmallestPerturbation", "basins", "Verdict"],
+        [
+            "bistability_map",
+            "critical_perturbation",
+            "boundary_section",
+            "smallest_kick",
+            "SmallestKick",
+            "SmallestPerturbation",
+            "basins",
+            "Verdict",
+        ],
     ),
     "cycles": (
         "Limit cycles",
@@ -73,6 +82,7 @@ GROUPS = {
             "CycleDerivatives",
             "continue_cycle",
             "cycle_at",
+            "tori_along",
         ],
     ),
     "linear": (

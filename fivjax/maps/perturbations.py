@@ -1,8 +1,8 @@
 r"""What may be smallest about a perturbation of steady sliding: an initial state, or a history of the load.
 
 Both are vectors $u$ with a norm, and both move, as long as the contact slides under constant friction, the two signals that end
-sliding linearly: a signal's change at the time $t$ is $κ(t) · u$. No $u$ smaller than the margin over $\sup_t |κ(t)|_*$, of the dual
-norm, ever ends it: such a perturbation is proved to slide for ever. The supremum is bounded between instants, too.
+sliding linearly: a signal's change at the time $t$ is $κ(t) · u$. No $u$ smaller than the margin over $\sup_t |κ(t)|_*$, of the
+dual norm, ever ends it: such a perturbation is proved to slide for ever. The supremum is bounded between instants, too.
 """
 
 from typing import NamedTuple, Protocol

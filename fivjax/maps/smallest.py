@@ -25,11 +25,14 @@ from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..model.sliding import sliding_states
 from ..verdicts.sliding_proof import envelope_peak, sliding_modes
+from .perturbations import stable_sliding
 from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
 from .threshold import critical_perturbation
 
 # Durations at which the bound is evaluated, and from which the smallest kick is sought.
 GRID, STARTS = 4096, 24
+# Of the starts that lead furthest down.
+DESCENTS = 4
 # Steps of the search about the best start; derivatives of p_crit that count as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
 OVER = ("p", "duration", "start", "state", "history")
@@ -147,7 +150,7 @@ def smallest_kick(
         arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
     shortest, longest = given["duration"] if "duration" in free else (own, own)
     certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
-    starts = np.linspace(shortest, longest, STARTS + 1)[1:] if "duration" in free else np.array([own])
+    starts = _nominated(scene, float(shortest), float(longest)) if "duration" in free else np.array([own])
     scanned = critical_perturbation(
         scene, duration=starts, p_range=tuple(map(float, given["p"])), p_step=p_step, progress=False
     )
@@ -160,7 +163,9 @@ def smallest_kick(
     row = scanned.isel(duration=best)
     p, duration = float(row["p_crit"]), float(starts[best])
     if "duration" in free:
-        p, duration = _descended(scene, p, duration, float(shortest), float(longest))
+        order = np.argsort(np.where(np.isfinite(scanned["p_crit"]), scanned["p_crit"], np.inf))[:DESCENTS]
+        tried = [(float(scanned["p_crit"][k]), float(starts[k])) for k in order if np.isfinite(scanned["p_crit"][k])]
+        p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for one in tried)
     at = critical_perturbation(
         scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
     ).isel(duration=0)
@@ -216,6 +221,29 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
         step = abs(d - duration) * (1 - share if turned else 1.0)
         duration, here = d, following
     return (p, duration) if here is None else (here.p, duration)
+
+
+def _nominated(scene: Scene, shortest: float, longest: float) -> np.ndarray:
+    """Durations to start from: those after which linear sliding swings furthest, and as many evenly between the bounds."""
+    durations = np.linspace(shortest, longest, GRID)
+    reached = _excess_by_duration(scene, durations)
+    lowest = np.flatnonzero((reached[1:-1] <= reached[:-2]) & (reached[1:-1] < reached[2:])) + 1
+    lowest = lowest[np.argsort(reached[lowest])][: STARTS // 2]
+    even = np.linspace(shortest, longest, STARTS // 2 + 1)[1:]
+    return np.unique(np.concatenate([durations[lowest], even]))
+
+
+def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
+    """The p - 1 at which linear sliding ends after a kick, without what may happen between two durations."""
+    sliding = stable_sliding(scene)
+    modes = sliding.modes
+    states = np.asarray(sliding_states(scene.structure.size, scene.structure.normal))
+    modal = modes.to_modal @ np.asarray(sliding.linear.equilibrium)[states].astype(complex)
+    shapes = 1 - np.exp(np.outer(durations, modes.eigenvalues))
+    # A kick without duration moves nothing.
+    with np.errstate(divide="ignore"):
+        reached = [margin / _peaks(shapes * (shares * modal), modes.envelope) for shares, margin in sliding.signals]
+    return np.min(reached, axis=0)
 
 
 @in_double_precision

@@ -2,6 +2,7 @@
 
 from . import energy as energy
 from . import linear as linear
+from .boundary import boundary_section as boundary_section
 from .branches import branch as branch
 from .contact_status import STATUS_COLOURS as STATUS_COLOURS
 from .contact_status import STATUS_NAMES as STATUS_NAMES

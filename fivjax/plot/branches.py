@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
 from .maps import bistability
-from .style import BLACK, COLOURS, axis_label, check_dataset, legend_above, new_figure
+from .style import BLACK, COLOURS, GREEN, axis_label, check_dataset, legend_above, new_figure
 
 CALL = "fj.continue_cycle(scene, 'mu', (0.02, 0.3))"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -19,12 +19,13 @@ def branch(
     branches: xr.Dataset | Mapping[str, xr.Dataset],
     *,
     beside: xr.Dataset | None = None,
+    tori: xr.Dataset | None = None,
     figure: Figure | None = None,
 ) -> Figure:
     """A bifurcation diagram: steady sliding and limit cycles over a parameter; stable ones solid, unstable ones dashed.
 
     **Arguments:** `branches`, a dataset from `continue_cycle`, or several over the same parameter by label; `beside`, a map
-    from `bistability_map` that is drawn to the right.
+    from `bistability_map` that is drawn to the right; `tori`, from `tori_along`, what attracts where cycles are unstable.
 
     **Returns:** a matplotlib figure.
 
@@ -54,6 +55,8 @@ def branch(
             handles.append(Line2D([], [], color=str(colour), label=label))
     if any(not np.all(one["stable"]) for one in several.values()):
         handles += [Line2D([], [], color=BLACK, label="stable"), Line2D([], [], color=BLACK, ls="--", label="unstable")]
+    if tori is not None:
+        handles += _tori(axes, tori)
     axes.set(xlabel=axis_label(names.pop()), ylabel="peak tangential speed (m/s)")
     axes.set_ylim(bottom=-0.02 * axes.get_ylim()[1])
     legend_above(axes, handles, columns=2)
@@ -73,6 +76,18 @@ def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
     x, slides = one["parameter"].values[order], one["sliding_stable"].values[order]
     for is_stable, style in ((True, "-"), (False, "--")):
         axes.plot(np.where(slides == is_stable, x, np.nan), np.zeros(len(x)), color=colour, ls=style, lw=1.3)
+
+
+def _tori(axes: Axes, tori: xr.Dataset) -> list[Line2D]:
+    check_dataset(tori, ("kind", "amplitude", "place"), "fj.tori_along(branch)", "tori")
+    handles = []
+    for kind, marker in (("torus", "o"), ("locked", "s"), ("another cycle", "^")):
+        here = tori["kind"].values == kind
+        if here.any():
+            style = {"ls": "none", "marker": marker, "ms": 4, "color": GREEN, "zorder": 4}
+            axes.plot(tori["parameter"].values[here], tori["amplitude"].values[here], **style)
+            handles.append(Line2D([], [], **style, label=kind))
+    return handles
 
 
 def _special_points(axes: Axes, several: Mapping[str, xr.Dataset]) -> list[Line2D]:

@@ -1,0 +1,98 @@
+"""What a branch's cycles become where a pair of multipliers has left the unit circle: tori, and cycles that they lock to."""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..io.datasets import labelled
+from ..steppers.event_exact import EventExact
+from .continuation import cycle_at
+from .cycle import LimitCycle
+from .search import attractors_met, states_in_contact
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# How far from the cycle motions are released, relative to it: a motion on either side of a small torus, and one far out.
+RELEASED = (1e-3, -1e-3, 0.02, -0.02)
+KINDS = ("torus", "locked", "another cycle", "none")
+
+
+@in_double_precision
+def tori_along(branch: "xr.Dataset", points: int = 12) -> "xr.Dataset":
+    """What attracts beside the cycles of a branch that a pair of multipliers has made unstable.
+
+        tori = fj.tori_along(fj.continue_cycle(scene, "mu", (0.02, 0.3)))
+
+    Between a Neimark–Sacker point and where its pair comes back, or the cycle has other modes of instability, motions are
+    released beside some of the cycles, and followed to what attracts them.
+
+    **Arguments:** `branch`, from `continue_cycle`; `points`, at most so many of its points.
+
+    **Returns:** a dataset over `point`: `place` on the branch, `parameter`, `kind` ("torus"; "locked", a cycle that closes
+    after more crossings of the section; "another cycle"; "none", where nothing was met), `amplitude` (peak tangential speed,
+    m/s) and `rotation_number` of a torus (turns per return, without its sense).
+
+    **Raises:** `ValueError` for what is no branch.
+
+    **Example:**
+
+        >>> branch = fj.continue_cycle(scene.replace(mu=0.227), "belt_speed", (1.7, 3.0))  # doctest: +SLOW
+        >>> bool(np.any(fj.tori_along(branch, points=2)["kind"] == "torus"))  # doctest: +SLOW
+        True
+    """
+    import xarray as xr
+
+    if not {"multipliers", "special", "parameter"} <= set(getattr(branch, "variables", ())):
+        raise ValueError("Argument `branch` must come from `fivjax.continue_cycle`.")
+    arguments.whole_number("points", points, minimum=1)
+    places = _turning(np.asarray(branch["multipliers"]), branch["special"].values)
+    places = (
+        places[np.unique(np.linspace(0, len(places) - 1, min(points, len(places))).round().astype(int))]
+        if len(places)
+        else places
+    )
+    kinds, amplitudes, rotation, scene = [], [], [], None
+    for place in places:
+        cycle = cycle_at(branch, int(place))
+        scene = cycle.scene
+        found = _attractor(cycle)
+        kind = KINDS[3]
+        if found is not None:
+            more = found.crossings > cycle.crossings
+            kind = KINDS[0] if found.kind == "torus" else KINDS[1] if more else KINDS[2]
+        kinds.append(kind)
+        amplitudes.append(np.nan if found is None else float(found.amplitude))
+        turns = None if found is None else found.rotation_number
+        rotation.append(np.nan if turns is None else abs(float(turns)))
+    dataset = xr.Dataset(
+        {
+            "place": ("point", places),
+            "parameter": ("point", np.asarray(branch["parameter"])[places]),
+            "kind": ("point", np.array(kinds, dtype="<U13")),
+            "amplitude": ("point", amplitudes),
+            "rotation_number": ("point", rotation),
+        }
+    )
+    if scene is None:
+        return dataset.assign_attrs(parameter=branch.attrs["parameter"])
+    return labelled(dataset, scene).assign_attrs(parameter=branch.attrs["parameter"])
+
+
+def _turning(multipliers: np.ndarray, special: np.ndarray) -> np.ndarray:
+    """Points whose cycles one complex pair of multipliers, and nothing else, makes unstable."""
+    outside = np.abs(multipliers) > 1 + 1e-6
+    complex_ = np.abs(multipliers.imag) > 1e-9
+    return np.flatnonzero((outside.sum(axis=1) == 2) & ((outside & complex_).sum(axis=1) == 2) & (special == ""))
+
+
+def _attractor(cycle: LimitCycle) -> LimitCycle | None:
+    """What attracts motions that are released beside a cycle; a torus before a cycle."""
+    states = np.stack([(1 + by) * cycle.deviation for by in RELEASED])
+    met = attractors_met(cycle.scene, EventExact(), states_in_contact(cycle.scene, jnp.asarray(states)))
+    found = [one.cycle for one in met if one.cycle is not None]
+    tori = [one for one in found if one.kind == "torus"]
+    return next(iter(tori or found), None)

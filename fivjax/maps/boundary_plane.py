@@ -1,0 +1,169 @@
+r"""A plane of the Poincaré section through the saddle on the boundary: what slides, what squeals, how a critical kick comes in.
+
+The plane is spanned by the saddle's unstable direction and its slowest stable one, right eigenvectors $r$ of the return map's
+derivative; with the left ones $l$ a state $x$ of the section has the coordinates $l · (x - x_s)$ in it, in sizes of the saddle.
+Where verdicts change along the unstable direction is the trace of the stable manifold; at the saddle it is tangent to the
+stable direction.
+"""
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+
+from ..cycles.kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked
+from ..cycles.section_map import sliding_state
+from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..io.datasets import labelled
+from ..model.load import ConstantLoad, Pulse
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact
+from ..verdicts.verdict import Verdict
+from .engine import run_to_verdict
+from .threshold import critical_perturbation
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# How far beside the critical kick the two shown are, relative to it.
+BESIDE = 1e-7
+# A crossing is shown while less than this share of its distance from the saddle leads out of the plane.
+FLAT = 0.5
+# Rounds in which the manifold is narrowed down, and states inside a bracket.
+ROUNDS, INSIDE = 2, 15
+
+
+@in_double_precision
+def boundary_section(
+    scene: Scene, *, reach: float = 0.15, points: int = 41, p_range: tuple[float, float] = (1.0, 5.0)
+) -> "xr.Dataset":
+    """The boundary between sliding and squeal in a plane of the Poincaré section through the saddle cycle.
+
+        fj.plot.boundary_section(fj.boundary_section(scene))
+
+    **Arguments:** `scene`, whose load is a `Pulse`; `reach`, half the width of the plane, in sizes of the saddle; `points`,
+    states on either axis; `p_range`, where the critical kick is looked for.
+
+    **Returns:** a dataset with
+
+    - `verdict` over `stable` and `unstable`, the coordinates in the plane, in sizes of the saddle, which is at zero;
+    - `manifold` over `stable`, where verdicts change, NaN where they do not;
+    - `path` over `side` ("slides", "squeals"), `crossing` and `direction` ("unstable", "stable"): where the motion after a kick
+      just below and just above the critical one crosses the section, projected onto the plane; NaN far from it;
+    - the attributes `p_crit` and `multiplier`, the saddle's unstable one.
+
+    **Raises:** `ValueError` where no critical kick lands on the stable manifold of a saddle cycle.
+
+    **Example:**
+
+        >>> plane = fj.boundary_section(scene.replace(belt_speed=1.0), points=9, p_range=(1.0, 1.3))  # doctest: +SLOW
+        >>> bool(abs(plane["manifold"].sel(stable=0.0)) < 0.05)  # doctest: +SLOW
+        True
+    """
+    import xarray as xr
+
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p leads to the boundary")
+    arguments.real_number("reach", reach, above=0)
+    arguments.whole_number("points", points, minimum=3)
+    found = critical_perturbation(scene, p_range=p_range, progress=False).isel(belt_speed=0)
+    bracket = float(found["p_crit_low"]), float(found["p_crit_high"])
+    critical = critical_kick(scene, bracket, ()) if np.all(np.isfinite(bracket)) else None
+    weights = np.asarray(scene.structure.weights)
+    saddle = None if critical is None else saddle_of(critical.saddle, weights)
+    if critical is None or saddle is None:
+        raise ValueError(
+            "No critical kick in the range lands on the stable manifold of a saddle cycle. Change `p_range`, or the scene."
+        )
+    right, left = _directions(saddle, weights)
+    origin = weights * np.asarray(saddle.closed.point.y)
+    axis, size = np.linspace(-reach, reach, points), np.linalg.norm(origin)
+
+    def verdicts(stable: np.ndarray, unstable: np.ndarray) -> np.ndarray:
+        places = unstable.reshape(-1, 1) * right[0] + stable.reshape(-1, 1) * right[1]
+        return _verdicts(scene, (origin + size * places) / weights).reshape(stable.shape)
+
+    stable, unstable = np.meshgrid(axis, axis, indexing="ij")
+    verdict = verdicts(stable, unstable)
+    along_p = directions_of(scene, ("p",))
+    sides = [
+        kicked(scene.replace(p=critical.p * (1 + by)), EventExact(), along_p, MOST_CROSSINGS)
+        for by in (-BESIDE, BESIDE)
+    ]
+    paths = [_path(side, weights, origin, left / size, right * size) for side in sides]
+    longest = max(map(len, paths))
+    padded = [np.pad(path, ((0, longest - len(path)), (0, 0)), constant_values=np.nan) for path in paths]
+    dataset = xr.Dataset(
+        {
+            "verdict": (("stable", "unstable"), verdict.astype(np.int8)),
+            "manifold": ("stable", _manifold(axis, verdict, verdicts)),
+            "path": (("side", "crossing", "direction"), np.stack(padded)),
+        },
+        coords={"stable": axis, "unstable": axis, "side": ["slides", "squeals"], "direction": ["unstable", "stable"]},
+    )
+    return labelled(dataset, scene).assign_attrs(p_crit=critical.p, multiplier=saddle.multiplier)
+
+
+def _directions(saddle: Saddle, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unstable and the slowest stable direction (rows), of length one, and the rows that give a state's shares in them."""
+    scaled = weights[:, None] * saddle.closed.jacobian / weights
+    values, right = np.linalg.eig(scaled)
+    order = np.argsort(-np.abs(values))[:2]
+    chosen = right[:, order]
+    # Of a complex pair the real part will do: the plane is only looked at.
+    basis = np.real(chosen / np.linalg.norm(chosen, axis=0))
+    basis = basis / np.linalg.norm(basis, axis=0)
+    unstable = saddle.left / (saddle.left @ basis[:, 0])
+    beside = basis[:, 1] - (unstable @ basis[:, 1]) * basis[:, 0]
+    beside = beside / np.linalg.norm(beside)
+    # The second row knows nothing of the first direction.
+    second = beside - (beside @ basis[:, 0]) * unstable
+    return np.stack([basis[:, 0], beside]), np.stack([unstable, second / (second @ beside)])
+
+
+def _path(path: Crossings, weights: np.ndarray, origin: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The crossings in the plane's coordinates, in order; not numbers while they are far from the plane."""
+    away = weights * path.y[: path.count] - origin
+    inside = away @ left.T
+    beside = np.linalg.norm(away - inside @ right, axis=-1)
+    return np.where((beside < FLAT * np.linalg.norm(away, axis=-1))[:, None], inside, np.nan)
+
+
+def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
+    """Where each row of verdicts changes between sliding and a limit cycle, narrowed down; the change closest to zero."""
+    low, high = np.full((2, len(axis)), np.nan)
+    for row, values in enumerate(verdict):
+        flips = np.flatnonzero(_changes(values))
+        if len(flips):
+            place = flips[np.argmin(np.abs(axis[flips] + axis[flips + 1]))]
+            low[row], high[row] = axis[place], axis[place + 1]
+    known = np.flatnonzero(np.isfinite(low))
+    for _ in range(ROUNDS if len(known) else 0):
+        inner = np.linspace(low[known], high[known], INSIDE + 2, axis=1)
+        found = verdicts(np.broadcast_to(axis[known, None], inner.shape), inner)
+        changes = _changes(found)
+        place, rows = np.argmax(changes, axis=1), np.arange(len(known))
+        at = changes[rows, place]
+        low[known] = np.where(at, inner[rows, place], low[known])
+        high[known] = np.where(at, inner[rows, place + 1], high[known])
+    return 0.5 * (low + high)
+
+
+def _changes(verdict: np.ndarray) -> np.ndarray:
+    """Between which neighbours of the last axis a verdict changes from sliding to a limit cycle, or back."""
+    pair = {int(Verdict.SLIDING), int(Verdict.LIMIT_CYCLE)}
+    decided = np.isin(verdict, list(pair))
+    return (verdict[..., 1:] != verdict[..., :-1]) & decided[..., 1:] & decided[..., :-1]
+
+
+def _verdicts(scene: Scene, states: np.ndarray) -> np.ndarray:
+    quiet = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
+    names = scene.structure.coordinates
+    places = {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
+    totals = states + np.asarray(sliding_state(scene, scene.load.final))
+    values = {name: np.ascontiguousarray(totals[:, place]) for name, place in places.items()}
+    return run_to_verdict(
+        quiet, values, EventExact(), t_max=30.0, memory=2e9, progress=False, label="section", states=places
+    ).verdict

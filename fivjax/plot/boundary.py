@@ -1,0 +1,58 @@
+"""The boundary between sliding and squeal in a plane of the Poincaré section."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from ..verdicts.verdict import Verdict
+from .maps import SLIDING_SHADE
+from .style import BLACK, BLUE, ORANGE, VERMILION, cell_edges, check_dataset, new_figure
+
+
+def boundary_section(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
+    """The stable manifold, the saddle and two kicks beside the critical one, over the verdicts of a plane of the section.
+
+    **Arguments:** `dataset` from `boundary_section`.
+
+    **Returns:** a matplotlib figure.
+
+    **Raises:** `TypeError` for anything but such a dataset.
+    """
+    check_dataset(dataset, ("verdict", "manifold", "path"), "fj.boundary_section(scene)")
+    figure = new_figure(figure, 7.2, 5.4)
+    axes = figure.add_subplot()
+    x, y = cell_edges(dataset["unstable"].values), cell_edges(dataset["stable"].values)
+    verdict = dataset["verdict"].values
+    handles: list[Patch | Line2D] = []
+    fills = (
+        (verdict == Verdict.SLIDING, SLIDING_SHADE, "slides"),
+        (verdict == Verdict.LIMIT_CYCLE, ORANGE, "squeals"),
+        (verdict < 0, "0.6", "no verdict"),
+    )
+    for where, colour, label in fills:
+        if where.any():
+            shown = np.ma.masked_where(~where, np.ones(verdict.shape))
+            axes.pcolormesh(x, y, shown, cmap=ListedColormap([colour]), alpha=0.6, rasterized=True)
+            handles.append(Patch(facecolor=colour, edgecolor="0.6", alpha=0.6, label=label))
+    axes.plot(dataset["manifold"], dataset["stable"], color=BLACK, lw=1.6)
+    handles.append(Line2D([], [], color=BLACK, lw=1.6, label="stable manifold"))
+    for side, colour, marker in (("slides", BLUE, "v"), ("squeals", VERMILION, "^")):
+        path = dataset["path"].sel(side=side)
+        axes.plot(
+            path.sel(direction="unstable"), path.sel(direction="stable"), color=colour, marker=marker, ms=2.5, lw=0.4
+        )
+        sign = "below" if side == "slides" else "above"
+        handles.append(Line2D([], [], color=colour, marker=marker, ms=4, lw=0.6, label=f"kick just {sign} critical"))
+    axes.plot(0, 0, "o", ms=8, mfc="white", mec=BLACK, mew=1.5, zorder=4)
+    handles.append(Line2D([], [], ls="none", marker="o", mfc="white", mec=BLACK, ms=8, label="saddle cycle"))
+    axes.set(
+        xlim=(x[0], x[-1]),
+        ylim=(y[0], y[-1]),
+        xlabel="along the unstable direction (sizes of the saddle)",
+        ylabel="along the slowest stable direction",
+    )
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
+    return figure
