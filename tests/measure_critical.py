@@ -30,7 +30,12 @@ def static(belt_speed: float, mu: float) -> fj.Scene:
 
 
 def bisected(scene: fj.Scene, low: float, high: float, width: float = 2e-13) -> tuple[float, float]:
-    """The change from sliding to anything else between two kicks, by the independent solver."""
+    """The change from sliding to anything else between two kicks, by the independent solver; outside them where it is not inside."""
+    while True:
+        ends = reference.fate([{**reference.of_scene(scene), "p": p} for p in (low, high)], threads=2).fate == "slides"
+        if (ends[0] and not ends[1]) or high - low > 1e-2:
+            break
+        low, high = low - 4 * (high - low), high + 4 * (high - low)
     while high - low > width * high:
         tried = np.linspace(low, high, 18)[1:-1]
         fates = reference.fate([{**reference.of_scene(scene), "p": p} for p in tried], threads=2).fate
@@ -92,15 +97,15 @@ def derivatives() -> None:
         print(f"  {found.kind.values} at v = {speed:g}: {p:.12f}, the reference's bracket {low:.12f} to {high:.12f}")
         for name in differentiable(scene):
             value, slope = float(scene.parameters[name]), float(found.d_p_crit.sel(parameter=name))
-            # Of touching kicks so little that the same swing touches.
-            by = (1e-7 if str(found.kind.values) == "grazing" else 1e-6) * (abs(value) or 1.0)
+            # So little that p_crit stays smooth (further away another swing touches first), and far above its rounding.
+            by = min(1e-3 * (abs(value) or 1.0), 2e-6 / max(abs(slope), 1e-12))
             kicks = []
             for side in (-by, by):
                 if value + side < 0:
                     kicks.append(np.nan)
                     continue
                 guess = p + slope * side
-                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 1e-7, guess + 1e-7)))
+                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 2e-9, guess + 2e-9)))
             difference = (kicks[1] - (p if np.isnan(kicks[0]) else kicks[0])) / (by if np.isnan(kicks[0]) else 2 * by)
             print(
                 f"  v = {speed:g} {name:12s} {slope: .9e}  differences {difference: .9e}  apart {slope - difference: .1e}"
