@@ -118,7 +118,7 @@ def killed_dask() -> None:
     from distributed import Client, LocalCluster
 
     # Else a worker that takes longer to come back is not expected any more; `cluster.adapt` would have another.
-    dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "2m"})
     with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         # A nanny gives up on a worker that dies before it has begun.
         _with_kills("Dask", client, lambda: _begun(cluster))
