@@ -179,3 +179,28 @@ def test_the_torus_of_one_of_two_contacts_is_found_too():
     assert np.array_equal(both["verdict"], one["verdict"])
     assert np.allclose(both["amplitude"], one["amplitude"], rtol=1e-3)
     assert list(both["attractor_kind"].values) == list(one["attractor_kind"].values) == ["torus"]
+
+
+@pytest.mark.slow
+def test_the_critical_kick_of_one_of_two_contacts_is_its_own():
+    """The same scan and the same narrowing: the same bracket, to the last digit."""
+    laws = [fj.Coulomb(0.2), fj.Coulomb(0.02)]
+    one = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
+    both = fj.Scene(copies(2), laws, 1.0, fj.Pulse(100.0, 1.2))
+    how = {"p_range": (1.2, 1.6), "p_step": 0.05, "tolerance": 1e-3, "t_max": 8.0, "force": [100.0]}
+    expected, found = (fj.critical_perturbation(scene, **how) for scene in (one, both))
+    assert np.isfinite(expected["p_crit"].values).all()
+    for name in ("p_crit", "p_crit_low", "p_crit_high"):
+        assert np.array_equal(found[name], expected[name])
+
+
+@pytest.mark.slow
+def test_the_saddle_cycle_of_one_of_two_contacts_is_its_own():
+    """Edge tracking and Newton's method in the space of both: the unstable cycle of the oscillator alone."""
+    scene, single = with_friction(0, 0.2), fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.5))
+    found, own = (
+        fj.saddle_cycle(each, fj.limit_cycle(each, start=fj.simulate(each, 4.0, 0.01))) for each in (scene, single)
+    )
+    assert found.unstable_directions == own.unstable_directions == 1
+    assert found.period == pytest.approx(own.period, rel=1e-10)
+    assert found.amplitude == pytest.approx(own.amplitude, rel=1e-10)
