@@ -47,8 +47,8 @@ class Map:
     overwrite: Overwrite = False
     refine: int = 0
     """how many times to halve all intervals where neighbours differ"""
-    t_max: float = 20.0
-    """time after which a trajectory without a verdict is called undecided (s)"""
+    t_max: float | None = None
+    """time after which a trajectory without a verdict is called undecided (s); unless given, so long that few are"""
     memory: float = 2e9
     """memory for trajectories under way (bytes)"""
     resume: Resume = None

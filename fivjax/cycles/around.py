@@ -1,5 +1,6 @@
 """Once around a closed cycle: its segments, its word of contact modes, its peak, its harmonics, its monodromy matrix."""
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..contact import Contact, Mechanics, Status
+from ..contact import Contact, Mechanics, State, Status
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
@@ -67,38 +68,80 @@ def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period:
 
 def peak_speed(stepper: EventExact, mechanics: Mechanics, segments: Round) -> Float[Array, ""]:
     """The largest tangential speed in any of the segments, of any contact, in m/s, to rounding."""
-    speeds = [_peak_of(stepper, mechanics, segments, tangential) for tangential, _ in mechanics.places]
-    return speeds[0] if len(speeds) == 1 else jnp.max(jnp.stack(speeds))
-
-
-def _peak_of(stepper: EventExact, mechanics: Mechanics, segments: Round, tangential: int) -> Float[Array, ""]:
-    velocity = segments.y.shape[1] // 2 + tangential
-    zero = jnp.zeros((), segments.y.dtype)
 
     def of_segment(y, contact, h):
-        coefficients, unit = stepper.series(mechanics, contact, zero, y)
-        speeds = coefficients[:, velocity]
-        end = h / unit
-
-        def derivatives(x):
-            value = slope = bend = jnp.zeros_like(x)
-            for c in speeds[::-1]:
-                bend = bend * x + slope
-                slope = slope * x + value
-                value = value * x + c
-            return value, slope, 2 * bend
-
-        samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
-        values, _, _ = jax.vmap(derivatives)(samples)
-        x = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
-        for _ in range(PEAK_STEPS):
-            _, slope, bend = derivatives(x)
-            x = jax.lax.stop_gradient(jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), 0.0, end))
-        refined, _, _ = derivatives(x)
-        ends = jnp.stack([jnp.max(jnp.abs(values)), jnp.abs(refined)])
-        return jnp.where(h > 0, jnp.max(ends), 0.0)
+        return _peak_within(stepper, mechanics, y, contact, h)
 
     return jnp.max(jax.vmap(of_segment)(segments.y, segments.contact, segments.h))
+
+
+def peak_speed_along(
+    stepper: EventExact,
+    mechanics: Mechanics,
+    point: Point,
+    crossings: Int[Array, ""],
+    longest: Float[Array, ""],
+    most: int,
+) -> Float[Array, ""]:
+    """The largest tangential speed in m/s, to rounding, of a motion from a point to its `crossings`-th crossing of the section.
+
+    Not a number where that takes more than the time `longest` (s), or more than `most` segments; none of them is kept.
+    """
+
+    def observe(total, segment: Segment):
+        crossed, peak = total
+        own = _peak_within(stepper, mechanics, segment.y, segment.contact, segment.after.h)
+        return crossed + segment.after.rise.happened, jnp.maximum(peak, own)
+
+    zero = jnp.zeros((), point.y.dtype)
+    after = follow(
+        stepper,
+        mechanics,
+        point.contact,
+        zero,
+        point.y,
+        longest,
+        total=(jnp.zeros((), jnp.int32), zero),
+        observe=observe,
+        until=lambda total: total[0] >= crossings,
+        at_section=True,
+        most=most,
+        kind="lax",
+    )
+    crossed, peak = after.total
+    return jnp.where(crossed >= crossings, peak, jnp.nan)
+
+
+def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: Contact, h) -> Float[Array, ""]:
+    coefficients, unit = stepper.series(mechanics, contact, jnp.zeros((), y.dtype), y)
+    of_contacts = [
+        _peak_of_series(coefficients[:, y.shape[0] // 2 + tangential], h, h / unit) for tangential, _ in mechanics.places
+    ]
+    return functools.reduce(jnp.maximum, of_contacts)
+
+
+def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
+    def derivatives(x):
+        value = slope = bend = jnp.zeros_like(x)
+        for c in speeds[::-1]:
+            bend = bend * x + slope
+            slope = slope * x + value
+            value = value * x + c
+        return value, slope, 2 * bend
+
+    samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
+    values, _, _ = jax.vmap(derivatives)(samples)
+
+    def newton(_, x):
+        _, slope, bend = derivatives(x)
+        return jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), 0.0, end)
+
+    # A loop, because its body is compiled once. Where the peak is does not matter to the first order.
+    largest = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
+    x = jax.lax.stop_gradient(jax.lax.fori_loop(0, PEAK_STEPS, newton, largest))
+    refined, _, _ = derivatives(x)
+    ends = jnp.stack([jnp.max(jnp.abs(values)), jnp.abs(refined)])
+    return jnp.where(h > 0, jnp.max(ends), 0.0)
 
 
 def harmonics(

@@ -18,7 +18,7 @@ from ..verdicts import ensemble as nominating
 from ..verdicts import tube
 from ..verdicts.tube_of_several import starts_of_several
 from ..verdicts.verdict import Verdict
-from .captures import Cycle, captured, distinct, stable_cycles
+from .captures import MORE_CROSSINGS, Cycle, captured, distinct, stable_cycles
 from .flattened import Flattened, flatten
 from .section import ReturnMaps, Section
 from .sharing import Batch
@@ -30,8 +30,15 @@ NEWTON_AT = (24, 64, 128, 256)
 BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 # Returns over which a torus' mean period is taken.
 MEAN_OVER = 64
-# Mean periods from each start in which its peak is sought.
-PEAK_OVER = 4
+# The peak on a torus is sought from one in so many of its states, for so many crossings: trajectories may have passed over some.
+PEAK_EVERY, PEAK_CROSSINGS = 2, 4
+# Starts about a torus from which it is asked whether neighbours part, and over how many returns, twice: the first turn
+# directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
+PARTING_FROM, PARTING_OVER, PARTING = 4, 48, 0.05
+# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
+LOCKED = -0.0015
+# How far neighbours are apart at first, relative to their size.
+APART = 1e-7
 
 
 class Torus(NamedTuple):
@@ -65,10 +72,11 @@ def search(
     columns: Float[np.ndarray, "g h"],
     report,
     near: Float[np.ndarray, "g 2n"] | None = None,
+    cycles: list[list[Cycle]] | None = None,
 ) -> list[Attractors]:
     """The attractors of these groups. `columns` are the load's histories of any trajectory of each.
 
-    With `near`, states of the section, members begin about these instead of being released.
+    With `near`, states of the section, members begin about these instead of being released. `cycles` of each are known.
     """
     members = len(nominating.RELEASES)
     own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
@@ -87,7 +95,7 @@ def search(
     deviations = np.full((most, len(own), size), np.nan)
     peaks, times, events = (np.full((most, len(own)), np.nan) for _ in range(3))
     decay = shared.tree.modes.slowest_decay
-    found = [Attractors([], None) for _ in groups]
+    found = [Attractors([] if cycles is None else list(cycles[k]), None) for k in range(len(groups))]
     looks = 0
 
     def met(k: int):
@@ -114,12 +122,19 @@ def search(
             open_ = np.unique(running[moving[running]] // members)
             sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
             if sets:
-                _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, within, report)
-                done = [k for k, _ in sets if found[k].torus is not None]
+                locked = _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, within, report)
+                done = [k for k, _ in sets if found[k].torus is not None or k in locked]
                 moving[np.isin(np.arange(len(own)) // members, done)] = False
         left = moving[running]
         running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
     return found
+
+
+def _keep(maps: ReturnMaps, new: list[tuple[int, Cycle]], found: list[Attractors]) -> None:
+    """Adds those cycles (each with the place of its group) that are not known yet."""
+    for k, cycle in new:
+        if not any(same_cycle(maps, cycle, other) for other in found[k].cycles):
+            found[k].cycles.append(cycle)
 
 
 def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int) -> None:
@@ -138,11 +153,9 @@ def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attract
     picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), running // members, left)
     if not len(picked):
         return
-    new = stable_cycles(maps, own[running[picked]], at.rows(picked))
-    for _, rows, cycle in new:
-        mine = found[running[picked[rows[0]]] // members].cycles
-        if not any(same_cycle(maps, cycle, other) for other in mine):
-            mine.append(cycle)
+    known = {int(own[members * k]): one.cycles for k, one in enumerate(found)}
+    new = stable_cycles(maps, own[running[picked]], at.rows(picked), known)
+    _keep(maps, [(running[picked[rows[0]]] // members, cycle) for _, rows, cycle in new], found)
     if new:
         take_captured()
 
@@ -161,8 +174,10 @@ def section_of(now) -> Section:
 
 def _add_tori(
     batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, within: int, report
-) -> None:
-    """Which of the sets that ensembles have met on (with the group's place) are tori."""
+) -> list[int]:
+    """Which of the sets that ensembles have met on (with the group's place) are tori; returns the places of groups whose torus
+    is locked: there its cycle was found.
+    """
     weights = maps.weights
     starts = [_about(maps, states[:: len(states) // tube.STARTS] / weights) for _, (states, _) in sets]
     count = tube.STARTS
@@ -192,15 +207,60 @@ def _add_tori(
             break
     tori = np.flatnonzero(np.all(home.reshape(-1, count), axis=1) & ok)
     if not len(tori):
-        return
-    rows = (count * tori[:, None] + np.arange(count)).ravel()
-    image = maps.returns(own[rows[::count]], last.rows(rows[::count]), MEAN_OVER)
+        return []
+    chosen = (count * tori[:, None] + np.arange(0, count, count // PARTING_FROM)).ravel()
+    parting = np.mean(_parting(maps, own[chosen], last.rows(chosen)).reshape(-1, PARTING_FROM), axis=1)
+    locked = _locked(maps, groups, last.rows(count * tori[parting < LOCKED]), tori[parting < LOCKED], sets, found)
+    led_to_cycle = [sets[k][0] for k in locked]
+    tori = np.setdiff1d(tori[parting < PARTING], locked)
+    if not len(tori):
+        return led_to_cycle
+    image = maps.returns(own[count * tori], last.rows(count * tori), MEAN_OVER)
     period = image.time / MEAN_OVER
-    peaks = maps.peaks(own[rows], last.rows(rows), np.repeat(PEAK_OVER * period, count)).reshape(-1, count)
+    peaks = [_peak_on(maps, groups[sets[k][0]], sets[k][1][0], last.rows(slice(count * k, count * (k + 1)))) for k in tori]
     for k, mean, peak in zip(tori, period, peaks, strict=True):
         place, (states, _) = sets[k]
-        if np.isfinite(mean) and np.all(np.isfinite(peak)):
-            found[place] = found[place]._replace(torus=Torus(states, float(np.max(peak)), float(mean)))
+        if np.isfinite(mean) and np.isfinite(peak):
+            found[place] = found[place]._replace(torus=Torus(states, peak, float(mean)))
+    return led_to_cycle
+
+
+def _locked(maps: ReturnMaps, groups, at: Section, tori, sets, found) -> list[int]:
+    """Which of these tori are locked: motions on them, from here, are near a cycle of many crossings, which is added."""
+    if not len(tori):
+        return []
+    places = [sets[k][0] for k in tori]
+    known = {int(groups[place]): found[place].cycles for place in places}
+    new = stable_cycles(maps, groups[places], at, known, MORE_CROSSINGS)
+    _keep(maps, [(places[rows[0]], cycle) for _, rows, cycle in new], found)
+    return [tori[row] for _, rows, _ in new for row in rows]
+
+
+def _peak_on(maps: ReturnMaps, group: int, states: Float[np.ndarray, "k 2n"], last: Section) -> float:
+    """The largest tangential speed (m/s) on a torus: of motions from states that lie all over it, for a few crossings."""
+    if len(maps.structure.contacts) > 1:  # whose contact modes a state of the section does not tell
+        at, crossings = last, PEAK_CROSSINGS * len(states) // (PEAK_EVERY * len(last.y))
+    else:
+        at, crossings = _section_at(states[::PEAK_EVERY] / maps.weights, maps.structure.normal), PEAK_CROSSINGS
+    return float(np.max(maps.peaks(np.full(len(at.y), group), at, crossings)))
+
+
+def _parting(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " m"]:
+    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return."""
+    weights = maps.weights
+    size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
+    # Away from the equilibrium, which keeps what the section and the contact hold at zero.
+    beside, grown = at.y * (1 + APART), np.nan
+    for _ in range(2):
+        pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
+        image = maps.returns(np.tile(group, 2), pair, PARTING_OVER).at
+        at, other = image.rows(slice(None, len(group))), image.rows(slice(len(group), None))
+        away = weights * (other.y - at.y)
+        distance = np.linalg.norm(away, axis=1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            grown = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
+            beside = at.y + APART * size * away / distance / weights
+    return grown
 
 
 def _about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:

@@ -55,11 +55,12 @@ def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Gri
     return Grid(axes, states)
 
 
-def check_run(scene: Scene, method: AbstractStepper, t_max: float, memory: float) -> None:
+def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_vector_contacts(scene.structure, "A map")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
-    arguments.real_number("t_max", t_max, above=0)
+    if t_max is not None:
+        arguments.real_number("t_max", t_max, above=0)
     arguments.real_number("memory", memory, above=0)
     per_contact = ("belt_speed", "restitution") if len(scene.structure.contacts) > 1 else ()
     batched = [name for name, value in scene.parameters.items() if np.shape(value) != () and name not in per_contact]

@@ -30,7 +30,7 @@ def basins(
     *,
     kick: bool = False,
     method: AbstractStepper | None = None,
-    t_max: float = 20.0,
+    t_max: float | None = None,
     memory: float = 2e9,
     progress: bool | None = None,
     executor=None,

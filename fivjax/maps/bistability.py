@@ -27,7 +27,7 @@ def bistability_map(
     scene: Scene,
     *,
     method: AbstractStepper | None = None,
-    t_max: float = 20.0,
+    t_max: float | None = None,
     memory: float = 2e9,
     max_steps: int = MOST_STEPS,
     progress: bool | None = None,
@@ -48,7 +48,9 @@ def bistability_map(
     - `**axes`: one-dimensional, strictly increasing values of any numeric parameter in `scene.parameters`, by name. One
       trajectory is run for each combination, from the sliding equilibrium of its own scene.
     - `method`: how to step, `EventExact()` unless given.
-    - `t_max`: time after which a trajectory without a verdict is called undecided, in s.
+    - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 20 s or 2,000 periods
+      of the structure's slowest mode, whichever is longer, and the time in which a motion just grows without contact events,
+      which is not stepped through, is not counted.
     - `memory`: how much memory the jobs that run at a time in this process may take, in bytes; there is one at least.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
@@ -102,7 +104,7 @@ def bistability_map(
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = checked_grid(axes)
-    limits = {"t_max": float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
+    limits = {"t_max": None if t_max is None else float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
     keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))
     run = functools.partial(

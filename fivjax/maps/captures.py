@@ -12,11 +12,14 @@ from jaxtyping import Bool, Float, Int
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
 from ..verdicts.capture_of_several import free_directions, trial_of_several
-from .section import SEGMENTS, ReturnMaps, Section
+from .section import ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
 NEARLY = 0.1
-MOST_CROSSINGS = 8
+CROSSINGS, MORE_CROSSINGS = 8, 40
+# A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
+# neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
+WEAKLY, SMALLEST_OF_MANY = 0.95, 1e-3
 NEWTON_STEPS = 12
 # Points of the section that a group nominates at a time.
 NOMINATED = 2
@@ -36,16 +39,24 @@ class Cycle(NamedTuple):
     neighbourhood: Neighbourhood
 
 
-def stable_cycles(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> list[tuple[int, Int, Cycle]]:
-    """The stable cycles that motions from these states are near to: of each the group, the rows that led to it, and it."""
+def stable_cycles(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    known: dict[int, list[Cycle]],
+    crossings: int = CROSSINGS,
+) -> list[tuple[int, Int, Cycle]]:
+    """The stable cycles of up to so many `crossings` that motions from these states are near to: of each the group, the rows
+    that led to it, and it. Those of a group that are `known` are not computed anew.
+    """
     weights = maps.weights
     paths = [at]
-    for _ in range(MOST_CROSSINGS + 1):
+    for _ in range(crossings + 1):
         paths.append(maps.returns(group, paths[-1], 1).at)
     path = weights * np.stack([p.y for p in paths[1:]], axis=1)  # [row, crossing, coordinate]
-    last, size = path[:, -1], np.linalg.norm(path[:, -1], axis=-1)
+    size = np.linalg.norm(path[:, -1], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        back = np.linalg.norm(path[:, -2::-1] - last[:, None], axis=-1) / size[:, None]
+        back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
         near = np.flatnonzero(np.isfinite(size) & (size > 0) & (nearest <= NEARLY))
@@ -66,28 +77,40 @@ def stable_cycles(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -
         else:
             kept.append(row)
             rows_of.append([near[row]])
-    attempts = [_trial(maps, closed, now, row) for row in kept]
-    stable = [
-        k for k, attempt in enumerate(attempts) if attempt is not None and closed.segments[kept[k]] <= SEGMENTS - 4
+    before = [_known(maps, closed.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    largest = [float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row])))) for row in kept]
+    locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY)
+    attempts = [
+        _trial(maps, closed, now, row) if old is None and not weak else None
+        for row, old, weak in zip(kept, before, locked_weakly, strict=True)
     ]
+    found = [(int(group[near[row]]), np.array(rows), old) for row, rows, old in zip(kept, rows_of, before, strict=True) if old]
+    stable = [k for k, attempt in enumerate(attempts) if attempt is not None]
     if not stable:
-        return []
+        return found
     chosen = np.array([kept[k] for k in stable])
     own, centre = group[near[chosen]], Section(closed.y, now.status, now.direction).rows(chosen)
     neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable])
-    amplitude = maps.peaks(own, centre, closed.period[chosen])
+    amplitude = maps.peaks(own, centre, lag[chosen])
     points, here = [centre.y], centre
     for _ in range(int(np.max(lag[chosen])) - 1):
         here = maps.returns(own, here, 1).at
         points.append(here.y)
-    found = []
     for k, (place, row) in enumerate(zip(stable, chosen, strict=True)):
         if neighbourhoods[k] is not None:
-            largest = float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row]))))
             states = np.stack([p[k] for p in points[: lag[row]]])
-            cycle = Cycle(states, float(closed.period[row]), largest, float(amplitude[k]), neighbourhoods[k])
+            cycle = Cycle(states, float(closed.period[row]), largest[place], float(amplitude[k]), neighbourhoods[k])
             found.append((int(own[k]), np.array(rows_of[place]), cycle))
     return found
+
+
+def _known(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle]) -> Cycle | None:
+    """The one of these cycles that has this state among its points."""
+    size = np.linalg.norm(maps.weights * y)
+    for cycle in cycles:
+        if np.min(np.linalg.norm(maps.weights * (cycle.points - y), axis=1)) < SAME * size:
+            return cycle
+    return None
 
 
 class _Closed(NamedTuple):
@@ -95,7 +118,6 @@ class _Closed(NamedTuple):
     residual: Float[np.ndarray, " m"]
     jacobian: Float[np.ndarray, "m 2n 2n"]
     period: Float[np.ndarray, " m"]
-    segments: Int[np.ndarray, " m"]
 
 
 def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
@@ -103,7 +125,7 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
     weights = maps.weights
     y, n = now.y.copy(), now.y.shape[1]
     closure = np.full(len(y), np.inf)
-    jacobian, period, segments = np.zeros((len(y), n, n)), np.zeros(len(y)), np.zeros(len(y), int)
+    jacobian, period = np.zeros((len(y), n, n)), np.zeros(len(y))
     best, running = y.copy(), np.arange(len(y))
     for _ in range(NEWTON_STEPS):
         if not len(running):
@@ -119,13 +141,13 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         better &= np.all(np.isfinite(derived), axis=(1, 2))
         rows = running[better]
         closure[rows], best[rows], jacobian[rows] = missed[better], at.y[better], derived[better]
-        period[rows], segments[rows] = image.time[better], image.segments[better]
+        period[rows] = image.time[better]
         matrices = np.eye(n) - derived[better]
         solvable = np.abs(np.linalg.det(matrices)) > 0
         matrices[~solvable] = np.eye(n)
         y[rows] = at.y[better] + np.linalg.solve(matrices, gap[better][..., None])[..., 0]
         running = rows[solvable & (missed[better] > EXACT)]
-    return _Closed(best, closure, jacobian, period, segments)
+    return _Closed(best, closure, jacobian, period)
 
 
 def _trial(maps: ReturnMaps, closed: _Closed, now: Section, row: int) -> Trial | None:
@@ -142,28 +164,42 @@ def _trial(maps: ReturnMaps, closed: _Closed, now: Section, row: int) -> Trial |
 
 def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial]) -> list[Neighbourhood | None]:
     """`verdicts.capture.neighbourhood` of several cycles at once."""
-    radius = [attempt.largest for attempt in trials]
+    many = np.asarray(crossings) > CROSSINGS
+    radius = np.array([attempt.largest for attempt in trials])
+    smallest = np.where(many, SMALLEST_OF_MANY, SMALLEST) / LARGEST * radius
+    radius[many] /= 8  # their points lie close together
     found: list[Neighbourhood | None] = [None] * len(trials)
     open_ = list(range(len(trials)))
     while open_:
-        states = [trials[k].states(radius[k]) for k in open_]
-        counts = np.array([len(part) for part in states])
-        at = Section(
-            np.concatenate(states),
-            np.repeat(np.array([trials[k].status for k in open_]), counts, axis=0),
-            np.repeat(np.array([trials[k].direction for k in open_]), counts, axis=0),
-        )
-        image = maps.returns(np.repeat(group[open_], counts), at, np.repeat(crossings[open_], counts))
-        images = Returned(*image.at, image.events)
-        ends, still = np.cumsum(counts), []
-        for k, start, end in zip(open_, ends - counts, ends, strict=True):
-            found[k] = trials[k].passed(radius[k], Returned(*(part[start:end] for part in images)))
-            if found[k] is None:
-                radius[k] *= 0.5
-                if radius[k] >= SMALLEST / LARGEST * trials[k].largest:
-                    still.append(k)
-        open_ = still
+        few = _passed(maps, group, crossings, [trials[k].probe() for k in open_], radius, open_)
+        promising = [k for k, passed in zip(open_, few, strict=True) if passed is not None]
+        all_ = _passed(maps, group, crossings, [trials[k] for k in promising], radius, promising)
+        for k, passed in zip(promising, all_, strict=True):
+            found[k] = passed
+        open_ = [k for k in open_ if found[k] is None]
+        radius[open_] *= 0.5
+        open_ = [k for k in open_ if radius[k] >= smallest[k]]
     return found
+
+
+def _passed(maps: ReturnMaps, group, crossings, trials: list[Trial], radius, places) -> list[Neighbourhood | None]:
+    """Which of several trials, each of the cycle at its place, are passed at their radius."""
+    if not trials:
+        return []
+    states = [one.states(radius[k]) for one, k in zip(trials, places, strict=True)]
+    counts = np.array([len(part) for part in states])
+    at = Section(
+        np.concatenate(states),
+        np.repeat(np.array([one.status for one in trials]), counts, axis=0),
+        np.repeat(np.array([one.direction for one in trials]), counts, axis=0),
+    )
+    image = maps.returns(np.repeat(group[places], counts), at, np.repeat(crossings[places], counts))
+    images = Returned(*image.at, image.events)
+    ends = np.cumsum(counts)
+    return [
+        one.passed(float(radius[k]), Returned(*(part[start:end] for part in images)))
+        for one, k, start, end in zip(trials, places, ends - counts, ends, strict=True)
+    ]
 
 
 def captured(

@@ -19,10 +19,15 @@ from .results import Verdicts
 from .trajectories import Grid
 
 
+def time_limit(t_max: float | None) -> dict[str, float]:
+    """The attribute that says it, where one was given."""
+    return {} if t_max is None else {"t_max": t_max}
+
+
 def map_dataset(
     scene: Scene,
     method: AbstractStepper,
-    t_max: float,
+    t_max: float | None,
     grid: Grid,
     verdicts: Verdicts,
     source: Int[np.ndarray, " trajectories"] | None = None,
@@ -59,7 +64,7 @@ def map_dataset(
         dataset["p_crit"] = (others, crossing.middle.reshape(over))
         dataset["p_crit_low"] = (others, crossing.low.reshape(over))
         dataset["p_crit_high"] = (others, crossing.high.reshape(over))
-    labelled(dataset, scene, method=describe_method(method), t_max=t_max)
+    labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
     dataset["verdict"].attrs.update(
         flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),

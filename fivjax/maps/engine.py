@@ -52,7 +52,7 @@ def run_to_verdict(
     values: Mapping[str, np.ndarray],
     method: AbstractStepper,
     *,
-    t_max: float,
+    t_max: float | None,
     memory: float,
     max_steps: int = MOST_STEPS,
     progress: bool | None,

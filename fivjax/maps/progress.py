@@ -33,6 +33,7 @@ class Progress(eqx.Module):
     """One trajectory on its way to a verdict."""
 
     t: Float[Array, ""]
+    skipped: Float[Array, ""]  # the part of it that nothing was known to happen in, s
     y: State  # as a deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
     contact: Contact
     crossing: State  # the last crossing of the section under the final load; NaN before the first
@@ -77,6 +78,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
     return Progress(
         t=jnp.zeros((), y.dtype),
+        skipped=jnp.zeros((), y.dtype),
         y=y,
         contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
         crossing=jnp.full_like(y, jnp.nan),
@@ -138,6 +140,7 @@ def step(setting: Setting, now: Progress) -> Progress:
     crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
     return Progress(
         t=t,
+        skipped=now.skipped,
         y=y,
         contact=contact,
         crossing=jnp.where(crossed, rise.at, now.crossing),

@@ -17,7 +17,7 @@ from ..verdicts.verdict import Verdict
 from . import attractors
 from .attractors import Attractors, Follower
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
-from .captures import Cycle, captured, distinct, stable_cycles
+from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, placed, released, step
@@ -29,8 +29,12 @@ from .sharing import Batch, grouped, shared_by, with_values
 KNOWN_FROM = 4
 # Those that are undecided later ask for a cycle of their own, each time after so many times the steps.
 OWN_FROM, OWN_AGAIN = 16, 2
+# Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long anyway.
+MORE_FROM = 64
 # Ensembles that are followed at once: what is kept of them takes memory, some 0.1 MB each.
 ENSEMBLES = 128
+# How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
+LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 # Looks at a trajectory's verdict while its time grows e-fold.
 LOOKS = 8
 
@@ -40,7 +44,7 @@ def follow_all(
     values: dict[str, np.ndarray],
     states: tuple[str, ...],
     known: dict[bytes, Attractors],
-    t_max: float,
+    t_max: float | None,
     max_steps: int,
     verdicts: Verdicts,
     index: np.ndarray,
@@ -62,18 +66,20 @@ def follow_all(
     basins = Basins(batch, shared, distinct, group)
     known_from = KNOWN_FROM * batch.method.round
     own_from = OWN_FROM * batch.method.round
+    limit = np.maximum(LEAST_TIME, LEAST_PERIODS * shared.tree.modes.slowest_period) if t_max is None else t_max
+    limit = np.broadcast_to(limit, len(distinct))
     done = 0
     while True:
         _, now = trajectories.tree
         verdict = np.array(now.verdict)
+        in_time = (now.t if t_max is not None else now.t - now.skipped) < limit[group[pending]]
         if done >= max_steps:
-            verdict = np.where((verdict == Verdict.UNDECIDED) & (now.t < t_max), Verdict.STEP_FAILURE, verdict)
+            verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
         which = np.full(len(pending), -1)
         if done > known_from:
-            in_time = (verdict == Verdict.UNDECIDED) & (now.t < t_max)
-            which = basins.entered(pending, now, in_time)
+            which = basins.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[which >= 0] = Verdict.LIMIT_CYCLE
-        finished = (verdict != Verdict.UNDECIDED) | (now.t >= t_max)
+        finished = (verdict != Verdict.UNDECIDED) | ~in_time
         ended = Ended(verdict, *basins.described(pending, verdict, which))
         chosen = np.flatnonzero(finished)
         record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
@@ -84,7 +90,8 @@ def follow_all(
         if done == known_from:
             basins.search(np.unique(group[pending]), columns, known, report)
         elif done >= own_from:
-            basins.search_alone(pending, trajectories.tree[1], columns, report)
+            crossings = CROSSINGS if done < MORE_FROM * batch.method.round else MORE_CROSSINGS
+            basins.search_alone(pending, trajectories.tree[1], columns, crossings, report)
             own_from = OWN_AGAIN * done
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
@@ -125,8 +132,10 @@ class Basins:
             self.cycles += one.cycles
             self._know_torus(g, one)
 
-    def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, report) -> None:
-        """Finds attractors from where a few trajectories of each group are that have taken long."""
+    def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, crossings: int, report) -> None:
+        """Finds attractors from where a few trajectories of each group are that have taken long: cycles of up to so many
+        `crossings`, and tori.
+        """
         latest = np.array(now.crossing)
         asks = np.all(np.isfinite(latest), axis=1) & (now.events > 0)
         if not np.any(asks) or self.maps is None:
@@ -134,12 +143,12 @@ class Basins:
         group = self.group[pending]
         picked = distinct(self.maps.weights * np.where(asks[:, None], latest, 0.0), group, asks)
         led_to_one = np.zeros(len(picked), bool)
-        for g, rows, cycle in stable_cycles(self.maps, group[picked], attractors.section_of(now).rows(picked)):
+        at = attractors.section_of(now).rows(picked)
+        known = {g: [self.cycles[place] for place in places] for g, places in self.of_group.items()}
+        for g, rows, cycle in stable_cycles(self.maps, group[picked], at, known, crossings):
             led_to_one[rows] = True
-            mine = self.of_group[g]
-            if not any(attractors.same_cycle(self.maps, cycle, self.cycles[place]) for place in mine):
-                mine.append(len(self.cycles))
-                self.cycles.append(cycle)
+            if not any(attractors.same_cycle(self.maps, cycle, self.cycles[place]) for place in self.of_group[g]):
+                self._add(g, [cycle])
         alone = picked[~led_to_one & (self.torus.amplitude[group[picked]] == 0)]
         groups, first = np.unique(group[alone], return_index=True)
         chosen = alone[first]
@@ -147,11 +156,17 @@ class Basins:
             part = slice(start, start + ENSEMBLES)
             follower, near = Follower(_begun, _follow), latest[chosen[part]]
             given = columns[pending[chosen[part]]]
+            cycles = [[self.cycles[place] for place in self.of_group[g]] for g in groups[part]]
             found = attractors.search(
-                self.batch, self.shared, self.maps, follower, groups[part], given, report, near=near
+                self.batch, self.shared, self.maps, follower, groups[part], given, report, near, cycles
             )
-            for g, one in zip(groups[part], found, strict=True):
+            for g, one, before in zip(groups[part], found, cycles, strict=True):
+                self._add(g, one.cycles[len(before) :])
                 self._know_torus(g, one)
+
+    def _add(self, g: int, cycles: list[Cycle]) -> None:
+        self.of_group[int(g)] += range(len(self.cycles), len(self.cycles) + len(cycles))
+        self.cycles += cycles
 
     def _know_torus(self, g: int, found: Attractors) -> None:
         """From now on trajectories of the group are compared with its torus, if one was found."""

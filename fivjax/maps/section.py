@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..contact import Contact
-from ..cycles.around import once_around, peak_speed
-from ..cycles.section_map import Point, moved
+from ..cycles.around import peak_speed_along
+from ..cycles.section_map import MOST_SEGMENTS, Point, moved
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
 from ..steppers.event_exact import EventExact
@@ -24,8 +24,6 @@ from .sharing import Batch
 # States in a block: few, because often there are few.
 BLOCK = 64
 DERIVED_BLOCK = 16
-# Segments of a cycle among which its peak is sought.
-SEGMENTS = 64
 
 
 class Section(NamedTuple):
@@ -80,14 +78,15 @@ class ReturnMaps:
         found, derivatives = in_blocks(_derived, self.mechanics, group, rows, 1, self.pool, size=DERIVED_BLOCK).tree
         return _images(found), derivatives
 
-    def peaks(self, group, at: Section, period) -> Float[np.ndarray, " m"]:
-        """The largest tangential speed (m/s) in a time `period` from each row."""
-        return in_blocks(_peaks, self.mechanics, group, _rows(at, period, float), 1, self.pool, size=DERIVED_BLOCK).tree
+    def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
+        """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
+        return in_blocks(_peaks, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=DERIVED_BLOCK).tree
 
 
-def _rows(at: Section, last, kind: type = np.int32) -> Flattened:
+def _rows(at: Section, crossings) -> Flattened:
     status, direction = np.asarray(at.status, np.int32), np.asarray(at.direction, float)
-    return flatten((np.asarray(at.y), status, direction, np.broadcast_to(np.asarray(last, kind), len(status)).copy()))
+    crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(status))
+    return flatten((np.asarray(at.y), status, direction, crossings.copy()))
 
 
 def _images(found) -> Images:
@@ -132,9 +131,9 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
 
 @compiled
 def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
-    def one(shared, y, status, direction, period):
-        mechanics, _ = shared
+    def one(shared, y, status, direction, crossings):
+        mechanics, longest = shared
         point = Point(y, Contact(status.astype(jnp.int32), direction))
-        return peak_speed(EventExact(), mechanics, once_around(EventExact(), mechanics, point, period, SEGMENTS))
+        return peak_speed_along(EventExact(), mechanics, point, crossings, longest * crossings, MOST_SEGMENTS)
 
     return _of_block(one, shared, rows)

@@ -20,6 +20,7 @@ from ..verdicts.verdict import Verdict
 from .axes import add_linear_limit, check_run, checked_axes
 from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings
+from .datasets import time_limit
 from .engine import run_to_verdict
 from .executors import with_workers
 
@@ -36,7 +37,7 @@ def critical_perturbation(
     p_step: float = 0.01,
     tolerance: float = 1e-5,
     method: AbstractStepper | None = None,
-    t_max: float = 30.0,
+    t_max: float | None = None,
     memory: float = 2e9,
     progress: bool | None = None,
     energy: bool = False,
@@ -168,7 +169,7 @@ def critical_perturbation(
             dataset[name] = (tuple(axes), values.reshape(shape))
     add_linear_limit(dataset, scene)
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
-    return labelled(dataset, scene, method=describe_method(method), t_max=t_max, tolerance=tolerance, p_step=p_step)
+    return labelled(dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step)
 
 
 def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

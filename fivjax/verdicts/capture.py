@@ -51,6 +51,8 @@ LARGEST, SMALLEST = 0.5, 1e-8
 # Ellipsoids on which the return map is checked, relative to the radius, and directions on each.
 SHELLS = (1.0, 0.5, 0.25, 0.125)
 DIRECTIONS = 64
+# Of the points of a radius, one in so many is tried first.
+PROBED = 8
 
 
 class Neighbourhood(NamedTuple):
@@ -123,6 +125,10 @@ class Trial(NamedTuple):
     sizes: Float[np.ndarray, " m"]  # of these, in the norm
     allowed: float  # the contraction asked for
     largest: float  # the radius to begin with
+
+    def probe(self) -> "Trial":
+        """The same with few points: most radii that are too large fail at these."""
+        return self._replace(steps=self.steps[::PROBED], sizes=self.sizes[::PROBED])
 
     def states(self, radius: float) -> Float[np.ndarray, "point state"]:
         """Where the return map is to be evaluated: the centre, to compare with, and the points."""

@@ -24,6 +24,8 @@ ENVELOPE_DECADES = 12.0
 ENVELOPE_INSTANTS = 161
 # Modes this close, relative to the fastest, are near-parallel or may become so.
 CLOSE = 0.2
+# States are computed from modal coordinates only where no more than so many of their digits are lost.
+WELL_CONDITIONED = 1e5
 
 
 class SlidingModes(eqx.Module):
@@ -32,6 +34,8 @@ class SlidingModes(eqx.Module):
     linear: LinearSliding
     eigenvalues: Complex[Array | np.ndarray, "*groups k"]  # 1/s
     to_modal: Complex[Array | np.ndarray, "*groups k m"]  # rows of V⁻¹
+    from_modal: Complex[Array | np.ndarray, "*groups m k"]  # z is the real part of this times w
+    regular: Bool[Array | np.ndarray, "*groups"]  # V is far enough from singular for z to be had from w
     # Shares of the modes in the two signals; of several contacts, in the two of each.
     pressing: Complex[Array | np.ndarray, "*groups_contacts k"]
     slip: Complex[Array | np.ndarray, "*groups_contacts k"]
@@ -40,6 +44,7 @@ class SlidingModes(eqx.Module):
     slowest_decay: Float[
         Array | np.ndarray, "*groups"
     ]  # of the structure on a belt without friction, 1/s; negative where it grows
+    slowest_period: Float[Array | np.ndarray, "*groups"]  # of the sliding motion, s
     stable: Bool[Array | np.ndarray, "*groups"]
 
 
@@ -66,7 +71,8 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     eigenvalues, vectors = np.linalg.eig(matrix)
     # A defective matrix has no modal coordinates. Infinite ones make every bound infinite, so nothing is proved.
     inverse = np.full(vectors.shape, np.inf, complex)
-    regular = finite & (np.linalg.cond(vectors) < 1e12)
+    condition = np.where(finite, np.linalg.cond(vectors), np.inf)
+    regular = condition < 1e12
     inverse[regular] = np.linalg.inv(vectors[regular])
     # Conjugate pairs: the upper half plane first, then cut off what only repeats it.
     order = np.argsort(-eigenvalues.imag, axis=-1, kind="stable")
@@ -79,11 +85,14 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         linear=linear,
         eigenvalues=eigenvalues.astype(complex),
         to_modal=inverse,
+        from_modal=count[:, None, :] * vectors,
+        regular=condition < WELL_CONDITIONED,
         pressing=count * np.einsum("l...i,lik->l...k", linear.pressing, vectors),
         slip=count * np.einsum("l...i,lik->l...k", linear.slip, vectors),
         remainder=np.einsum("lki,l...i->l...k", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         slowest_decay=_slowest_decay(linear.frictionless),
+        slowest_period=_slowest_period(eigenvalues),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
 
@@ -91,6 +100,11 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
 def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
     finite = np.all(np.isfinite(matrix), axis=(-2, -1))
     return np.where(finite, -np.max(np.linalg.eigvals(np.where(finite[:, None, None], matrix, 0)).real, axis=-1), 0.0)
+
+
+def _slowest_period(eigenvalues: np.ndarray) -> np.ndarray:
+    lowest = np.min(np.where(eigenvalues.imag > 0, eigenvalues.imag, np.inf), axis=-1)
+    return np.where(np.isfinite(lowest), 2 * np.pi / lowest, 0.0)
 
 
 def _clusters(eigenvalues: np.ndarray) -> np.ndarray:

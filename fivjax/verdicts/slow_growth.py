@@ -1,0 +1,42 @@
+r"""How long a motion that slides will go on sliding for certain, and where it is then.
+
+A little above the stability limit the motion about an unstable sliding equilibrium grows for thousands of periods before its
+first event. While the contact slides, the deviation is $z(t) = \sum_k v_k w_k e^{λ_k t}$ exactly, so nobody has to step
+through all that: with $σ = \max_k \mathrm{Re} λ_k > 0$ a signal $\sum_k a_k w_k e^{λ_k t}$ stays within its margin $m$ at
+least until $e^{σt} \sum_k |a_k w_k| = m$.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..contact import Contact, Mechanics, State, Status
+from ..model.sliding import sliding_states
+from .sliding_proof import SlidingModes
+
+# Of the time for which sliding is certain, so much is used: rounding must not lead past an event.
+USED = 0.999
+# Times shorter than so many periods of the slowest growing mode are left to the stepper.
+LEAST_PERIODS = 4.0
+
+
+def slid_on(
+    mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State, allowed: Bool[Array, ""]
+) -> tuple[State, Float[Array, ""]]:
+    """The deviation from the equilibrium when sliding stops to be certain, and the time until then (s).
+
+    Zero time, and the same state, where that is soon, or where it is not `allowed`: the load must be final.
+    """
+    linear = modes.linear
+    keep = sliding_states(deviation.shape[0] // 2, mechanics.normal)
+    modal = modes.to_modal @ deviation[keep].astype(modes.to_modal.dtype)
+    growth = jnp.max(modes.eigenvalues.real)
+    sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & linear.exists & allowed
+    sizes = jnp.stack([jnp.sum(jnp.abs(shares * modal)) for shares in (modes.pressing, modes.slip)])
+    margins = jnp.stack([linear.pressing_margin, linear.slip_margin])
+    time = USED * jnp.min(jnp.log(margins / sizes)) / growth
+    frequency = jnp.max(jnp.where(modes.eigenvalues.real >= growth, modes.eigenvalues.imag, 0.0))
+    worthwhile = time * frequency > LEAST_PERIODS * 2 * jnp.pi
+    taken = sliding & modes.regular & (growth > 0) & worthwhile & jnp.isfinite(time)
+    time = jnp.where(taken, time, 0.0)
+    moved = (modes.from_modal @ (jnp.exp(modes.eigenvalues * time) * modal)).real
+    return jnp.where(taken, deviation.at[keep].set(moved), deviation), time
