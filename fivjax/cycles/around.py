@@ -115,7 +115,8 @@ def peak_speed_along(
 def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: Contact, h) -> Float[Array, ""]:
     coefficients, unit = stepper.series(mechanics, contact, jnp.zeros((), y.dtype), y)
     of_contacts = [
-        _peak_of_series(coefficients[:, y.shape[0] // 2 + tangential], h, h / unit) for tangential, _ in mechanics.places
+        _peak_of_series(coefficients[:, y.shape[0] // 2 + tangential], h, h / unit)
+        for tangential, _ in mechanics.places
     ]
     return functools.reduce(jnp.maximum, of_contacts)
 

@@ -28,15 +28,13 @@ NEWTON_AT = (24, 64, 128, 256)
 # Looks in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone. What
 # takes longer is left to the trajectories that meet it.
 BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
-# Returns over which a torus' mean period is taken.
-MEAN_OVER = 64
-# The peak on a torus is sought from one in so many of its states, for so many crossings: trajectories may have passed over some.
+# The peak on a torus is sought from one in so many of its states, for so many crossings: some trajectories have passed over.
 PEAK_EVERY, PEAK_CROSSINGS = 2, 4
 # Starts about a torus from which it is asked whether neighbours part, and over how many returns, twice: the first turn
 # directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
 PARTING_FROM, PARTING_OVER, PARTING = 4, 48, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
-LOCKED = -0.0015
+LOCKED = -0.003
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 
@@ -209,15 +207,19 @@ def _add_tori(
     if not len(tori):
         return []
     chosen = (count * tori[:, None] + np.arange(0, count, count // PARTING_FROM)).ravel()
-    parting = np.mean(_parting(maps, own[chosen], last.rows(chosen)).reshape(-1, PARTING_FROM), axis=1)
+    parting, period = (
+        np.mean(part.reshape(-1, PARTING_FROM), axis=1) for part in _parting(maps, own[chosen], last.rows(chosen))
+    )
     locked = _locked(maps, groups, last.rows(count * tori[parting < LOCKED]), tori[parting < LOCKED], sets, found)
     led_to_cycle = [sets[k][0] for k in locked]
-    tori = np.setdiff1d(tori[parting < PARTING], locked)
+    with np.errstate(invalid="ignore"):
+        kept = (parting < PARTING) & ~np.isin(tori, locked)
+    tori, period = tori[kept], period[kept]
     if not len(tori):
         return led_to_cycle
-    image = maps.returns(own[count * tori], last.rows(count * tori), MEAN_OVER)
-    period = image.time / MEAN_OVER
-    peaks = [_peak_on(maps, groups[sets[k][0]], sets[k][1][0], last.rows(slice(count * k, count * (k + 1)))) for k in tori]
+    peaks = [
+        _peak_on(maps, groups[sets[k][0]], sets[k][1][0], last.rows(slice(count * k, count * (k + 1)))) for k in tori
+    ]
     for k, mean, peak in zip(tori, period, peaks, strict=True):
         place, (states, _) = sets[k]
         if np.isfinite(mean) and np.isfinite(peak):
@@ -245,22 +247,25 @@ def _peak_on(maps: ReturnMaps, group: int, states: Float[np.ndarray, "k 2n"], la
     return float(np.max(maps.peaks(np.full(len(at.y), group), at, crossings)))
 
 
-def _parting(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " m"]:
-    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return."""
+def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; and
+    the mean time of a return (s).
+    """
     weights = maps.weights
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     # Away from the equilibrium, which keeps what the section and the contact hold at zero.
-    beside, grown = at.y * (1 + APART), np.nan
+    beside, grown, time = at.y * (1 + APART), np.nan, 0.0
     for _ in range(2):
         pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-        image = maps.returns(np.tile(group, 2), pair, PARTING_OVER).at
-        at, other = image.rows(slice(None, len(group))), image.rows(slice(len(group), None))
+        image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)
+        time = time + image.time[: len(group)]
+        at, other = image.at.rows(slice(None, len(group))), image.at.rows(slice(len(group), None))
         away = weights * (other.y - at.y)
         distance = np.linalg.norm(away, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
             grown = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
             beside = at.y + APART * size * away / distance / weights
-    return grown
+    return grown, time / (2 * PARTING_OVER)
 
 
 def _about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:

@@ -48,9 +48,9 @@ def bistability_map(
     - `**axes`: one-dimensional, strictly increasing values of any numeric parameter in `scene.parameters`, by name. One
       trajectory is run for each combination, from the sliding equilibrium of its own scene.
     - `method`: how to step, `EventExact()` unless given.
-    - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 20 s or 2,000 periods
-      of the structure's slowest mode, whichever is longer, and the time in which a motion just grows without contact events,
-      which is not stepped through, is not counted.
+    - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 20 s, or 2,000
+      periods of the structure's slowest mode if these are longer; and the time in which a motion just grows, without contact
+      events, is not counted: nobody has to step through it.
     - `memory`: how much memory the jobs that run at a time in this process may take, in bytes; there is one at least.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
     - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.

@@ -84,7 +84,11 @@ def stable_cycles(
         _trial(maps, closed, now, row) if old is None and not weak else None
         for row, old, weak in zip(kept, before, locked_weakly, strict=True)
     ]
-    found = [(int(group[near[row]]), np.array(rows), old) for row, rows, old in zip(kept, rows_of, before, strict=True) if old]
+    found = [
+        (int(group[near[row]]), np.array(rows), old)
+        for row, rows, old in zip(kept, rows_of, before, strict=True)
+        if old
+    ]
     stable = [k for k, attempt in enumerate(attempts) if attempt is not None]
     if not stable:
         return found

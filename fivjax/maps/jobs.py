@@ -30,7 +30,7 @@ class Task(NamedTuple):
     names: tuple[str, ...]  # parameters that make groups
     history: tuple[str, ...]  # those of the load's history
     states: dict[str, int]  # displacements and velocities at the beginning, with their places in the state
-    t_max: float
+    t_max: float | None
     max_steps: int
     energy: bool
     width: int  # trajectories of a group side by side

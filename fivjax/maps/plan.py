@@ -45,7 +45,7 @@ def planned(
     values: Mapping[str, np.ndarray],
     method: AbstractStepper,
     *,
-    t_max: float,
+    t_max: float | None,
     max_steps: int,
     energy: bool = False,
     states: Mapping[str, int] | None = None,
@@ -71,7 +71,7 @@ def planned(
         names=tuple(name for name in values if name not in HISTORY and name not in states),
         history=tuple(name for name in values if name in HISTORY),
         states=states,
-        t_max=float(t_max),
+        t_max=None if t_max is None else float(t_max),
         max_steps=int(max_steps),
         energy=energy,
         # The same in all jobs, because products of other shapes round differently.

@@ -149,7 +149,9 @@ class Basins:
             led_to_one[rows] = True
             if not any(attractors.same_cycle(self.maps, cycle, self.cycles[place]) for place in self.of_group[g]):
                 self._add(g, [cycle])
-        alone = picked[~led_to_one & (self.torus.amplitude[group[picked]] == 0)]
+        # Motions on a locked torus take long to close in on its cycle: nothing else need be sought for them.
+        locked = [any(len(self.cycles[place].points) > CROSSINGS for place in self.of_group[g]) for g in group[picked]]
+        alone = picked[~led_to_one & (self.torus.amplitude[group[picked]] == 0) & ~np.array(locked)]
         groups, first = np.unique(group[alone], return_index=True)
         chosen = alone[first]
         for start in range(0, len(groups), ENSEMBLES):

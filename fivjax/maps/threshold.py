@@ -169,7 +169,9 @@ def critical_perturbation(
             dataset[name] = (tuple(axes), values.reshape(shape))
     add_linear_limit(dataset, scene)
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
-    return labelled(dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step)
+    return labelled(
+        dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
+    )
 
 
 def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
