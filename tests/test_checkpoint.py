@@ -89,7 +89,7 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
     ("change", "fragment"),
     [
         (dict(mu=[0.1, 0.2, 0.226]), "`mu`"),
-        (dict(t_max=19.0), "`t_max` is None and not 19.0"),
+        (dict(t_max=19.0), "`t_max` is null and not 19.0"),
         (dict(method=fj.WhereSwitched()), "`method`"),
     ],
 )

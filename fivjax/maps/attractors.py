@@ -33,8 +33,8 @@ PEAK_EVERY, PEAK_CROSSINGS = 2, 4
 # Starts about a torus from which it is asked whether neighbours part, and over how many returns, twice: the first turn
 # directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
 PARTING_FROM, PARTING_OVER, PARTING = 4, 48, 0.05
-# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
-LOCKED = -0.003
+# Unless neighbours part by more than this, the torus may be locked: on a cycle of many crossings. So few returns do not tell.
+LOCKED = 0.005
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 
@@ -210,7 +210,10 @@ def _add_tori(
     parting, period = (
         np.mean(part.reshape(-1, PARTING_FROM), axis=1) for part in _parting(maps, own[chosen], last.rows(chosen))
     )
-    locked = _locked(maps, groups, last.rows(count * tori[parting < LOCKED]), tori[parting < LOCKED], sets, found)
+    closing_in = np.repeat(parting < LOCKED, PARTING_FROM)
+    locked = _locked(
+        maps, groups, last.rows(chosen[closing_in]), np.repeat(tori, PARTING_FROM)[closing_in], sets, found
+    )
     led_to_cycle = [sets[k][0] for k in locked]
     with np.errstate(invalid="ignore"):
         kept = (parting < PARTING) & ~np.isin(tori, locked)
@@ -228,14 +231,14 @@ def _add_tori(
 
 
 def _locked(maps: ReturnMaps, groups, at: Section, tori, sets, found) -> list[int]:
-    """Which of these tori are locked: motions on them, from here, are near a cycle of many crossings, which is added."""
+    """Which tori are locked: motions from here, each on the torus at its place, are near a cycle, which is added."""
     if not len(tori):
         return []
     places = [sets[k][0] for k in tori]
     known = {int(groups[place]): found[place].cycles for place in places}
     new = stable_cycles(maps, groups[places], at, known, MORE_CROSSINGS)
     _keep(maps, [(places[rows[0]], cycle) for _, rows, cycle in new], found)
-    return [tori[row] for _, rows, _ in new for row in rows]
+    return sorted({int(tori[row]) for _, rows, _ in new for row in rows})
 
 
 def _peak_on(maps: ReturnMaps, group: int, states: Float[np.ndarray, "k 2n"], last: Section) -> float:
@@ -254,7 +257,7 @@ def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
     weights = maps.weights
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     # Away from the equilibrium, which keeps what the section and the contact hold at zero.
-    beside, grown, time = at.y * (1 + APART), np.nan, 0.0
+    beside, grown, time = at.y * (1 + APART), np.full(len(group), np.nan), np.zeros(len(group))
     for _ in range(2):
         pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
         image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)

@@ -77,7 +77,7 @@ def basins(
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
     grid = checked_grid(axes, tuple(states))
     _check_gap(scene, axes)
-    keeper = keeper_at(resume, scene, method, grid, {"t_max": float(t_max), "kick": bool(kick)})
+    keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         verdicts = run_to_verdict(
             scene,

@@ -104,7 +104,7 @@ def bistability_map(
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = checked_grid(axes)
-    limits = {"t_max": None if t_max is None else float(t_max), "max_steps": int(max_steps), "energy": bool(energy)}
+    limits = {"t_max": t_max, "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
     keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))
     run = functools.partial(
