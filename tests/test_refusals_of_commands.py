@@ -7,7 +7,7 @@ from refusing import EngineReached, refused, refused_on_the_command_line, untouc
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.maps import store as checkpoint
+from fivjax.maps import checkpoint
 
 T = np.arange(64) * 1e-3
 A = np.sin(400.0 * T)

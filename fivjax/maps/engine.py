@@ -5,6 +5,7 @@ A trajectory (`progress`, `conclusion`) is one of a group that shares its mechan
 """
 
 import contextvars
+import functools
 import threading
 import warnings
 from collections.abc import Mapping
@@ -80,7 +81,8 @@ def run_to_verdict(
     `places` are those that are to be run, all unless given. `verdicts` has those of all that an earlier run has left, and gets
     the others: a job of which any is missing is run as a whole. `keeper` is handed what each job comes to.
 
-    Interrupted by the user, it returns what the finished jobs have decided; the rest is `Verdict.NOT_RUN`.
+    Interrupted by the user, it returns what is decided by then, of jobs in other processes what the finished ones have decided;
+    the rest is `Verdict.NOT_RUN`.
     """
     plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
     verdicts = not_run(plan.trajectories.total, energy) if verdicts is None else verdicts
@@ -130,10 +132,13 @@ def _follow(
         keys = [row.tobytes() for row in grouped(values, tuple(plan.task.states))[0]] if attractors else []
         return Job(plan.task, values, {key: attractors[key] for key in keys if key in attractors})
 
+    def write(number: int, results: Verdicts) -> None:
+        for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(results), strict=True):
+            whole[plan.jobs[number]] = own
+
     def done(number: int, result: Done) -> None:
         places = plan.jobs[number]
-        for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(result.verdicts), strict=True):
-            whole[places] = own
+        write(number, result.verdicts)
         found[number] = result.found
         if keeper is not None:
             keeper.keep(places, verdicts, result.found if needed_later else {})
@@ -162,7 +167,9 @@ def _follow(
             mine = Workers(threads)
 
             def here(number: int):
-                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report)
+                # Of a job that is interrupted nothing is kept to go on from, so that all results are those of whole jobs.
+                partly = functools.partial(write, number)
+                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report, partly)
 
             try:
                 hand_out(missing, here, mine, done, given_up, stop)

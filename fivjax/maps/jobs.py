@@ -53,14 +53,20 @@ class Done(NamedTuple):
 
 
 @in_double_precision
-def run_job(job: Job, threads: Executor | None = None, report: Callable[[int], None] | None = None) -> Done:
+def run_job(
+    job: Job,
+    threads: Executor | None = None,
+    report: Callable[[int], None] | None = None,
+    interrupted: Callable[[Verdicts], None] | None = None,
+) -> Done:
     """The results of a job.
 
-    Where it runs, it may use `threads`; `report` is told how many trajectories have ended, and may end it by an exception.
+    Where it runs, it may use `threads`; `report` is told how many trajectories have ended, and may end it by an exception:
+    `interrupted` is then handed what is decided by then.
     """
     if threads is None:
         with ThreadPoolExecutor(max_workers=1) as one:
-            return run_job(job, one, report)
+            return run_job(job, one, report, interrupted)
     task = job.task
     total = len(next(iter(job.values.values())))
     verdicts, known = not_run(total, task.energy), dict(job.known)
@@ -76,15 +82,20 @@ def run_job(job: Job, threads: Executor | None = None, report: Callable[[int], N
         many=task.many,
         pool=threads,
     )
-    rounds.follow_all(
-        batch,
-        job.values,
-        tuple(task.states),
-        known,
-        task.t_max,
-        task.max_steps,
-        verdicts,
-        np.arange(total),
-        report or (lambda count: None),
-    )
+    try:
+        rounds.follow_all(
+            batch,
+            job.values,
+            tuple(task.states),
+            known,
+            task.t_max,
+            task.max_steps,
+            verdicts,
+            np.arange(total),
+            report or (lambda count: None),
+        )
+    except KeyboardInterrupt:
+        if interrupted is not None:
+            interrupted(verdicts)
+        raise
     return Done(verdicts, {key: one for key, one in known.items() if key not in job.known})
