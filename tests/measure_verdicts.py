@@ -72,7 +72,8 @@ class Tally:
         self.quiet_cycles += int((said_cycle & quiet).sum())
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.abs(amplitude / truth.amplitude - 1.0)
-        both = said_cycle & lives & ~fading
+        # A reference that still grows after ten thousand periods has not come to the attractor yet.
+        both = said_cycle & lives & ~fading & ~(lives & truth.growing)
         self.amplitudes += error[both].tolist()
         for kind, where in (
             ("slides not", wrong_sliding),

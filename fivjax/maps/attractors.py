@@ -33,8 +33,8 @@ PEAK_EVERY, PEAK_CROSSINGS = 2, 4
 # Starts about a torus from which it is asked whether neighbours part, and over how many returns, twice: the first turn
 # directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
 PARTING_FROM, PARTING_OVER, PARTING = 4, 48, 0.05
-# Unless neighbours part by more than this, the torus may be locked: on a cycle of many crossings. So few returns do not tell.
-LOCKED = 0.005
+# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
+LOCKED = -0.01
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 
@@ -210,7 +210,7 @@ def _add_tori(
     parting, period = (
         np.mean(part.reshape(-1, PARTING_FROM), axis=1) for part in _parting(maps, own[chosen], last.rows(chosen))
     )
-    closing_in = np.repeat(parting < LOCKED, PARTING_FROM)
+    closing_in = np.flatnonzero(np.repeat(parting < LOCKED, PARTING_FROM))[::2]
     locked = _locked(
         maps, groups, last.rows(chosen[closing_in]), np.repeat(tori, PARTING_FROM)[closing_in], sets, found
     )

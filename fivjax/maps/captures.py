@@ -16,6 +16,8 @@ from .section import ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
 NEARLY = 0.1
+# The same for many crossings: after so many of them any motion on a torus comes back nearly.
+MORE_NEARLY = 0.02
 CROSSINGS, MORE_CROSSINGS = 8, 40
 # A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
 # neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
@@ -59,7 +61,8 @@ def stable_cycles(
         back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
-        near = np.flatnonzero(np.isfinite(size) & (size > 0) & (nearest <= NEARLY))
+        close = nearest <= np.where(lag > CROSSINGS, MORE_NEARLY, NEARLY)
+        near = np.flatnonzero(np.isfinite(size) & (size > 0) & close)
     if not len(near):
         return []
     now, lag = paths[-1].rows(near), lag[near]

@@ -287,6 +287,12 @@ class Fates:
         return self.amplitudes[:, -1]
 
     @property
+    def growing(self):
+        """The same the other way round: the run has not come to its attractor yet."""
+        rises = np.diff(self.amplitudes[:, -5:], axis=1) > 1e-6 * self.amplitudes[:, -1:]
+        return np.all(rises, axis=1)
+
+    @property
     def shrinking(self):
         falls = np.diff(self.amplitudes[:, -5:], axis=1) < -1e-6 * self.amplitudes[:, -1:]
         return np.all(falls, axis=1)
