@@ -18,7 +18,7 @@ from ..verdicts import ensemble as nominating
 from ..verdicts import tube
 from ..verdicts.tube_of_several import starts_of_several
 from ..verdicts.verdict import Verdict
-from .captures import MORE_CROSSINGS, Cycle, captured, distinct, stable_cycles
+from .captures import MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
 from .flattened import Flattened, flatten
 from .section import ReturnMaps, Section
 from .sharing import Batch
@@ -131,7 +131,7 @@ def search(
 def _keep(maps: ReturnMaps, new: list[tuple[int, Cycle]], found: list[Attractors]) -> None:
     """Adds those cycles (each with the place of its group) that are not known yet."""
     for k, cycle in new:
-        if not any(same_cycle(maps, cycle, other) for other in found[k].cycles):
+        if is_new(maps, cycle, found[k].cycles):
             found[k].cycles.append(cycle)
 
 
@@ -156,13 +156,6 @@ def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attract
     _keep(maps, [(running[picked[rows[0]]] // members, cycle) for _, rows, cycle in new], found)
     if new:
         take_captured()
-
-
-def same_cycle(maps: ReturnMaps, one: Cycle, other: Cycle) -> bool:
-    """Whether two cycles of a group are the same."""
-    size = np.linalg.norm(maps.weights * one.points[0])
-    apart = np.min(np.linalg.norm(maps.weights * (other.points - one.points[0]), axis=1))
-    return len(one.points) == len(other.points) and bool(apart < 1e-6 * size)
 
 
 def section_of(now) -> Section:

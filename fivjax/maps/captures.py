@@ -80,7 +80,7 @@ def stable_cycles(
         else:
             kept.append(row)
             rows_of.append([near[row]])
-    before = [_known(maps, closed.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    before = [_passing(maps, closed.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = [float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row])))) for row in kept]
     locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY)
     attempts = [
@@ -111,7 +111,12 @@ def stable_cycles(
     return found
 
 
-def _known(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle]) -> Cycle | None:
+def is_new(maps: ReturnMaps, cycle: Cycle, known: list[Cycle]) -> bool:
+    """Whether a cycle is none of the known ones of its group."""
+    return _passing(maps, cycle.points[0], [one for one in known if len(one.points) == len(cycle.points)]) is None
+
+
+def _passing(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle]) -> Cycle | None:
     """The one of these cycles that has this state among its points."""
     size = np.linalg.norm(maps.weights * y)
     for cycle in cycles:

@@ -17,7 +17,7 @@ from ..verdicts.verdict import Verdict
 from . import attractors
 from .attractors import Attractors, Follower
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
-from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, stable_cycles
+from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, placed, released, step
@@ -144,13 +144,13 @@ class Basins:
         picked = distinct(self.maps.weights * np.where(asks[:, None], latest, 0.0), group, asks)
         led_to_one = np.zeros(len(picked), bool)
         at = attractors.section_of(now).rows(picked)
-        known = {g: [self.cycles[place] for place in places] for g, places in self.of_group.items()}
+        known = {g: self._cycles_of(g) for g in self.of_group}
         for g, rows, cycle in stable_cycles(self.maps, group[picked], at, known, crossings):
             led_to_one[rows] = True
-            if not any(attractors.same_cycle(self.maps, cycle, self.cycles[place]) for place in self.of_group[g]):
+            if is_new(self.maps, cycle, self._cycles_of(g)):
                 self._add(g, [cycle])
         # Motions on a locked torus take long to close in on its cycle: nothing else need be sought for them.
-        locked = [any(len(self.cycles[place].points) > CROSSINGS for place in self.of_group[g]) for g in group[picked]]
+        locked = [any(len(cycle.points) > CROSSINGS for cycle in self._cycles_of(g)) for g in group[picked]]
         alone = picked[~led_to_one & (self.torus.amplitude[group[picked]] == 0) & ~np.array(locked)]
         groups, first = np.unique(group[alone], return_index=True)
         chosen = alone[first]
@@ -158,13 +158,16 @@ class Basins:
             part = slice(start, start + ENSEMBLES)
             follower, near = Follower(_begun, _follow), latest[chosen[part]]
             given = columns[pending[chosen[part]]]
-            cycles = [[self.cycles[place] for place in self.of_group[g]] for g in groups[part]]
+            cycles = [self._cycles_of(g) for g in groups[part]]
             found = attractors.search(
                 self.batch, self.shared, self.maps, follower, groups[part], given, report, near, cycles
             )
             for g, one, before in zip(groups[part], found, cycles, strict=True):
                 self._add(g, one.cycles[len(before) :])
                 self._know_torus(g, one)
+
+    def _cycles_of(self, g: int) -> list[Cycle]:
+        return [self.cycles[place] for place in self.of_group[g]]
 
     def _add(self, g: int, cycles: list[Cycle]) -> None:
         self.of_group[int(g)] += range(len(self.cycles), len(self.cycles) + len(cycles))
