@@ -16,7 +16,7 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
-from .section_map import Point, flow_with_jacobian, mechanics_about_sliding
+from .section_map import Point, flow_with_jacobian, mechanics_about_sliding, to_crossing
 
 # Places in a segment where the tangential speed is looked at; about its largest, Newton's method finds the peak.
 SAMPLES = 24
@@ -88,28 +88,13 @@ def peak_speed_along(
     Not a number where that takes more than the time `longest` (s), or more than `most` segments; none of them is kept.
     """
 
-    def observe(total, segment: Segment):
-        crossed, peak = total
+    def observe(peak, segment: Segment):
         own = _peak_within(stepper, mechanics, segment.y, segment.contact, segment.after.h)
-        return crossed + segment.after.rise.happened, jnp.maximum(peak, own)
+        return jnp.maximum(peak, own)
 
     zero = jnp.zeros((), point.y.dtype)
-    after = follow(
-        stepper,
-        mechanics,
-        point.contact,
-        zero,
-        point.y,
-        longest,
-        total=(jnp.zeros((), jnp.int32), zero),
-        observe=observe,
-        until=lambda total: total[0] >= crossings,
-        at_section=True,
-        most=most,
-        kind="lax",
-    )
-    crossed, peak = after.total
-    return jnp.where(crossed >= crossings, peak, jnp.nan)
+    crossed, _, peak = to_crossing(stepper, mechanics, point, crossings, longest, zero, observe, most)
+    return jnp.where(crossed, peak, jnp.nan)
 
 
 def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: Contact, h) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ as a large one.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, Rest, State
 from ..foundation.compiling import compiled
 from ..model.scene import Scene, steady_sliding
-from ..steppers.core import Segment, follow
+from ..steppers.core import Followed, Segment, Total, follow
 from ..steppers.event_exact import EventExact
 
 # Segments on the way from one point of the section to the next, at most: hundreds of events in one swing.
@@ -41,7 +42,6 @@ class Return(NamedTuple):
     time: Float[Array, ""]  # how long it took, s
     events: Int[Array, ""]  # contact events on the way
     segments: Int[Array, ""]  # segments on the way
-    peak: Float[Array, ""]  # largest tangential speed at the ends of segments, m/s
     arrived: Bool[Array, ""]  # whether the section was met
 
 
@@ -68,6 +68,43 @@ def longest_return(scene: Scene) -> Float[Array, ""]:
     return 100 * 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
 
 
+def to_crossing(
+    stepper: EventExact,
+    mechanics: Mechanics,
+    start: Point,
+    crossings: Int[Array, ""] | int,
+    longest: Float[Array, ""],
+    total: Total,
+    observe: Callable[[Total, Segment], Total],
+    most: int,
+) -> tuple[Bool[Array, ""], Followed, Total]:
+    """A motion from a start to its `crossings`-th crossing of the section, or for a time `longest` (s), or `most` segments.
+
+    Returns whether it has crossed so often, where it has come to, and the total of what `observe` adds of each segment.
+    """
+
+    def observe_crossings(counted, segment: Segment):
+        crossed, total = counted
+        return crossed + segment.after.rise.happened, observe(total, segment)
+
+    after = follow(
+        stepper,
+        mechanics,
+        start.contact,
+        jnp.zeros((), start.y.dtype),
+        start.y,
+        longest,
+        total=(jnp.zeros((), jnp.int32), total),
+        observe=observe_crossings,
+        until=lambda counted: counted[0] >= crossings,
+        at_section=True,
+        most=most,
+        kind="lax",
+    )
+    crossed, total = after.total
+    return crossed >= crossings, after, total
+
+
 def moved(
     stepper: EventExact,
     mechanics: Mechanics,
@@ -82,32 +119,14 @@ def moved(
     none = jnp.zeros((), jnp.int32)
 
     def observe(total, segment: Segment):
-        crossed, events, segments, peak = total
-        after = segment.after
-        return (
-            crossed + after.rise.happened,
-            events + jnp.any(after.ended),
-            segments + 1,
-            jnp.maximum(peak, after.peak),
-        )
+        events, segments = total
+        return events + jnp.any(segment.after.ended), segments + 1
 
-    after = follow(
-        stepper,
-        mechanics,
-        start.contact,
-        jnp.zeros((), start.y.dtype),
-        start.y,
-        longest,
-        total=(none, none, none, jnp.zeros((), start.y.dtype)),
-        observe=observe,
-        until=lambda total: total[0] >= crossings,
-        at_section=True,
-        most=64 * MOST_SEGMENTS,
-        kind="lax",
+    crossed, after, (events, segments) = to_crossing(
+        stepper, mechanics, start, crossings, longest, (none, none), observe, 64 * MOST_SEGMENTS
     )
-    crossed, events, segments, peak = after.total
-    arrived = (crossed >= crossings) & jnp.all(jnp.isfinite(after.y))
-    return Return(Point(after.y, after.contact), longest - after.left, events, segments, peak, arrived)
+    arrived = crossed & jnp.all(jnp.isfinite(after.y))
+    return Return(Point(after.y, after.contact), longest - after.left, events, segments, arrived)
 
 
 def section_return(

@@ -42,9 +42,7 @@ class Images(NamedTuple):
 
     at: Section
     events: Int[np.ndarray, " m"]  # contact events on the way
-    segments: Int[np.ndarray, " m"]
     time: Float[np.ndarray, " m"]  # s
-    peak: Float[np.ndarray, " m"]  # largest tangential speed at the ends of segments, m/s
 
 
 class ReturnMaps:
@@ -100,7 +98,7 @@ def _one(shared, y, status, direction, crossings):
     found = moved(EventExact(), mechanics, point, crossings, longest * crossings)
     y = jnp.where(found.arrived, found.point.y, jnp.nan)
     contact = found.point.contact
-    return y, contact.status, contact.direction, found.events, found.segments, found.time, found.peak
+    return y, contact.status, contact.direction, found.events, found.time
 
 
 def _of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
