@@ -3,13 +3,12 @@
 import contextlib
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 import xarray as xr
 
+from ..cycles.cycle import under_final_load
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
-from ..model.load import ConstantLoad
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
@@ -21,6 +20,7 @@ from .engine import run_to_verdict
 from .executors import with_workers
 from .resuming import keeper_at
 from .shares import wilson
+from .states import state_places
 
 
 @in_double_precision
@@ -67,12 +67,12 @@ def basins(
     method = EventExact() if method is None else method
     check_run(scene, method, t_max, memory)
     arguments.truth("kick", kick)
-    states = _places(scene, axes)
+    states = _states_among(scene, axes)
     if not states:
         names = ", ".join(f"{name}, d{name}" for name in scene.structure.coordinates)
         raise ValueError(f"A map of basins needs at least one displacement or velocity as its axis: {names}.")
     if not kick:
-        scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
+        scene = under_final_load(scene)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
     grid = checked_grid(axes, tuple(states))
@@ -100,11 +100,9 @@ def basins(
     return _with_shares(dataset)
 
 
-def _places(scene: Scene, axes: dict) -> dict[str, int]:
+def _states_among(scene: Scene, axes: dict) -> dict[str, int]:
     """The axes that are displacements or velocities, with their places in the state."""
-    n = scene.structure.size
-    known = {name: k for k, name in enumerate(scene.structure.coordinates)}
-    known |= {f"d{name}": n + k for name, k in known.items()}
+    known = state_places(scene.structure)
     unknown = [name for name in axes if name not in known and name not in scene.parameters]
     if unknown:
         raise ValueError(

@@ -8,7 +8,6 @@ stable direction.
 
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import numpy as np
 
 from ..cycles.kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked
@@ -17,11 +16,11 @@ from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..io.datasets import labelled
-from ..model.load import ConstantLoad, Pulse
+from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .engine import run_to_verdict
+from .states import verdicts_from
 from .threshold import critical_perturbation
 
 if TYPE_CHECKING:
@@ -80,10 +79,11 @@ def boundary_section(
     right, left = _directions(saddle, weights)
     origin = weights * np.asarray(saddle.closed.point.y)
     axis, size = np.linspace(-reach, reach, points), np.linalg.norm(origin)
+    rest = np.asarray(sliding_state(scene, scene.load.final))
 
     def verdicts(stable: np.ndarray, unstable: np.ndarray) -> np.ndarray:
         places = unstable.reshape(-1, 1) * right[0] + stable.reshape(-1, 1) * right[1]
-        return _verdicts(scene, (origin + size * places) / weights).reshape(stable.shape)
+        return verdicts_from(scene, (origin + size * places) / weights + rest, "section").reshape(stable.shape)
 
     stable, unstable = np.meshgrid(axis, axis, indexing="ij")
     verdict = verdicts(stable, unstable)
@@ -156,14 +156,3 @@ def _changes(verdict: np.ndarray) -> np.ndarray:
     pair = {int(Verdict.SLIDING), int(Verdict.LIMIT_CYCLE)}
     decided = np.isin(verdict, list(pair))
     return (verdict[..., 1:] != verdict[..., :-1]) & decided[..., 1:] & decided[..., :-1]
-
-
-def _verdicts(scene: Scene, states: np.ndarray) -> np.ndarray:
-    quiet = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
-    names = scene.structure.coordinates
-    places = {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
-    totals = states + np.asarray(sliding_state(scene, scene.load.final))
-    values = {name: np.ascontiguousarray(totals[:, place]) for name, place in places.items()}
-    return run_to_verdict(
-        quiet, values, EventExact(), t_max=30.0, memory=2e9, progress=False, label="section", states=places
-    ).verdict

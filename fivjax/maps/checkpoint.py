@@ -15,10 +15,9 @@ import numpy as np
 import xarray as xr
 
 from ..io.datasets import check_writable, save
-from ..verdicts.verdict import Verdict
 from .attractor_files import from_bytes, to_bytes
 from .attractors import Attractors
-from .results import Verdicts
+from .results import Verdicts, by_name, worth_keeping
 from .trajectories import Places
 
 KIND = "fivjax checkpoint"
@@ -61,12 +60,9 @@ class Checkpoint:
         """Write what is not written yet."""
         if not self._new:
             return
-        parts = verdicts._asdict()
-        # Whoever goes on may have other workers.
-        parts["verdict"] = np.where(verdicts.verdict == Verdict.WORKER_LOST, Verdict.NOT_RUN, verdicts.verdict)
-        parts["verdict"] = parts["verdict"].astype(np.int8)
         found = json.dumps({place: to_bytes(part).hex() for place, part in self.found.items()}).encode()
-        results = {**parts.pop("energy"), **parts, "found": np.frombuffer(found, np.uint8)}
+        kept = verdicts._replace(verdict=worth_keeping(verdicts.verdict))
+        results = {**by_name(kept), "found": np.frombuffer(found, np.uint8)}
         keep(self.path, self.run, results)
         self._written, self._new = time.monotonic(), False
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from ..contact import Contact, Status
 from ..cycles.section_map import MOST_SEGMENTS, mechanics_about_sliding
@@ -38,8 +38,19 @@ class Certificate(NamedTuple):
     shapes: Vectors
 
 
+class StableSliding(NamedTuple):
+    """Sliding in modal coordinates, of one scene."""
+
+    modes: SlidingModes
+    linear: LinearSliding
+    shift: Complex[np.ndarray, " k"]  # of the equilibrium by the load, in modal coordinates
+    signals: tuple[tuple[np.ndarray, float], ...]  # shares of modes in slip and in pressing, and the margin of each
+
+
 class Perturbation(Protocol):
     """A kind of perturbation, as a search for the smallest one wants it."""
+
+    sliding: StableSliding
 
     def norm(self, u: Vectors) -> Float[np.ndarray, " k"]: ...
 
@@ -58,13 +69,7 @@ class Perturbation(Protocol):
     def certificate(self) -> Certificate: ...
 
 
-class _Sliding(NamedTuple):
-    modes: SlidingModes
-    linear: LinearSliding
-    signals: tuple[tuple[np.ndarray, float], ...]  # shares of modes in each signal, and its margin
-
-
-def stable_sliding(scene: Scene) -> _Sliding:
+def stable_sliding(scene: Scene) -> StableSliding:
     """Sliding in modal coordinates, without the leading axis of groups.
 
     **Raises:** `ValueError` where steady sliding does not exist or is not stable.
@@ -75,8 +80,10 @@ def stable_sliding(scene: Scene) -> _Sliding:
         raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
     own: SlidingModes = jax.tree.map(lambda leaf: leaf[0], modes)
     linear = own.linear
-    margins = float(np.asarray(linear.slip_margin)), float(np.asarray(linear.pressing_margin))
-    return _Sliding(own, linear, ((own.slip, margins[0]), (own.pressing, margins[1])))
+    states = sliding_states(scene.structure.size, scene.structure.normal)
+    shift = np.asarray(own.to_modal) @ np.asarray(linear.equilibrium)[states].astype(complex)
+    signals = (own.slip, float(linear.slip_margin)), (own.pressing, float(linear.pressing_margin))
+    return StableSliding(own, linear, shift, signals)
 
 
 @compiled
@@ -157,18 +164,13 @@ class Histories:
         return gradient @ np.asarray(_after_with_jacobian(self.scene, EventExact(), jnp.asarray(u), self.time))
 
     def certificate(self) -> Certificate:
-        modes = self.sliding.modes
-        rates = np.asarray(modes.eigenvalues)
-        shift = np.asarray(self.sliding.linear.equilibrium)[
-            sliding_states(self.scene.structure.size, self.scene.structure.normal)
-        ]
-        modal = np.asarray(modes.to_modal) @ shift.astype(complex)
+        rates = np.asarray(self.sliding.modes.eigenvalues)
         edges, fastest = np.linspace(0.0, self.time, self.pieces + 1), np.max(np.abs(rates))
         count = int(np.ceil(FINE * fastest * self.time / (2 * np.pi * self.pieces)))
         inside = np.linspace(0.0, self.time / self.pieces, count + 1)
         size, shapes = np.inf, []
         for row, (shares, margin) in enumerate(self.sliding.signals):
-            own = np.asarray(shares) * modal
+            own = np.asarray(shares) * self.sliding.shift
             steady = float(np.real(np.sum(own)))
             # The load presses by itself while it lasts.
             direct = margin - steady if row == 1 else 0.0

@@ -57,6 +57,17 @@ def not_run(total: int, energy: bool) -> Verdicts:
     )
 
 
+def by_name(verdicts: Verdicts) -> dict[str, np.ndarray]:
+    """The same, terms of the ledger beside the rest."""
+    parts = verdicts._asdict()
+    return {**parts.pop("energy"), **parts}
+
+
+def worth_keeping(verdict: np.ndarray) -> np.ndarray:
+    """The verdicts as they are kept: what was lost with its worker is run again, because others may have better ones."""
+    return np.where(verdict == Verdict.WORKER_LOST, Verdict.NOT_RUN, verdict).astype(np.int8)
+
+
 class Ended(NamedTuple):
     """Verdicts of trajectories, and the attractors that have captured them."""
 

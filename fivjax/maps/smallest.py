@@ -20,11 +20,9 @@ from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
-from ..linear.linearisation import linear_sliding
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
-from ..model.sliding import sliding_states
-from ..verdicts.sliding_proof import envelope_peak, sliding_modes
+from ..verdicts.sliding_proof import envelope_peak
 from .perturbations import stable_sliding
 from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
 from .threshold import critical_perturbation
@@ -237,33 +235,25 @@ def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
     """The p - 1 at which linear sliding ends after a kick, without what may happen between two durations."""
     sliding = stable_sliding(scene)
     modes = sliding.modes
-    states = np.asarray(sliding_states(scene.structure.size, scene.structure.normal))
-    modal = modes.to_modal @ np.asarray(sliding.linear.equilibrium)[states].astype(complex)
     shapes = 1 - np.exp(np.outer(durations, modes.eigenvalues))
     # A kick without duration moves nothing.
     with np.errstate(divide="ignore"):
-        reached = [margin / _peaks(shapes * (shares * modal), modes.envelope) for shares, margin in sliding.signals]
+        reached = [
+            margin / _peaks(shapes * (shares * sliding.shift), modes.envelope) for shares, margin in sliding.signals
+        ]
     return np.min(reached, axis=0)
 
 
 @in_double_precision
 def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
     """A p - 1 below which no kick of a duration between these (s) has any contact event: it slides for ever."""
-    linear = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], _linear(scene))
-    modes = sliding_modes(linear)
-    if not bool(modes.stable[0]) or not bool(np.asarray(linear.exists)[0]):
-        raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
-    rates, shift = modes.eigenvalues[0], np.asarray(linear.equilibrium)[0]
-    states = np.asarray(sliding_states(scene.structure.size, scene.structure.normal))
-    modal = modes.to_modal[0] @ shift[states].astype(complex)
-    envelope = jax.tree.map(lambda leaf: leaf[0], modes.envelope)
+    sliding = stable_sliding(scene)
+    rates, modal, envelope = sliding.modes.eigenvalues, sliding.shift, sliding.modes.envelope
     least = np.inf
-    signals = ((modes.slip[0], linear.slip_margin), (modes.pressing[0], linear.pressing_margin))
-    for row, (shares, margin) in enumerate(signals):
-        size = float(np.asarray(margin)[0])
+    for row, (shares, margin) in enumerate(sliding.signals):
         steady = float(np.real(np.sum(shares * modal)))
         # The load presses by itself while it lasts: in the end, as much more as there is more of it.
-        direct = size - steady if row == 1 else 0.0
+        direct = margin - steady if row == 1 else 0.0
         slope = float(_peaks(shares * rates * modal, envelope)[0])
         during = np.linspace(0.0, longest, GRID)
         response = direct + steady - np.real(np.exp(np.outer(during, rates)) @ (shares * modal))
@@ -273,13 +263,8 @@ def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
         kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)
         gap = after[1] - after[0] if len(after) > 1 else 0.0
         peak = max(peak, float(np.max(_peaks(kicked, envelope))) + 0.5 * slope * gap)
-        least = min(least, size / peak)
+        least = min(least, margin / peak)
     return float(least)
-
-
-@compiled
-def _linear(scene: Scene):
-    return linear_sliding(scene)
 
 
 @compiled

@@ -7,18 +7,15 @@ search goes there as far as it gains, from the best of the shapes that linear sl
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from ..cycles.stable_manifold import Saddle, manifold_normal
-from ..model.load import ConstantLoad
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .attractors import Attractors
 from .crossing import Crossing, first_crossings
-from .engine import run_to_verdict
-from .perturbations import Histories, InitialStates, Perturbation, Vectors, stable_sliding
+from .perturbations import Histories, InitialStates, Perturbation, Vectors
+from .states import verdicts_from
 
 # How far above the certified bound a ray is looked along at first, and at how many sizes; then around where it was, and inside
 # a bracket.
@@ -93,29 +90,14 @@ class _Rays:
     """Where perturbations along rays squeal first."""
 
     def __init__(self, scene: Scene, kind: Perturbation):
-        self.kind = kind
-        self.scene = eqx.tree_at(lambda scene: scene.load, scene, ConstantLoad(scene.load.final))
-        names = scene.structure.coordinates
-        self.places = {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
-        self.rest = np.asarray(stable_sliding(scene).linear.equilibrium)
+        self.scene, self.kind = scene, kind
+        self.rest = np.asarray(kind.sliding.linear.equilibrium)
         self.attractors: dict[bytes, Attractors] = {}
         self.trajectories = 0
 
     def verdicts(self, u: Vectors) -> np.ndarray:
-        states = self.kind.states(u) + self.rest
         self.trajectories += len(u)
-        values = {name: np.ascontiguousarray(states[:, place]) for name, place in self.places.items()}
-        return run_to_verdict(
-            self.scene,
-            values,
-            EventExact(),
-            t_max=30.0,
-            memory=2e9,
-            progress=False,
-            label="states",
-            states=self.places,
-            attractors=self.attractors,
-        ).verdict
+        return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
 
     def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> Crossing:
         """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to a relative width."""

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..verdicts.verdict import Verdict
+from ..io.files import check_writable
 from .attractor_files import from_bytes, to_bytes
 from .attractors import Attractors
 from .checkpoint import refuse_other_run
-from .results import Verdicts, not_run
+from .results import Verdicts, by_name, not_run, worth_keeping
 from .trajectories import Grid, Places, Tiles
 
 KIND = "fivjax store"
@@ -48,7 +48,7 @@ class Store:
         self.found: dict[int, dict[bytes, Attractors]] = {}
         self.verdicts: Verdicts | None = None
         run = {**run, "chunk": list(tile)}
-        fields = _fields(not_run(1, energy))
+        fields = by_name(not_run(1, energy))
         with contextlib.suppress(FileExistsError):
             if not self.path.exists():
                 _create(self.path, run, grid, tile, fields)
@@ -73,7 +73,7 @@ class Store:
                 parts = {name: np.asarray(array[at]).ravel() for name, array in self.arrays.items()}
             except Exception:  # whatever a broken chunk makes of its decoder
                 continue
-            for name, values in _fields(verdicts).items():
+            for name, values in by_name(verdicts).items():
                 values[places] = parts[name]
         return verdicts
 
@@ -90,14 +90,12 @@ class Store:
             folder = self.path / FOUND
             folder.mkdir(exist_ok=True)
             _write(folder / f"{int(places[0])}.npz", to_bytes(found))
-        fields = _fields(verdicts)
+        fields = by_name(verdicts)
         numbers = self.tiles.holding(places)
         for name in sorted(fields, key=lambda name: name == "verdict"):  # that one last
             for number in numbers:
                 at, own = self.tiles.slices(int(number)), self.tiles[int(number)]
-                values = fields[name][own]
-                if name == "verdict":
-                    values = np.where(values == Verdict.WORKER_LOST, Verdict.NOT_RUN, values).astype(np.int8)
+                values = worth_keeping(fields[name][own]) if name == "verdict" else fields[name][own]
                 self.arrays[name][at] = values.reshape([part.stop - part.start for part in at])
                 self._on_disk(name, int(number))
 
@@ -123,20 +121,10 @@ def _zarr():
     return zarr
 
 
-def _fields(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    parts = verdicts._asdict()
-    return {**parts.pop("energy"), **parts}
-
-
 def _create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
     """An empty store, which appears under its name as a whole."""
     zarr = _zarr()
-    if not path.parent.is_dir():
-        raise ValueError(f"Output folder `{path.parent}` does not exist; create it first.")
-    try:
-        part = Path(tempfile.mkdtemp(dir=path.parent, prefix=".fivjax."))
-    except OSError as error:
-        raise ValueError(f"Output folder `{path.parent}` cannot be written: {error.strerror}.") from error
+    part = Path(tempfile.mkdtemp(dir=check_writable(path).parent, prefix=".fivjax."))
     try:
         group = zarr.create_group(part, zarr_format=3, attributes={"kind": KIND, "run": json.dumps(run)})
         for name, values in grid.axes.items():

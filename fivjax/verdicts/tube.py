@@ -17,19 +17,26 @@ STARTS = 16
 HOME = 16
 
 
+def directions_from(
+    states: Float[np.ndarray, "k 2n"],
+) -> tuple[Float[np.ndarray, "m 2n"], Float[np.ndarray, "m 2n"], float]:
+    """Some of a set of states, all along it; where starts are displaced to from each; and the mean size of the states."""
+    chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
+    random = np.random.default_rng(0).normal(size=chosen.shape)
+    kind = np.arange(STARTS) % 4
+    away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
+    return chosen, away, float(np.mean(np.linalg.norm(states, axis=-1)))
+
+
 def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
     """States on the edge of the tube about weighted deviations `states`.
 
     `velocity`, `gap` and `gap_rate` are places of the tangential velocity, which is zero on the section, and of the normal
     displacement and velocity, which are zero in contact.
     """
-    chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
-    size = np.mean(np.linalg.norm(states, axis=-1))
+    chosen, away, size = directions_from(states)
     # Shares of rounding are contact.
     open_ = chosen[:, gap] > 1e-6 * size
-    random = np.random.default_rng(0).normal(size=chosen.shape)
-    kind = np.arange(STARTS) % 4
-    away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
     away[:, velocity] = 0.0
     away[~open_, gap] = away[~open_, gap_rate] = 0.0
     found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)

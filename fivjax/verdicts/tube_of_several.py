@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from .tube import RADIUS, STARTS
+from .tube import RADIUS, directions_from
 
 
 def starts_of_several(
@@ -17,13 +17,9 @@ def starts_of_several(
     which are zero in contact like the velocities there.
     """
     n = len(section)
-    chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
-    size = np.mean(np.linalg.norm(states, axis=-1))
+    chosen, away, size = directions_from(states)
     # Shares of rounding are contact.
     open_ = chosen[:, gaps] > 1e-6 * size
-    random = np.random.default_rng(0).normal(size=chosen.shape)
-    kind = np.arange(STARTS) % 4
-    away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
     away = _on_section(_closed(away, open_, gaps), section)
     found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
     found[:, gaps] = np.where(open_, np.maximum(found[:, gaps], 1e-6 * size), 0.0)
