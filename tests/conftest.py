@@ -1,8 +1,32 @@
-"""Scenes that many tests share. Nothing here turns double precision on: the library does that for itself."""
+"""Scenes that many tests share, and what they compile. Nothing here turns double precision on: the library does that for itself."""
+
+import os
+import shutil
+import tempfile
 
 import pytest
 
 import fivjax as fj
+
+CACHE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers, and the processes that tests start, find compiled what one of them compiled.
+
+    Most of the suite's time is compilation. Workers inherit the folder from the process that starts them, which removes it.
+    """
+    if CACHE not in os.environ:
+        os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if (folder := config.stash.get(_FOLDER, None)) is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_FOLDER = pytest.StashKey[str]()
 
 
 @pytest.fixture
