@@ -82,6 +82,13 @@ def test_modes_along_friction_and_what_has_no_steady_sliding():
     assert modes.sizes["mode"] == 4
     assert 0 < modes["mu_crit"] < 0.3
     assert np.all(modes["shape"].sel(coordinate=[2, 5]) == 0)
+    # One contact by vectors: its free coordinates are those of the contacts, not what its vectors look like as places.
+    pair, unit = coupled(2e4, 1.05), np.eye(6)
+    first = fj.ContactPoint(unit[pair.contacts[0].tangential], unit[pair.contacts[0].normal])
+    mixed = fj.Structure(*pair.matrices, contacts=[first, pair.contacts[1]])
+    same = fj.cea.modes(mixed, mu=np.linspace(0.0, 0.3, 4))
+    np.testing.assert_allclose(same["frequency"], modes["frequency"], rtol=1e-9)
+    assert np.all(same["shape"].sel(coordinate=[2, 5]) == 0)
     pair = coupled(2e4, 1.05)
     upwards = fj.Structure(*pair.matrices[:3], -np.asarray(pair.load_direction), contacts=pair.contacts)
     lifted = fj.Scene(upwards, fj.Coulomb(0.2), 3.0, fj.ConstantLoad(100.0))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import contact_coordinates, sliding_coordinates, sliding_matrices, sliding_rows
 from ..model.structure import Structure
 from .gradients import significant_growth
 from .linearisation import linear_sliding, state_matrix
@@ -32,8 +33,9 @@ def one_contact(structure: Structure) -> bool:
 
 
 def free_coordinates(structure: Structure) -> np.ndarray:
-    """The coordinates that closed contacts leave free, of a structure with contacts at coordinates."""
-    return np.setdiff1d(np.arange(structure.size), _places(structure)[1])
+    """The coordinates that closed contacts leave free: of `in_contact_coordinates`."""
+    structure = in_contact_coordinates(structure)
+    return sliding_coordinates(structure.size, contact_coordinates(structure)[1])
 
 
 def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:
@@ -56,23 +58,11 @@ def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"
 def sliding_forces(structure: Structure, friction: Float[Array, " c"], force) -> Float[Array, " c"]:
     """The normal forces of steady sliding under a load, in N."""
     structure = in_contact_coordinates(structure)
-    _, normal = _places(structure)
-    free = free_coordinates(structure)
+    normal, free = np.atleast_1d(contact_coordinates(structure)[1]), free_coordinates(structure)
     *_, stiffness, load = structure.matrices
-    rows = _with_friction(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)[free]
+    rows = sliding_rows(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)
     displacements = jnp.linalg.solve(rows[:, free], rows[:, -1] * force)
     return stiffness[normal][:, free] @ displacements - load[normal] * force
-
-
-def _places(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    contacts = structure.contacts
-    return np.array([contact.tangential for contact in contacts]), np.array([contact.normal for contact in contacts])
-
-
-def _with_friction(structure: Structure, matrix, friction):
-    """Rows of the structure, each tangential one less σμ times its own normal row."""
-    tangential, normal = _places(structure)
-    return matrix.at[tangential].add(-friction[:, None] * matrix[normal])
 
 
 def sliding_state(
@@ -83,15 +73,10 @@ def sliding_state(
     `friction` is σμ of each contact, `slopes` what friction that varies with speed adds to its damping, N dμ/dv in N·s/m.
     """
     structure = in_contact_coordinates(structure)
-    tangential, _ = _places(structure)
-    free = np.ix_(free_coordinates(structure), free_coordinates(structure))
-
-    def sliding(matrix):
-        return _with_friction(structure, matrix, friction)[free]
-
-    mass, damping, stiffness = structure.matrices[:3]
-    damping = damping.at[tangential, tangential].add(slopes)
-    return state_matrix(sliding(mass), sliding(damping), sliding(stiffness))
+    tangential, _ = contact_coordinates(structure)
+    mass, damping, stiffness = sliding_matrices(structure, friction)
+    along = free_coordinates(structure)[:, None] == np.atleast_1d(tangential)
+    return state_matrix(mass, damping + jnp.diag(along @ slopes), stiffness)
 
 
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
