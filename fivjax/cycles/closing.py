@@ -43,9 +43,8 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
     point, step, since = guess, None, 0
     for _ in range(MOST_ITERATIONS):
         found, jacobian = _returned(scene, stepper, point, crossings)
-        y, size = np.asarray(point.y), np.linalg.norm(weights * np.asarray(point.y))
+        y, closure = np.asarray(point.y), missed_by(point, found, weights)
         gap = np.asarray(found.point.y) - y
-        closure = np.linalg.norm(weights * gap) / size if size > 0 else np.inf
         usable = np.isfinite(closure) and np.all(np.isfinite(jacobian))
         if usable and not _same_mode(found.point, point):
             # The guess lies on the other side of an event; where it leads is on this side.
@@ -72,16 +71,28 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
         point = Point(jnp.asarray(y + step), point.contact)
     if best is None or not best[0] <= CLOSED:
         return None
-    closure, point, found, jacobian = best
+    _, point, found, jacobian = best
     # Once around may be less than what was asked for.
     for fewer in (count for count in range(1, crossings) if crossings % count == 0):
         sooner, derived = _returned(scene, stepper, point, fewer)
-        y = np.asarray(point.y)
-        missed = np.linalg.norm(weights * (np.asarray(sooner.point.y) - y)) / np.linalg.norm(weights * y)
+        missed = missed_by(point, sooner, weights)
         if missed <= CLOSED and _same_mode(sooner.point, point):
-            found, jacobian, closure, crossings = sooner, derived, missed, fewer
+            found, jacobian, crossings = sooner, derived, fewer
             break
-    return Closed(point, crossings, float(found.time), jacobian, float(closure), int(found.segments), int(found.events))
+    return closed_as(point, crossings, found, jacobian, weights)
+
+
+def missed_by(point: Point, found: Return, weights: Float[np.ndarray, " state"]) -> float:
+    """How far a return ends from the point it began at, relative to its size."""
+    y = np.asarray(point.y)
+    size = np.linalg.norm(weights * y)
+    return float(np.linalg.norm(weights * (np.asarray(found.point.y) - y)) / size) if size > 0 else np.inf
+
+
+def closed_as(point: Point, crossings: int, found: Return, jacobian, weights: Float[np.ndarray, " state"]) -> Closed:
+    """A cycle from its return."""
+    residual = missed_by(point, found, weights)
+    return Closed(point, crossings, float(found.time), jacobian, residual, int(found.segments), int(found.events))
 
 
 def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> tuple[Return, np.ndarray]:

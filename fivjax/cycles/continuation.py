@@ -19,7 +19,7 @@ from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.event_exact import EventExact
 from .around import seen_around
-from .closing import Closed
+from .closing import closed_as
 from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
 from .following import Point, follow_branch, seen, sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
@@ -164,11 +164,7 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     if crossings is None:
         raise NoLimitCycle(f"At point {i} of the branch the motion does not come back to the section.")
     found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
-    residual = np.linalg.norm(weights * (np.asarray(found.point.y) - y)) / np.linalg.norm(weights * y)
-    closed = Closed(
-        point, crossings, float(found.time), jacobian, float(residual), int(found.segments), int(found.events)
-    )
-    return limit_cycle_of(scene, stepper, closed)
+    return limit_cycle_of(scene, stepper, closed_as(point, crossings, found, jacobian, weights))
 
 
 def _checked_bounds(bounds) -> tuple[float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .following import Point, sliding_rates
-from .grazing import looked_at
+from .grazing import looked_at, row_of
 from .multiple_shooting import images, moved_along, parameter_direction
 from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
 from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier
@@ -54,11 +54,8 @@ def _derivative(family: Family, special: Special, name: str) -> float:
     if special.grazing is not None:
         _, partial = looked_at(curve, place.parameter, place.phases, special.grazing.touch, direction)
         _, itself = looked_at(curve, place.parameter, place.phases, special.grazing.touch)
-        last, size = float(partial.guard_parameter[0]), itself.guard_y.shape[1]
-        row = np.zeros(len(curve.scales))
-        k = special.grazing.touch.phase
-        row[k * size : (k + 1) * size], row[-1] = itself.guard_y[0], itself.guard_parameter[0]
-        row = row * curve.scales
+        last = float(partial.guard_parameter[0])
+        row = row_of(curve, place.phases, special.grazing.touch, itself)
     system = np.vstack([own, row])
     sizes = np.max(np.abs(system), axis=1)
     change = np.linalg.solve(system / sizes[:, None], -np.append(slope, last) / sizes)
