@@ -98,8 +98,7 @@ def calibrate(
             raise ValueError(
                 f"Parameter `{both[0]}` is free, but recording {k} states it as known. Drop one of the two."
             )
-    if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-        raise ValueError(f"Argument `starts` must be a whole number of at least 1, but is {starts!r}.")
+    arguments.whole_number("starts", starts, minimum=1)
     arguments.real_number("spread", spread, above=0, maximum=0.9)
     arguments.real_number("identifiable_within", identifiable_within, above=0)
     method = EventExact() if method is None else method

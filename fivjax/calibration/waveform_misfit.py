@@ -21,9 +21,8 @@ from .noise import noise_of_means
 LEAST_EXPLAINED = 0.7
 
 
-class SlidingMisfit(AbstractMisfit):
-    """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
-    found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+class AbstractWaveformMisfit(AbstractMisfit):
+    """A recording that is compared block by block; far from the answer by the poles and shapes of its small motion."""
 
     edges: Float[Array, " edge"]
     means: Float[Array, "B k"]
@@ -32,10 +31,16 @@ class SlidingMisfit(AbstractMisfit):
     poles: Complex[Array, " j"]
     shapes: Complex[Array, "j k"]
     channels: tuple[Channel, ...] = eqx.field(static=True)
-    projected: int = eqx.field(static=True)
 
     def coarse(self, scene):
         return characteristic_residual(scene.replace(**self.known), self.poles, self.shapes, self.channels)
+
+
+class SlidingMisfit(AbstractWaveformMisfit):
+    """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
+    found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+
+    projected: int = eqx.field(static=True)
 
     def compared(self, scene, own, share):
         weight = window(self.edges, share)[:, None] / self.sigma
@@ -62,23 +67,13 @@ class SlidingMisfit(AbstractMisfit):
         return waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
 
 
-class KickMisfit(AbstractMisfit):
+class KickMisfit(AbstractWaveformMisfit):
     """The response to the scene's own load, from steady sliding, through every contact event."""
 
-    edges: Float[Array, " edge"]
-    means: Float[Array, "B k"]
-    sigma: Float[Array, " k"]
-    known: dict[str, Array]
-    poles: Complex[Array, " j"]
-    shapes: Complex[Array, "j k"]
     method: AbstractStepper
-    channels: tuple[Channel, ...] = eqx.field(static=True)
     # Whether no contact event is taken to happen: then matrix exponentials do, a hundred times as fast.
     uneventful: bool = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
-
-    def coarse(self, scene):
-        return characteristic_residual(scene.replace(**self.known), self.poles, self.shapes, self.channels)
 
     def compared(self, scene, own, share):
         weight = window(self.edges, share)[:, None] / self.sigma

@@ -160,8 +160,7 @@ def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
     for name, method in methods.items():
         arguments.instance(f"methods[{name!r}]", method, AbstractStepper, "a stepper, such as EventExact()")
     arguments.real_number("t1", t1, above=0)
-    if isinstance(trajectories, bool) or not isinstance(trajectories, int | np.integer) or trajectories < 1:
-        raise ValueError(f"Argument `trajectories` must be a whole number of at least 1, but is {trajectories!r}.")
+    arguments.whole_number("trajectories", trajectories, minimum=1)
     refuse_painleve(scene)
     for kind in precisions:
         arguments.one_of("precisions", kind, ("float64", "float32"))
