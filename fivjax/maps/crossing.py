@@ -23,6 +23,12 @@ class Crossing(NamedTuple):
         return np.stack([self.low, self.high], axis=-1)
 
 
+def with_ends(inner: np.ndarray) -> np.ndarray:
+    """Verdicts inside brackets (rows, kicks) between those at their ends, which are proved: sliding and limit cycle."""
+    ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(inner), 2))
+    return np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
+
+
 def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> Crossing:
     """The first crossing of each row of `verdicts` (rows, kicks) at `kicks`, one row for all or one for each.
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from ..cycles.stable_manifold import Saddle, manifold_normal
 from ..model.scene import Scene
-from ..verdicts.verdict import Verdict
 from .attractors import Attractors
-from .crossing import Crossing, first_crossings
+from .crossing import Crossing, first_crossings, with_ends
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .states import verdicts_from
 
@@ -107,9 +106,7 @@ class _Rays:
             if not len(wide):
                 return found
             inner = np.linspace(found.low[wide], found.high[wide], INSIDE + 2, axis=1)
-            verdicts = self._along(shapes[wide], inner[:, 1:-1])
-            ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(wide), 2))
-            now = first_crossings(inner, np.concatenate([ends[:, :1], verdicts, ends[:, 1:]], axis=1))
+            now = first_crossings(inner, with_ends(self._along(shapes[wide], inner[:, 1:-1])))
             stuck = now.high - now.low >= 0.9 * (found.high[wide] - found.low[wide])
             for whole, part in zip(found, now, strict=True):
                 whole[wide] = part

@@ -19,7 +19,7 @@ from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .axes import add_linear_limit, check_run, checked_axes
 from .critical_derivatives import differentiable, with_derivatives
-from .crossing import NO_KICK, Crossing, first_crossings
+from .crossing import NO_KICK, Crossing, first_crossings, with_ends
 from .datasets import time_limit
 from .engine import run_to_verdict
 from .executors import with_workers
@@ -241,9 +241,7 @@ def _narrowed(
             before, again = at_ends[open_], verdicts[:, [0, -1]]
             contradicted[open_] = np.any((before >= 0) & (again >= 0) & (before != again), axis=1)
         else:
-            inner = _verdicts(run, method, chosen, p[:, 1:-1], label)
-            ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(open_), 2))
-            verdicts = np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
+            verdicts = with_ends(_verdicts(run, method, chosen, p[:, 1:-1], label))
         now = first_crossings(p, verdicts)
         still = []
         for row, place in enumerate(open_):
