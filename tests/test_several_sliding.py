@@ -83,8 +83,8 @@ def test_modes_along_friction_and_what_has_no_steady_sliding():
     assert 0 < modes["mu_crit"] < 0.3
     assert np.all(modes["shape"].sel(coordinate=[2, 5]) == 0)
     # One contact by vectors: its free coordinates are those of the contacts, not what its vectors look like as places.
-    pair, unit = coupled(2e4, 1.05), np.eye(6)
-    first = fj.ContactPoint(unit[pair.contacts[0].tangential], unit[pair.contacts[0].normal])
+    pair, one, unit = coupled(2e4, 1.05), fj.belt_oscillator(), np.eye(6)
+    first = fj.ContactPoint(unit[one.tangential], unit[one.normal])
     mixed = fj.Structure(*pair.matrices, contacts=[first, pair.contacts[1]])
     same = fj.cea.modes(mixed, mu=np.linspace(0.0, 0.3, 4))
     np.testing.assert_allclose(same["frequency"], modes["frequency"], rtol=1e-9)

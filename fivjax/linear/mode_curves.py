@@ -36,8 +36,9 @@ def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     **Returns:** a dataset over the axis and `mode` with `frequency` (Hz, damped), `growth_rate` (1/s), `damping_ratio`
     (-Re λ/|λ|), `eigenvalue` (that of the pair with positive imaginary part, or the larger of two real ones; 1/s),
     `partner` (the other one) and `shape` (complex displacements over `coordinate`, normal one included, the largest
-    scaled to 1; of contacts given by vectors those of `fj.in_contact_coordinates`). NaN where there is no steady sliding. Along `mu`, and with constant friction, also the numbers of
-    `stability_limit` and `coalescence`: `mu_crit`, `frequency_crit` (Hz) and `mu_coalescence` (undamped).
+    scaled to 1; of contacts given by vectors those of `fj.in_contact_coordinates`). NaN where there is no steady
+    sliding. Along `mu`, and with constant friction, also the numbers of `stability_limit` and `coalescence`: `mu_crit`,
+    `frequency_crit` (Hz) and `mu_coalescence` (undamped).
 
     **Example:**
 
