@@ -22,11 +22,12 @@ from .captures import MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_
 from .flattened import Flattened, flatten
 from .section import ReturnMaps, Section
 from .sharing import Batch
+from .windowed_returns import KEPT
 
 # Looks at an ensemble after which cycles are computed from where its members are.
 NEWTON_AT = (24, 64, 128, 256)
-# Looks in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone. What
-# takes longer is left to the trajectories that meet it.
+# Crossings in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone.
+# What takes longer is left to the trajectories that meet it.
 BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 # The peak on a torus is sought from one in so many of its states, for so many crossings: some trajectories have passed over.
 PEAK_EVERY, PEAK_CROSSINGS = 2, 4
@@ -120,7 +121,7 @@ def search(
             open_ = np.unique(running[moving[running]] // members)
             sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
             if sets:
-                locked = _add_tori(batch, shared, maps, rounds, groups, columns, sets, found, within, report)
+                locked = _add_tori(maps, groups, sets, found, within, report)
                 done = [k for k, _ in sets if found[k].torus is not None or k in locked]
                 moving[np.isin(np.arange(len(own)) // members, done)] = False
         left = moving[running]
@@ -163,9 +164,7 @@ def section_of(now) -> Section:
     return Section(np.array(now.y), np.array(now.contact.status), np.array(now.contact.direction))
 
 
-def _add_tori(
-    batch, shared, maps: ReturnMaps, rounds: Follower, groups, columns, sets, found, within: int, report
-) -> list[int]:
+def _add_tori(maps: ReturnMaps, groups, sets, found, within: int, report) -> list[int]:
     """Which of the sets that ensembles have met on (with the group's place) are tori; returns the places of groups whose torus
     is locked: there its cycle was found.
     """
@@ -173,27 +172,22 @@ def _add_tori(
     starts = [_about(maps, states[:: len(states) // tube.STARTS] / weights) for _, (states, _) in sets]
     count = tube.STARTS
     own = np.repeat([groups[k] for k, _ in sets], count)
-    each = np.repeat(np.stack([columns[k] for k, _ in sets]), count, axis=0)
-    y = np.concatenate(starts) / weights
-    trajectories = _at(rounds.begun(batch, shared, own, each, np.ones(len(own))), y, maps.normal)
+    last = _section_at(np.concatenate(starts) / weights, maps.normal)
     running, ok, home = np.arange(len(own)), np.ones(len(sets), bool), np.zeros(len(own), bool)
-    last = _section_at(np.zeros_like(y), maps.normal)
-    ends = np.full((tube.HOME, len(own), y.shape[1]), np.nan)
-    for looks in range(nominating.SEEN, within + 1, nominating.SEEN):
+    smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for _, (states, _) in sets])
+    for _ in range(0, within, KEPT):
         report(0)
-        rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
-        _, now = trajectories.tree
-        ends = np.roll(ends, -nominating.SEEN, axis=0)
-        ends[-nominating.SEEN :, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
-        # One that slides, or fails, has not come back.
-        ok[np.unique(running[now.verdict != Verdict.UNDECIDED] // count)] = False
-        for k in np.unique(running // count) if looks >= tube.HOME else ():
-            mine = running[running // count == k]
-            home[mine] = tube.home(sets[k][1][0], ends[:, mine])
-        for whole, part in zip(last, section_of(now), strict=True):
+        image = maps.returns(own[running], last.rows(running), KEPT)
+        for whole, part in zip(last, image.at, strict=True):
             whole[running] = part
-        left = ok[running // count] & ~home[running]
-        running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
+        ends = weights * np.moveaxis(image.path, 1, 0)
+        # One that fades, or fails, does not come back.
+        lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[running // count])
+        ok[np.unique(running[lost] // count)] = False
+        for k in np.unique(running // count):
+            mine = running // count == k
+            home[running[mine]] = tube.home(sets[k][1][0], ends[:, mine])
+        running = running[ok[running // count] & ~home[running]]
         if not len(running):
             break
     tori = np.flatnonzero(np.all(home.reshape(-1, count), axis=1) & ok)

@@ -52,10 +52,8 @@ def stable_cycles(
     that led to it, and it. Those of a group that are `known` are not computed anew.
     """
     weights = maps.weights
-    paths = [at]
-    for _ in range(crossings + 1):
-        paths.append(maps.returns(group, paths[-1], 1).at)
-    path = weights * np.stack([p.y for p in paths[1:]], axis=1)  # [row, crossing, coordinate]
+    last, states = maps.path(group, at, crossings + 1)
+    path = weights * states  # [row, crossing, coordinate]
     size = np.linalg.norm(path[:, -1], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
@@ -65,7 +63,7 @@ def stable_cycles(
         near = np.flatnonzero(np.isfinite(size) & (size > 0) & close)
     if not len(near):
         return []
-    now, lag = paths[-1].rows(near), lag[near]
+    now, lag = last.rows(near), lag[near]
     closed = _closed(maps, group[near], now, lag)
     # Of those that are the same, the first stands for all.
     kept: list[int] = []
@@ -99,13 +97,11 @@ def stable_cycles(
     own, centre = group[near[chosen]], Section(closed.y, now.status, now.direction).rows(chosen)
     neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable])
     amplitude = maps.peaks(own, centre, lag[chosen])
-    points, here = [centre.y], centre
-    for _ in range(int(np.max(lag[chosen])) - 1):
-        here = maps.returns(own, here, 1).at
-        points.append(here.y)
+    _, points = maps.path(own, centre, int(np.max(lag[chosen])))
+    points = np.concatenate([centre.y[:, None], points], axis=1)
     for k, (place, row) in enumerate(zip(stable, chosen, strict=True)):
         if neighbourhoods[k] is not None:
-            states = np.stack([p[k] for p in points[: lag[row]]])
+            states = points[k, : lag[row]]
             cycle = Cycle(states, float(closed.period[row]), largest[place], float(amplitude[k]), neighbourhoods[k])
             found.append((int(own[k]), np.array(rows_of[place]), cycle))
     return found
@@ -143,17 +139,17 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         if not len(running):
             break
         at = Section(y[running], now.status[running], now.direction[running])
-        image, derived = maps.derived(group[running], at, lag[running])
-        gap = image.at.y - at.y
+        image, time, derived = maps.derived(group[running], at, lag[running])
+        gap = image.y - at.y
         with np.errstate(invalid="ignore", divide="ignore"):
             missed = np.linalg.norm(weights * gap, axis=1) / np.linalg.norm(weights * at.y, axis=1)
             better = missed < closure[running]
-        alike = (image.at.status == at.status) & (image.at.direction == at.direction)
+        alike = (image.status == at.status) & (image.direction == at.direction)
         better &= np.all(alike.reshape(len(alike), -1), axis=1)
         better &= np.all(np.isfinite(derived), axis=(1, 2))
         rows = running[better]
         closure[rows], best[rows], jacobian[rows] = missed[better], at.y[better], derived[better]
-        period[rows] = image.time[better]
+        period[rows] = time[better]
         matrices = np.eye(n) - derived[better]
         solvable = np.abs(np.linalg.det(matrices)) > 0
         matrices[~solvable] = np.eye(n)

@@ -1,6 +1,7 @@
 """The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
 
-The programs here know nothing of a map's axes: all maps of structures of one size and friction of one kind share them.
+The programs here know nothing of a map's axes: all maps of structures of one size and friction of one kind share them. Where
+the trajectories of a map are followed in windows, so are these motions; but for derivatives, which a window does not have.
 """
 
 from typing import NamedTuple
@@ -10,20 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..contact import Contact
+from ..contact import Contact, Status
 from ..cycles.around import peak_speed_along
-from ..cycles.section_map import MOST_SEGMENTS, Point, moved
+from ..cycles.section_map import MOST_SEGMENTS, Point, moved, to_crossing
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
+from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact
 from ..steppers.section import section_weights
+from ..steppers.windowed import Windowed
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .sharing import Batch
+from .windowed_returns import KEPT, MOST_WINDOWS, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
 
 # States in a block: few, because often there are few.
 BLOCK = 64
 DERIVED_BLOCK = 16
+# Of central differences, relative to a state's size: the third root of rounding.
+STEP = 5e-6
 
 
 class Section(NamedTuple):
@@ -43,6 +49,7 @@ class Images(NamedTuple):
     at: Section
     events: Int[np.ndarray, " m"]  # contact events on the way
     time: Float[np.ndarray, " m"]  # s
+    path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN where there were fewer
 
 
 class ReturnMaps:
@@ -50,7 +57,9 @@ class ReturnMaps:
 
     def __init__(self, batch: Batch, shared: Flattened):
         tree = shared.tree
-        self.mechanics = flatten((tree.mechanics, np.asarray(tree.longest_return)))
+        longest = np.asarray(tree.longest_return)
+        self.mechanics = flatten((tree.mechanics, longest))
+        self.windows = flatten((tree.prepared, longest)) if isinstance(batch.method, Windowed) else None
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)
@@ -67,18 +76,65 @@ class ReturnMaps:
 
     def returns(self, group, at: Section, crossings) -> Images:
         """The `crossings`-th crossing from each row."""
-        found = in_blocks(_returned, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=self.block).tree
-        return _images(found)
+        if self.windows is not None:
+            return _images(self._in_windows(group, at, crossings)[:-1])
+        return _images(self._exactly(_returned, self.block, group, at, crossings))
 
-    def derived(self, group, at: Section, crossings) -> tuple[Images, Float[np.ndarray, "m 2n 2n"]]:
-        """The same, and the return map's derivatives."""
-        rows = _rows(at, crossings)
-        found, derivatives = in_blocks(_derived, self.mechanics, group, rows, 1, self.pool, size=DERIVED_BLOCK).tree
-        return _images(found), derivatives
+    def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
+        """The next `count` states on the section from each row: the last with its contact mode, and all of them."""
+        states = []
+        while count > 0:
+            part = min(count, KEPT)
+            image = self.returns(group, at, part)
+            at, count = image.at, count - part
+            states.append(image.path[:, KEPT - part :])
+        return at, np.concatenate(states, axis=1)
+
+    def derived(
+        self, group, at: Section, crossings
+    ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
+        """The same crossing, the time that it takes (s), and the derivative there, in what a row's contact mode leaves free."""
+        if self.windows is not None:
+            return self._differences(group, at, crossings)
+        (*section, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
+        return Section(*section), time, derivatives
 
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
-        return in_blocks(_peaks, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=DERIVED_BLOCK).tree
+        if self.windows is not None:
+            return self._in_windows(group, at, crossings)[-1]
+        return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
+
+    def _differences(self, group, at: Section, crossings):
+        """By central differences: the same program as everything else; neighbourhoods are checked by the map itself."""
+        count, size = at.y.shape
+        free = np.ones((count, size), bool)
+        free[:, self.structure.size + self.tangential] = False
+        touches = at.status != Status.DETACH
+        free[touches, self.normal] = free[touches, self.structure.size + self.normal] = False
+        lengths = STEP * np.linalg.norm(self.weights * at.y, axis=1)
+        row, place = np.nonzero(free)
+        step = lengths[row] / self.weights[place]
+        away = np.zeros((len(row), size))
+        away[np.arange(len(row)), place] = step
+        starts = np.concatenate([at.y, at.y[row] + away, at.y[row] - away])
+        rows = np.concatenate([np.arange(count), row, row])
+        image = self.returns(group[rows], Section(starts, at.status[rows], at.direction[rows]), crossings[rows])
+        base, ahead, behind = (
+            image.at.rows(part) for part in np.split(np.arange(len(rows)), [count, count + len(row)])
+        )
+        alike = (ahead.status == behind.status) & (ahead.status == base.status[row])
+        derivatives = np.zeros((count, size, size))
+        slopes = (ahead.y - behind.y) / (2 * step[:, None])
+        derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
+        return base, image.time[:count], derivatives
+
+    def _in_windows(self, group, at: Section, crossings):
+        rows = _rows(at, crossings)
+        return in_blocks(moved_in_windows, self.windows, group, rows, SIDE_BY_SIDE, self.pool, size=self.block).tree
+
+    def _exactly(self, program, size: int, group, at: Section, crossings):
+        return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree
 
 
 def _rows(at: Section, crossings) -> Flattened:
@@ -92,13 +148,30 @@ def _images(found) -> Images:
     return Images(Section(y, status, direction), *rest)
 
 
-def _one(shared, y, status, direction, crossings):
+def _arrived(shared, y, status, direction, crossings):
     mechanics, longest = shared
     point = Point(y, Contact(status.astype(jnp.int32), direction))
     found = moved(EventExact(), mechanics, point, crossings, longest * crossings)
     y = jnp.where(found.arrived, found.point.y, jnp.nan)
-    contact = found.point.contact
-    return y, contact.status, contact.direction, found.events, found.time
+    return y, found.point.contact.status, found.point.contact.direction, found.time
+
+
+def _with_path(shared, y, status, direction, crossings):
+    mechanics, longest = shared
+    point = Point(y, Contact(status.astype(jnp.int32), direction))
+
+    def observe(total, segment: Segment):
+        events, path = total
+        after = segment.after
+        return events + jnp.any(after.ended), with_newest(path, after.y, after.rise.happened)
+
+    nothing = jnp.zeros((), jnp.int32), no_path(y)
+    longest = longest * crossings
+    crossed, after, (events, path) = to_crossing(
+        EventExact(), mechanics, point, crossings, longest, nothing, observe, MOST_WINDOWS
+    )
+    y = jnp.where(crossed & jnp.all(jnp.isfinite(after.y)), after.y, jnp.nan)
+    return y, after.contact.status, after.contact.direction, events, longest - after.left, path
 
 
 def _of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
@@ -108,7 +181,7 @@ def _of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
 
 @compiled
 def _returned(shared: Flattened, rows: Flattened) -> Flattened:
-    return _of_block(_one, shared, rows)
+    return _of_block(_with_path, shared, rows)
 
 
 @compiled
@@ -116,7 +189,7 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, y, *row):
         def along(direction):
             def state(y):
-                found = _one(shared, y, *row)
+                found = _arrived(shared, y, *row)
                 return found[0], found
 
             _, tangent, found = jax.jvp(state, (y,), (direction,), has_aux=True)

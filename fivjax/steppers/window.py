@@ -64,6 +64,17 @@ class Window(eqx.Module):
         last = -least(jnp.where(rises, -index, 1).astype(jnp.int32))
         return last >= 0, (chosen(samples[:-1], last), chosen(samples[1:], last))
 
+    def first_rise(self) -> Int[Array, " l"]:
+        """The first interval in which the tangential velocity rises through zero, by its samples."""
+        speed, index = self.speed, jnp.arange(INTERVALS)[:, None]
+        return least(jnp.where((speed[:-1] < 0) & (speed[1:] >= 0), index, INTERVALS).astype(jnp.int32))
+
+    def fastest(self, interval: Int[Array, " l"]) -> Int[Array, " l"]:
+        """The sample of the largest tangential speed up to the beginning of an interval."""
+        speed, index = jnp.abs(self.speed), jnp.arange(INTERVALS + 1)[:, None]
+        speed = jnp.where(index <= interval, speed, -1.0)
+        return least(jnp.where(speed == -least(-speed), index, INTERVALS).astype(jnp.int32))
+
     def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
         """The largest tangential speed up to the beginning of an interval."""
         speed = jnp.abs(self.speed)
@@ -114,6 +125,10 @@ class Series(eqx.Module):
         """The guards, their coefficients that are zero but for rounding exactly so."""
         c = self.parts[0]
         return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
+
+    def speed(self, tangential: int) -> Float[Array, "k l"]:
+        """The series of the tangential velocity, in m per interval."""
+        return self.parts[2][1:, tangential] * jnp.arange(1.0, ORDER + 2)[:, None]
 
     def state(self, x: Float[Array, " l"]) -> Float[Array, "state l"]:
         """Displacements, and velocities in m per interval."""

@@ -10,6 +10,10 @@ from .propagation import ORDER
 from .window import Bracket, Series
 
 MOST_ROOT_STEPS = 60
+# Of Newton's method in a bracket, for the root of a velocity that changes sign in an interval: bisection has to help seldom.
+RISE_STEPS = 12
+# Of Newton's method, for a peak from the sample next to it.
+PEAK_STEPS = 5
 # Terms of the series in the steps of Newton's method that nearly all roots are found with: few while it is still far off.
 ROOT_STEPS = (5, 5, ORDER)
 
@@ -61,6 +65,39 @@ def first_root(
     first, fires = jnp.where(any_spent, 0.0, first), jnp.where(any_spent, spent, fires)
     fires = fires & (first <= end)
     return jnp.where(fires[0] | fires[1], first, end), fires
+
+
+def first_rise(
+    series: Series, tangential: int, end: Float[Array, " l"]
+) -> tuple[Bool[Array, " l"], Float[Array, " l"]]:
+    """Whether the tangential velocity has risen through zero by `end` (a share of the interval), and where, or `end`."""
+    speed = series.speed(tangential)
+
+    def at(x):
+        return value_and_slope(speed, x)
+
+    rises = (speed[0] < 0) & (at(end)[0] >= 0)
+
+    def nearer(_, carry):
+        low, high, x = carry
+        value, slope = at(x)
+        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
+        newton = x - value / jnp.where(slope == 0, 1.0, slope)
+        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+
+    begin = jnp.zeros_like(end), end, 0.5 * end
+    return rises, jnp.where(rises, jax.lax.fori_loop(0, RISE_STEPS, nearer, begin)[2], end)
+
+
+def highest(c: Float[Array, "k l"], low: Float[Array, " l"], high: Float[Array, " l"]) -> Float[Array, " l"]:
+    """The largest size of a polynomial near zero, between `low` and `high`, one of which is zero or on either side of it."""
+
+    def nearer(_, x):
+        _, slope, bend = value_slope_and_bend(c, x)
+        return jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), low, high)
+
+    x = jax.lax.fori_loop(0, PEAK_STEPS, nearer, jnp.zeros_like(high))
+    return jnp.maximum(jnp.abs(c[0]), jnp.abs(value_and_slope(c, x)[0]))
 
 
 def _approached(c: Float[Array, "k 2 l"], brackets: Bracket) -> Float[Array, "2 l"]:

@@ -12,6 +12,7 @@ mechanics leads here, too.
 """
 
 import functools
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from .base import Advance
 from .propagation import INTERVALS, Propagators, propagators, stacked
 from .section import Rise
 from .window import Bracket, Series, Window, parabola_root
-from .window_roots import dipped, first_root
+from .window_roots import dipped, first_rise, first_root, highest
 
 
 class Windowed(eqx.Module):
@@ -53,39 +54,50 @@ class Windowed(eqx.Module):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
-        del at_section  # the crossing is read off the window's samples
-        return _advance_one(prepared, contact, load, y, h)
+        return (_to_section if at_section else _advance_one)(prepared, contact, load, y, h)
 
 
-@jax.custom_batching.custom_vmap
-def _advance_one(prepared: Propagators, contact: Contact, load, y: State, h) -> Advance:
-    alone = jax.tree.map(lambda leaf: leaf[..., None], (contact, load, y, h))
-    return jax.tree.map(lambda leaf: leaf[..., 0], _advance(prepared, *alone))
+def _side_by_side(advance: Callable):
+    """`advance`, which takes trajectories side by side along the last axis, of one of them; its `jax.vmap` is `advance` again.
 
+    Where mechanics differ, too, there is nothing to share.
+    """
 
-@_advance_one.def_vmap
-def _advance_many(size: int, batched, prepared: Propagators, *trajectories):
-    """Trajectories with common mechanics go side by side along the last axis; others have nothing to share."""
-    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
-    if any(jax.tree.leaves(batched[0])):
-        after = jax.vmap(_advance_one.fun, in_axes=axes)(prepared, *trajectories)
-    else:
+    @jax.custom_batching.custom_vmap
+    def of_one(prepared: Propagators, *trajectory):
+        alone = jax.tree.map(lambda leaf: leaf[..., None], trajectory)
+        return jax.tree.map(lambda leaf: leaf[..., 0], advance(prepared, *alone))
 
-        def side_by_side(leaf, axis):
-            return jnp.broadcast_to(leaf[..., None], (*leaf.shape, size)) if axis is None else jnp.moveaxis(leaf, 0, -1)
+    @of_one.def_vmap
+    def _of_many(size: int, batched, prepared: Propagators, *trajectories):
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+        if any(jax.tree.leaves(batched[0])):
+            after = jax.vmap(of_one.fun, in_axes=axes)(prepared, *trajectories)
+        else:
 
-        trajectories = [
-            jax.tree.map(side_by_side, leaf, axis) for leaf, axis in zip(trajectories, axes[1:], strict=True)
-        ]
-        after = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), _advance(prepared, *trajectories))
-    return after, jax.tree.map(lambda _: True, after)
+            def last(leaf, axis):
+                if axis is None:
+                    return jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))
+                return jnp.moveaxis(leaf, 0, -1)
+
+            trajectories = [jax.tree.map(last, leaf, axis) for leaf, axis in zip(trajectories, axes[1:], strict=True)]
+            after = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), advance(prepared, *trajectories))
+        return after, jax.tree.map(lambda _: True, after)
+
+    return of_one
 
 
 def _advance(
-    prepared: Propagators, contact: Contact, load: Float[Array, " l"], y: Float[Array, "state l"], h: Float[Array, " l"]
+    prepared: Propagators,
+    contact: Contact,
+    load: Float[Array, " l"],
+    y: Float[Array, "state l"],
+    h: Float[Array, " l"],
+    at_section: bool = False,
 ) -> Advance:
     """One advance of trajectories side by side: to the next event, the end of the step or that of the window, whichever comes
-    first.
+    first. With `at_section` to the first rise of the tangential velocity, if that comes before (one that comes and goes between
+    two samples of the window is passed over); and its peak is known to rounding.
     """
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
@@ -94,9 +106,15 @@ def _advance(
     window = Window(prepared.window @ here, prepared.sizes @ jnp.abs(here), exact, n, mechanics.tangential)
     none, no_state = jnp.zeros_like(load), jnp.zeros_like(y)
 
-    interval = computed_once(lambda: window.safe_intervals(steps), none.astype(jnp.int32))
+    def first_of_all():
+        safe = window.safe_intervals(steps)
+        return jnp.minimum(safe, window.first_rise()) if at_section else safe
+
+    interval = computed_once(first_of_all, none.astype(jnp.int32))
     state, peak = computed_once(lambda: (window.state_at(interval), window.peak(interval)), (no_state, none))
-    rises, around = computed_once(lambda: window.rise(interval), (none > 0, (no_state, no_state)))
+    rises, around = none > 0, (no_state, no_state)
+    if not at_section:
+        rises, around = computed_once(lambda: window.rise(interval), (rises, around))
     there = stacked(mechanics, contact, load, state)
     series = Series(prepared.series @ there, prepared.sizes @ jnp.abs(there), exact, n)
     no = jnp.zeros((2, *none.shape), bool)
@@ -107,18 +125,32 @@ def _advance(
     share, fires = first_root(series, brackets, end)
 
     velocity = n + mechanics.tangential
+    if at_section:
+        rises, share = computed_once(lambda: first_rise(series, mechanics.tangential, share), (rises, share))
 
     def follow():
         reached = series.state(share)
         reached = jnp.where(jnp.arange(2 * n)[:, None] >= n, reached / prepared.interval, reached)
-        next_contact, y_next = over_trajectories(reached, contact, load, fires)
-        # The last rise is the one that counts: in what is left of the interval, after the window's.
-        later = (state[velocity] < 0) & (reached[velocity] >= 0)
-        before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
-        at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
+        if at_section:
+            reached = reached.at[velocity].set(jnp.where(rises, 0.0, reached[velocity]))
+        next_contact, y_next = over_trajectories(reached, contact, load, fires & ~rises)
         jumps = (reached[velocity] < 0) & (y_next[velocity] >= 0)
-        rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
-        return jnp.maximum(peak, jnp.abs(reached[velocity])), next_contact, y_next, rise, reached
+        if at_section:
+            rise = Rise(rises | jumps, y_next)
+        else:
+            # The last rise is the one that counts: in what is left of the interval, after the window's.
+            later = (state[velocity] < 0) & (reached[velocity] >= 0)
+            before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
+            at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
+            rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
+        seen = peak_near_fastest() if at_section else peak
+        return jnp.maximum(seen, jnp.abs(reached[velocity])), next_contact, y_next, rise, reached
+
+    def peak_near_fastest():
+        sample = window.fastest(interval)
+        about = stacked(mechanics, contact, load, window.state_at(sample))
+        speed = Series(prepared.series @ about, there, exact, n).speed(mechanics.tangential)
+        return highest(speed, jnp.maximum(-1.0 * sample, -1.0), interval + share - sample) / prepared.interval
 
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
     def over_trajectories(reached, contact, load, fires):
@@ -127,7 +159,11 @@ def _advance(
 
     like = none, contact, no_state, Rise(none > 0, no_state), no_state
     peak, next_contact, y_next, rise, end = computed_once(follow, like)
-    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise, end, fires)
+    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise, end, fires & ~rises)
+
+
+_advance_one = _side_by_side(_advance)
+_to_section = _side_by_side(functools.partial(_advance, at_section=True))
 
 
 def _rise(

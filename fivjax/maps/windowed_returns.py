@@ -1,0 +1,78 @@
+"""The return map of the Poincaré section by windows: motions of several groups side by side, for constant friction."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..contact import Contact
+from ..cycles.section_map import MOST_SEGMENTS
+from ..foundation.compiling import compiled
+from ..steppers.windowed import Windowed
+from .flattened import Flattened, flatten
+
+# Motions of one group in a row.
+SIDE_BY_SIDE = 8
+# Windows on the way, at most: as many as `section_map.moved` takes segments.
+MOST_WINDOWS = 64 * MOST_SEGMENTS
+# States on the section that are kept of a motion, the last ones.
+KEPT = 16
+
+
+def no_path(y: Float[Array, "*rows state"]) -> Float[Array, "*rows kept state"]:
+    """The states on the section of a motion that has not met it yet."""
+    return jnp.full((*y.shape[:-1], KEPT, y.shape[-1]), jnp.nan, y.dtype)
+
+
+def with_newest(
+    path: Float[Array, "*rows kept state"], y: Float[Array, "*rows state"], crossed: Bool[Array, "*rows"]
+) -> Float[Array, "*rows kept state"]:
+    """The path, with this state where the motion has `crossed` the section in it."""
+    longer = jnp.concatenate([path[..., 1:, :], y[..., None, :]], axis=-2)
+    return jnp.where(crossed[..., None, None], longer, path)
+
+
+@compiled
+def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
+    """From states of the section to the crossing asked for of each: the state there, contact mode, events and time (s) on the
+    way, the path, the largest tangential speed (m/s). Not a number where the section is not met.
+    """
+    windows, longest = shared.tree
+    y, status, direction, crossings = rows.tree
+    to_section = functools.partial(Windowed().advance, at_section=True)
+    advance = jax.vmap(jax.vmap(to_section, in_axes=(None, 0, 0, 0, 0)))
+
+    def going(left, crossed):
+        return (left > 0) & (crossed < crossings)
+
+    def further(carry):
+        count, before = carry
+        y, contact, left, crossed, events, path, peak = before
+        after = advance(windows, contact, jnp.zeros_like(left), y, left)
+        now = (
+            after.y,
+            after.contact,
+            jnp.where(after.h >= left, 0.0, left - after.h),
+            crossed + after.rise.happened,
+            events + jnp.any(after.ended, axis=-1),
+            with_newest(path, after.y, after.rise.happened),
+            jnp.maximum(peak, after.peak),
+        )
+        moves = going(left, crossed)
+
+        def where_it_moves(new, old):
+            return jnp.where(moves.reshape(*moves.shape, *[1] * (new.ndim - 2)), new, old)
+
+        return count + 1, jax.tree.map(where_it_moves, now, before)
+
+    def any_going(carry):
+        count, (_, _, left, crossed, *_) = carry
+        return (count < MOST_WINDOWS) & jnp.any(going(left, crossed))
+
+    time, none = longest[:, None] * crossings, jnp.zeros(crossings.shape, jnp.int32)
+    begin = y, Contact(status.astype(jnp.int32), direction), time, none, none, no_path(y), jnp.zeros_like(time)
+    _, (y, contact, left, crossed, events, path, peak) = jax.lax.while_loop(any_going, further, (0, begin))
+    arrived = (crossed >= crossings) & jnp.all(jnp.isfinite(y), axis=-1)
+    y, peak = jnp.where(arrived[..., None], y, jnp.nan), jnp.where(arrived, peak, jnp.nan)
+    return flatten((y, contact.status, contact.direction, events, time - left, path, peak), row_axes=2)
