@@ -37,7 +37,6 @@ class Progress(eqx.Module):
     y: State  # as a deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
     contact: Contact
     crossing: State  # the last crossing of the section under the final load; NaN before the first
-    peak: Float[Array, ""]  # largest tangential speed since it was last set to zero, m/s
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
     approach: Approach
@@ -82,7 +81,6 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
         y=y,
         contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
         crossing=jnp.full_like(y, jnp.nan),
-        peak=jnp.zeros((), y.dtype),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
         approach=attractors.no_approach(y),
@@ -134,7 +132,7 @@ def step(setting: Setting, now: Progress) -> Progress:
     # Exact steppers end on the section; `Windowed` reads the crossing off its samples, which is good enough on the way.
     at_section = not isinstance(method, Windowed)
     after = method.advance(setting.prepared, now.contact, load, now.y, t - now.t, at_section)
-    y, contact, h, peak, rise, *_ = after
+    y, contact, h, rise = after.y, after.contact, after.h, after.rise
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
     changed = jnp.any(changed) if setting.mechanics.several else changed
@@ -146,7 +144,6 @@ def step(setting: Setting, now: Progress) -> Progress:
         y=y,
         contact=contact,
         crossing=jnp.where(crossed, rise.at, now.crossing),
-        peak=jnp.maximum(now.peak, peak),
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
         approach=now.approach,

@@ -75,11 +75,6 @@ class Window(eqx.Module):
         speed = jnp.where(index <= interval, speed, -1.0)
         return least(jnp.where(speed == -least(-speed), index, INTERVALS).astype(jnp.int32))
 
-    def peak(self, interval: Int[Array, " l"]) -> Float[Array, " l"]:
-        """The largest tangential speed up to the beginning of an interval."""
-        speed = jnp.abs(self.speed)
-        return -least(jnp.where(jnp.arange(INTERVALS + 1)[:, None] <= interval, -speed, 0.0))
-
 
 class Bracket(eqx.Module):
     """What is known of the first roots of the guards in [0, 1] from their starts and ends."""

@@ -111,7 +111,7 @@ def _advance(
         return jnp.minimum(safe, window.first_rise()) if at_section else safe
 
     interval = computed_once(first_of_all, none.astype(jnp.int32))
-    state, peak = computed_once(lambda: (window.state_at(interval), window.peak(interval)), (no_state, none))
+    state = computed_once(lambda: window.state_at(interval), no_state)
     rises, around = none > 0, (no_state, no_state)
     if not at_section:
         rises, around = computed_once(lambda: window.rise(interval), (rises, around))
@@ -143,8 +143,9 @@ def _advance(
             before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
             at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
             rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
-        seen = peak_near_fastest() if at_section else peak
-        return jnp.maximum(seen, jnp.abs(reached[velocity])), next_contact, y_next, rise, reached
+        speed = jnp.abs(reached[velocity])
+        peak = jnp.maximum(speed, peak_near_fastest()) if at_section else speed
+        return peak, next_contact, y_next, rise, reached
 
     def peak_near_fastest():
         sample = window.fastest(interval)

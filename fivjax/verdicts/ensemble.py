@@ -70,7 +70,6 @@ class Ensemble(NamedTuple):
     """The last crossing states of `e` members, look by look; NaN where a member was not followed any more."""
 
     deviations: Float[np.ndarray, "k e state"]  # weighted
-    peaks: Float[np.ndarray, "k e"]  # largest tangential speed since the look before, m/s
     times: Float[np.ndarray, "k e"]  # s
     events: Int[np.ndarray, "k e"]  # contact events so far
     moving: Bool[np.ndarray, " e"]  # members that are still followed: without another verdict
@@ -86,8 +85,8 @@ def no_approach(y: State) -> Approach:
     return Approach(none, jnp.zeros((), jnp.int32))
 
 
-def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], float] | None:
-    """Crossing states and the amplitude (m/s) of what the ensemble has met on, if it has and if that may be a torus.
+def met(ensemble: Ensemble, decay: float) -> Float[np.ndarray, "s 2n"] | None:
+    """Crossing states of what the ensemble has met on, if it has and if that may be a torus.
 
     Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago.
     In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
@@ -122,7 +121,7 @@ def met(ensemble: Ensemble, decay: float) -> tuple[Float[np.ndarray, "s 2n"], fl
     # The more of them, the closer together they are on a torus.
     states = np.concatenate([before[_distance(states, before) <= REACHED], states])
     chosen = _spread(states)
-    return None if chosen is None else (states[chosen], float(np.max(ensemble.peaks[later][:, members])))
+    return None if chosen is None else states[chosen]
 
 
 def _spread(states: Float[np.ndarray, "m 2n"]) -> Int[np.ndarray, " KEPT"] | None:

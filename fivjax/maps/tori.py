@@ -1,0 +1,142 @@
+"""Tori of many groups: whether sets on which ensembles have met attract, whether neighbours part on them, how high they go."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..contact import Status
+from ..verdicts import tube
+from ..verdicts.tube_of_several import starts_of_several
+from .captures import MORE_CROSSINGS, Cycle, stable_cycles
+from .section import ReturnMaps, Section
+from .windowed_returns import KEPT
+
+# Crossings in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone.
+# What takes longer is left to the trajectories that meet it.
+BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
+# Starts about a torus that are followed further. Over so many returns, twice, it is asked whether neighbours part: the first
+# turn directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
+FURTHER, PARTING_OVER, PARTING = 8, 48, 0.05
+# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
+LOCKED = -0.01
+# How far neighbours are apart at first, relative to their size.
+APART = 1e-7
+# They then settle for so many returns more, and the largest speed in so many after these is the torus' amplitude.
+SETTLE_OVER, PEAK_OVER = 160, 32
+
+
+class Torus(NamedTuple):
+    """A set of crossing states about which everything was seen to come back."""
+
+    states: Float[np.ndarray, "k 2n"]  # weighted deviations
+    amplitude: float  # m/s
+    period: float  # mean time between crossings, s
+
+
+def tori_among(
+    maps: ReturnMaps,
+    groups: Int[np.ndarray, " g"],
+    sets: list[tuple[int, Float[np.ndarray, "k 2n"]]],
+    known: list[list[Cycle]],
+    within: int,
+    report,
+) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
+    """Which of these sets, each with the place of its group, are tori: those, by the place; and the cycles of those that are
+    locked. `known` are the cycles of each group; starts about a torus have to be back `within` so many crossings.
+    """
+    own = np.array([groups[k] for k, _ in sets])
+    back, last = _back(maps, own, [states for _, states in sets], within, report)
+    if not len(back):
+        return {}, []
+    chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
+    group, at = own[chosen // tube.STARTS], last.rows(chosen)
+    growth, period, later = _parting(maps, group, at)
+    growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
+    closing_in = np.flatnonzero(np.repeat(growth < LOCKED, FURTHER))[::4]
+    cycles: list[tuple[int, Cycle]] = []
+    locked: list[int] = []
+    if len(closing_in):
+        of_group = {int(groups[k]): known[k] for k, _ in sets}
+        for _, rows, cycle in stable_cycles(maps, group[closing_in], at.rows(closing_in), of_group, MORE_CROSSINGS):
+            of_torus = closing_in[rows] // FURTHER
+            cycles.append((sets[back[of_torus[0]]][0], cycle))
+            locked += list(of_torus)
+    with np.errstate(invalid="ignore"):
+        kept = np.flatnonzero((growth < PARTING) & ~np.isin(np.arange(len(back)), locked))
+    if not len(kept):
+        return {}, cycles
+    rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
+    settled = maps.returns(group[rows], later.rows(rows), SETTLE_OVER).at
+    peak = np.max(maps.peaks(group[rows], settled, PEAK_OVER).reshape(-1, FURTHER), axis=1)
+    tori = {}
+    for k, mean, highest in zip(kept, period[kept], peak, strict=True):
+        place, states = sets[back[k]]
+        if np.isfinite(mean) and np.isfinite(highest):
+            tori[place] = Torus(states, float(highest), float(mean))
+    return tori, cycles
+
+
+def _back(
+    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "k 2n"]], within: int, report
+) -> tuple[Int[np.ndarray, " t"], Section]:
+    """About which of the sets all starts come back within so many crossings; and where the starts are then, set by set."""
+    weights, count = maps.weights, tube.STARTS
+    starts = [about(maps, states[:: len(states) // count] / weights) for states in sets]
+    own, last = np.repeat(group, count), section_at(np.concatenate(starts) / weights, maps.normal)
+    running, back, ok = np.arange(len(own)), np.zeros(len(own), bool), np.ones(len(sets), bool)
+    smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
+    for _ in range(0, within, KEPT):
+        report(0)
+        image = maps.returns(own[running], last.rows(running), KEPT)
+        for whole, part in zip(last, image.at, strict=True):
+            whole[running] = part
+        ends = weights * np.moveaxis(image.path, 1, 0)
+        # One that fades, or fails, does not come back.
+        with np.errstate(invalid="ignore"):
+            lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[running // count])
+        ok[running[lost] // count] = False
+        for k in np.unique(running // count):
+            mine = running // count == k
+            back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine])
+        running = running[ok[running // count] & ~back[running]]
+        if not len(running):
+            break
+    return np.flatnonzero(np.all(back.reshape(-1, count), axis=1) & ok), last
+
+
+def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Section]:
+    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; the mean
+    time of a return (s); and where the motions are in the end.
+    """
+    weights = maps.weights
+    size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
+    # Away from the equilibrium, which keeps what the section and the contact hold at zero.
+    beside, growth, time = at.y * (1 + APART), np.full(len(group), np.nan), np.zeros(len(group))
+    for _ in range(2):
+        pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
+        image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)
+        time = time + image.time[: len(group)]
+        at, other = image.at.rows(slice(None, len(group))), image.at.rows(slice(len(group), None))
+        away = weights * (other.y - at.y)
+        distance = np.linalg.norm(away, axis=1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            growth = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
+            beside = at.y + APART * size * away / distance / weights
+    return growth, time / (2 * PARTING_OVER), at
+
+
+def about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
+    """Weighted starts on the edge of the tube about states of the section, or about one."""
+    structure = maps.structure
+    if len(structure.contacts) > 1:
+        section = maps.section / maps.weights[structure.size :]
+        return starts_of_several(maps.weights * np.atleast_2d(states), section, np.asarray(maps.normal))
+    velocity, rate = structure.size + structure.tangential, structure.size + structure.normal
+    return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate)
+
+
+def section_at(y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray) -> Section:
+    """States of the section with the contact mode that they tell."""
+    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
+    return Section(y, status, np.ones(status.shape))

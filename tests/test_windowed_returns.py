@@ -1,0 +1,75 @@
+"""The section's return map by windows: the one that the series stepper has, many at a time."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.maps.section import ReturnMaps, Section
+from fivjax.maps.sharing import Batch, shared_by
+from fivjax.maps.tori import section_at
+from fivjax.steppers.windowed import Windowed
+
+CROSSINGS = 6
+
+
+@pytest.fixture(scope="module")
+def maps():
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
+    with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
+        batch = Batch(scene, Windowed(), ("mu",), (), (), False, 8, False, pool)
+        yield ReturnMaps(batch, shared_by(batch, np.array([[0.12], [0.2], [0.227]])))
+
+
+@pytest.fixture(scope="module")
+def exactly(maps):
+    """The same return maps by the series stepper, which the oracle agrees with."""
+    same = object.__new__(ReturnMaps)
+    vars(same).update(vars(maps) | {"windows": None})
+    return same
+
+
+@pytest.fixture(scope="module")
+def starts(maps, exactly) -> tuple[np.ndarray, Section]:
+    """Groups and states on the section, from small ones, which slide, to large ones, which stick and lift off."""
+    group = np.arange(24) % 3
+    states = np.random.default_rng(3).normal(size=(24, 6)) * np.geomspace(0.1, 8.0, 24)[:, None]
+    at = section_at(np.where(np.arange(6) == 3, 0.0, states) / maps.weights, maps.normal)
+    closed = at.status[:, None] != fj.Status.DETACH
+    at = at._replace(y=np.where(closed & np.isin(np.arange(6), (2, 5)), 0.0, at.y))
+    # Where the velocity rises, as it does on the section, and not only is zero.
+    return group, exactly.returns(group, at, 1).at
+
+
+def test_crossings_are_the_series_stepper_s(maps, exactly, starts):
+    """Also the events on the way, the time that it takes, and the crossings before the last."""
+    group, at = starts
+    found, expected = maps.returns(group, at, CROSSINGS), exactly.returns(group, at, CROSSINGS)
+    size = np.linalg.norm(maps.weights * at.y, axis=1)
+    assert np.sum(expected.events > 5) > 6
+    assert np.any(expected.events == 0)
+    for ours, theirs in ((found.at.y, expected.at.y), (found.path[:, -CROSSINGS], expected.path[:, -CROSSINGS])):
+        assert np.all(np.isfinite(theirs))
+        assert np.max(np.linalg.norm(maps.weights * (ours - theirs), axis=1) / size) < 1e-9
+    np.testing.assert_array_equal(found.events, expected.events)
+    np.testing.assert_array_equal(found.at.status, expected.at.status)
+    np.testing.assert_allclose(found.time, expected.time, rtol=1e-10)
+    assert np.all(np.isnan(found.path[:, 0]))
+
+
+def test_the_peak_on_the_way_is_known_to_rounding(maps, exactly, starts):
+    np.testing.assert_allclose(maps.peaks(*starts, CROSSINGS), exactly.peaks(*starts, CROSSINGS), rtol=1e-9)
+
+
+def test_differences_are_the_derivative_through_events(maps, exactly, starts):
+    """In the coordinates that the section and the contact leave free: the others nobody can change."""
+    group, at = (starts[0][:12], starts[1].rows(slice(12)))
+    _, time, ours = maps.derived(group, at, np.full(12, 2))
+    _, expected_time, theirs = exactly.derived(group, at, np.full(12, 2))
+    np.testing.assert_allclose(time, expected_time, rtol=1e-10)
+    scale = maps.weights[:, None] / maps.weights
+    free = np.array([0, 1, 4])
+    difference = (scale * (ours - theirs))[:, :, free]
+    assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
