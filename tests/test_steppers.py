@@ -1,6 +1,7 @@
 """Both steppers against closed forms, against each other, and in a plain `diffrax.diffeqsolve`."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,21 +31,31 @@ def point_mass(mu=0.0, mu_static=None, stiffness=1.0, belt_speed=0.0, force=1.0,
         tangential=0,
         normal=1,
     )
-    return fj.Scene(structure, fj.Coulomb(mu, mu_static), belt_speed, fj.ConstantLoad(force), restitution=restitution)
+    # One kind of friction for all, so that they share what is compiled.
+    friction = fj.Coulomb(mu, mu if mu_static is None else mu_static)
+    return fj.Scene(structure, friction, belt_speed, fj.ConstantLoad(force), restitution=restitution)
+
+
+@eqx.filter_jit
+def begun(scene, y):
+    mechanics, load = Mechanics(scene), scene.load(0.0)
+    return mechanics, load, status_from_forces(mechanics, load, y)
+
+
+@eqx.filter_jit
+def advanced(method, mechanics, contact, load, y, h):
+    return method.advance(mechanics, contact, load, y, h)
 
 
 def events(scene: fj.Scene, y0, t1: float, method=None) -> list[tuple[float, int]]:
     """(time, new status) of every status change, from the stepper's own advances."""
     method = method or fj.EventExact()
     with jax.enable_x64(True):
-        mechanics = Mechanics(scene)
-        load = scene.load(0.0)
         y = jnp.asarray(y0, float)
-        contact = status_from_forces(mechanics, load, y)
-        advance = jax.jit(lambda contact, y, h: method.advance(mechanics, contact, load, y, h))
+        mechanics, load, contact = begun(scene, y)
         t, seen = 0.0, []
         while t < t1:
-            after = advance(contact, y, jnp.asarray(t1 - t))
+            after = advanced(method, mechanics, contact, load, y, jnp.asarray(t1 - t))
             t += float(after.h)
             if int(after.contact.status) != int(contact.status):
                 seen.append((t, int(after.contact.status)))
@@ -118,7 +129,7 @@ def test_where_switched_has_the_order_of_its_solver_while_the_status_lasts(solve
     exact = oracle.propagate(oracle.paper_model(mu=0.227, belt_speed=3.0, p=1.05), 0.05, np.array([0.0, 0.05]))
     order = solver().order(None)
     # Coarse enough that the error of the best of them stands clear of rounding.
-    steps = {2: [200, 400], 3: [200, 400], 5: [40, 80], 8: [8, 16]}[order]
+    steps = {2: [100, 200], 3: [100, 200], 5: [40, 80], 8: [8, 16]}[order]
     errors = []
     for count in steps:
         run = fj.simulate(scene, 0.05, 0.05, fj.WhereSwitched(solver(), dt=0.05 / count))
@@ -132,9 +143,10 @@ def test_where_switched_error_falls_in_proportion_to_the_step_after_events(paper
     """First order after events, as its documentation says: not worse, and not silently something else."""
     scene = paper_scene.replace(p=1.3)
     exact = fj.simulate(scene, 0.5, 0.5)
+    # Compiled for up to 256 steps from row to row, and up to 4096.
     steps = [2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5]
     errors = [
-        np.abs(fj.simulate(scene, 0.5, 0.5, fj.WhereSwitched(dt=dt)).velocity[-1] - exact.velocity[-1]).max()
+        np.abs(fj.simulate(scene, 0.5, 0.05, fj.WhereSwitched(dt=dt)).velocity[-1] - exact.velocity[-1]).max()
         for dt in steps
     ]
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -143,10 +155,9 @@ def test_where_switched_error_falls_in_proportion_to_the_step_after_events(paper
     assert errors[-1] < 2e-4
 
 
-@pytest.mark.parametrize("method", [LOW_ORDER, fj.WhereSwitched(dt=1e-4)], ids=["exact", "where"])
-def test_plain_diffeqsolve_gives_what_simulate_gives(method, paper_scene):
-    """Both steppers are diffrax solvers: the scene in `args`, the status in the solver state, dense output inside steps."""
-    scene = paper_scene.replace(p=1.3)
+def test_plain_diffeqsolve_gives_what_simulate_gives(paper_scene):
+    """A stepper is a diffrax solver: the scene in `args`, the status in the solver state, dense output inside steps."""
+    scene, method = paper_scene.replace(p=1.3), fj.WhereSwitched(dt=1e-4)
     run = fj.simulate(scene, 0.5, 1e-4, method)
     with jax.enable_x64(True):
         solution = diffrax.diffeqsolve(
@@ -169,9 +180,9 @@ def test_plain_diffeqsolve_gives_what_simulate_gives(method, paper_scene):
 
 
 def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
-    """Dense output must be as exact as the step, also where several events lie inside one diffrax step."""
+    """The other stepper is one too, and its dense output as exact as the step, also with several events inside one."""
     scene = paper_scene.replace(p=2.0)
-    run = fj.simulate(scene, 0.3, 2e-3, LOW_ORDER)
+    run = fj.simulate(scene, 0.3, 0.3 / 63, LOW_ORDER)
     with jax.enable_x64(True):
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(fj.vector_field),
@@ -186,7 +197,10 @@ def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
         )
     assert np.count_nonzero(np.diff(run.status)) > 15
     # Rounding, multiplied by the growth of differences through some thirty events.
-    np.testing.assert_allclose(np.asarray(solution.ys)[:, :3], run.displacement, atol=1e-13)
+    ys = np.asarray(solution.ys)
+    assert solution.result == diffrax.RESULTS.successful
+    np.testing.assert_allclose(ys[:, :3], run.displacement, atol=1e-13)
+    np.testing.assert_allclose(ys[:, 3:], run.velocity, atol=1e-10)
 
 
 def test_a_grazing_dip_inside_one_advance_is_found():

@@ -116,7 +116,9 @@ def derivatives(
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     refuse_painleve(scene)
     begin = start_state(scene, y0)
-    value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), y0, mode, method)
+    # An equilibrium moves with the parameters. As an array, a start is not compiled anew for other numbers.
+    given = None if y0 is None else begin
+    value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
     calls = closest_call(scene, method, begin, float(t1))
     return Derivatives(
         value=jax.tree.map(known_to_numpy, value),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation import arguments
-from ..foundation.compiling import compiled, power_of_4
+from ..foundation.compiling import compiled
 from ..foundation.precision import (
     Returned,
     in_double_precision,
@@ -31,6 +31,7 @@ from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
+from .compiled_sizes import compiled_rows, compiled_steps, with_step_as_array
 from .ending import ENDING, GROWTH, Ending
 from .energy import Books, Energy, Ledger
 from .start import checked_start, snapped_to_belt, start_state
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 # Rows that a trajectory may have: some 20 GB of them.
 MOST_ROWS = 10**8
-# Trajectories up to the second are compiled for the next power of four of rows, none for fewer than the first.
-LEAST_ROWS, MOST_REPEATED = 64, 4**8
 
 
 class Trajectory(eqx.Module):
@@ -189,15 +188,17 @@ def simulate(
     start = "sliding equilibrium" if y0 is None else "given by y0"
     y0 = start_state(scene, y0)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
-    most = math.ceil(dt_save / method.dt - 1e-9) + MOST_ADVANCES
+    steps = math.ceil(dt_save / method.dt - 1e-9)
     count = rows + 1
-    # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled.
+    # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled, and of steps.
     if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
-        derivatives, count = "forward", _compiled_rows(rows + 1)
+        derivatives, count = "forward", compiled_rows(rows + 1)
+        steps = compiled_steps(steps)
+    most = steps + MOST_ADVANCES
     # With NumPy, and not one small compiled program for each operation.
     instants = np.arange(count)
     saved = real(np.where(instants < rows, np.minimum(float(dt_save) * instants, float(t1)), float(t1)))
-    found = _simulate(scene, method, y0, saved, most, bool(energy), derivatives)
+    found = _simulate(scene, with_step_as_array(method), y0, saved, most, bool(energy), derivatives)
     # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
     grown = found.pop("grown")
@@ -241,11 +242,6 @@ def _at_contacts(rows: Float[Returned, "T n"], directions: np.ndarray) -> Float[
         else rows @ directions
     )
     return along[:, 0] if directions.shape[1] == 1 else along
-
-
-def _compiled_rows(count: int) -> int:
-    """The number of rows that is compiled for so many. Where these are many, compiling is little beside them."""
-    return power_of_4(max(count, LEAST_ROWS)) if count <= MOST_REPEATED else count
 
 
 def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int) -> Array | np.int8:
