@@ -78,7 +78,7 @@ def search(
         mine = slice(k * members, (k + 1) * members)
         whole = nominating.Ensemble(deviations, times, events, moving)
         seen = nominating.Ensemble(*(part[:looks, mine] for part in whole[:-1]), moving=moving[mine])
-        return nominating.met(seen, decay[groups[k]])
+        return nominating.met(seen, decay[groups[k]], thin=near is not None)
 
     while len(running) and looks < most:
         report(0)

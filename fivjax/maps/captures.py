@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..contact import Status
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
 from ..verdicts.capture_of_several import free_directions, trial_of_several
@@ -22,7 +23,7 @@ CROSSINGS, MORE_CROSSINGS = 8, 40
 # A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
 # neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
 WEAKLY, SMALLEST_OF_MANY = 0.95, 1e-3
-NEWTON_STEPS = 12
+NEWTON_STEPS, MISSES = 14, 3
 # Points of the section that a group nominates at a time.
 NOMINATED = 2
 # The same cycle: a state this close to one of its own, relative to their size.
@@ -69,20 +70,20 @@ def stable_cycles(
     kept: list[int] = []
     rows_of: list[list[int]] = []
     for row in np.flatnonzero(closed.residual <= CLOSED):
-        size = np.linalg.norm(weights * closed.y[row])
+        size = np.linalg.norm(weights * closed.at.y[row])
         for k, other in enumerate(kept):
             same = group[near[other]] == group[near[row]] and lag[other] == lag[row]
-            if same and np.linalg.norm(weights * (closed.y[other] - closed.y[row])) < SAME * size:
+            if same and np.linalg.norm(weights * (closed.at.y[other] - closed.at.y[row])) < SAME * size:
                 rows_of[k].append(near[row])
                 break
         else:
             kept.append(row)
             rows_of.append([near[row]])
-    before = [_passing(maps, closed.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = [float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row])))) for row in kept]
     locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY)
     attempts = [
-        _trial(maps, closed, now, row) if old is None and not weak else None
+        _trial(maps, closed, row) if old is None and not weak else None
         for row, old, weak in zip(kept, before, locked_weakly, strict=True)
     ]
     found = [
@@ -94,7 +95,7 @@ def stable_cycles(
     if not stable:
         return found
     chosen = np.array([kept[k] for k in stable])
-    own, centre = group[near[chosen]], Section(closed.y, now.status, now.direction).rows(chosen)
+    own, centre = group[near[chosen]], closed.at.rows(chosen)
     neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable])
     amplitude = maps.peaks(own, centre, lag[chosen])
     _, points = maps.path(own, centre, int(np.max(lag[chosen])))
@@ -122,52 +123,63 @@ def _passing(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle])
 
 
 class _Closed(NamedTuple):
-    y: Float[np.ndarray, "m 2n"]
+    at: Section
     residual: Float[np.ndarray, " m"]
     jacobian: Float[np.ndarray, "m 2n 2n"]
     period: Float[np.ndarray, " m"]
 
 
 def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
-    """Newton's method for all rows at once; a row that does not get closer is given up."""
+    """Newton's method for all rows at once; a row that misses `MISSES` times to get closer is given up.
+
+    Next to the onset of an event, or to a change of the mode in which the section is met, a first step may lead astray.
+    """
     weights = maps.weights
-    y, n = now.y.copy(), now.y.shape[1]
-    closure = np.full(len(y), np.inf)
-    jacobian, period = np.zeros((len(y), n, n)), np.zeros(len(y))
-    best, running = y.copy(), np.arange(len(y))
+    here, best = (Section(*(part.copy() for part in now)) for _ in range(2))
+    count, n = now.y.shape
+    closure, misses = np.full(count, np.inf), np.zeros(count, int)
+    jacobian, period = np.zeros((count, n, n)), np.zeros(count)
+    running = np.arange(count)
     for _ in range(NEWTON_STEPS):
         if not len(running):
             break
-        at = Section(y[running], now.status[running], now.direction[running])
+        at = here.rows(running)
         image, time, derived = maps.derived(group[running], at, lag[running])
         gap = image.y - at.y
         with np.errstate(invalid="ignore", divide="ignore"):
             missed = np.linalg.norm(weights * gap, axis=1) / np.linalg.norm(weights * at.y, axis=1)
             better = missed < closure[running]
-        alike = (image.status == at.status) & (image.direction == at.direction)
-        better &= np.all(alike.reshape(len(alike), -1), axis=1)
-        better &= np.all(np.isfinite(derived), axis=(1, 2))
+        alike = (image.status == at.status) & ((at.status != Status.SLIDE) | (image.direction == at.direction))
+        alike = np.all(alike.reshape(len(alike), -1), axis=1)
+        usable = np.isfinite(missed) & np.all(np.isfinite(derived), axis=(1, 2))
+        better &= alike & usable
         rows = running[better]
-        closure[rows], best[rows], jacobian[rows] = missed[better], at.y[better], derived[better]
-        period[rows] = time[better]
-        matrices = np.eye(n) - derived[better]
+        for whole, part in zip(best, at, strict=True):
+            whole[rows] = part[better]
+        closure[rows], jacobian[rows], period[rows] = missed[better], derived[better], time[better]
+        misses[running] += ~better
+        matrices = np.where(usable[:, None, None], np.eye(n) - derived, np.eye(n))
         solvable = np.abs(np.linalg.det(matrices)) > 0
         matrices[~solvable] = np.eye(n)
-        y[rows] = at.y[better] + np.linalg.solve(matrices, gap[better][..., None])[..., 0]
-        running = rows[solvable & (missed[better] > EXACT)]
+        stepped = at.y + np.linalg.solve(matrices, np.where(usable[:, None], gap, 0.0)[..., None])[..., 0]
+        # Where the section is met in another mode, what is sought has that mode.
+        following = Section(np.where(alike[:, None], stepped, image.y), image.status, image.direction)
+        for whole, part in zip(here, following, strict=True):
+            whole[running] = part
+        running = running[usable & solvable & ~(better & (missed <= EXACT)) & (misses[running] < MISSES)]
     return _Closed(best, closure, jacobian, period)
 
 
-def _trial(maps: ReturnMaps, closed: _Closed, now: Section, row: int) -> Trial | None:
+def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
     structure = maps.structure
+    y, *own = (part[row] for part in closed.at)
     if len(structure.contacts) > 1:
-        own = now.status[row], now.direction[row]
         places = np.asarray(maps.tangential), np.asarray(maps.normal)
         basis = free_directions(maps.weights, maps.section, *places, own[0])
-        return trial_of_several(closed.y[row], *own, closed.jacobian[row], maps.weights, basis)
-    status, direction = int(now.status[row]), float(now.direction[row])
+        return trial_of_several(y, *own, closed.jacobian[row], maps.weights, basis)
+    status, direction = int(own[0]), float(own[1])
     free = free_on_section(structure.size, structure.tangential, structure.normal, status)
-    return trial(closed.y[row], status, direction, closed.jacobian[row], maps.weights, free)
+    return trial(y, status, direction, closed.jacobian[row], maps.weights, free)
 
 
 def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial]) -> list[Neighbourhood | None]:

@@ -35,6 +35,8 @@ MORE_FROM = 64
 ENSEMBLES = 128
 # How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
 LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
+# Where a cycle is known that attracts slowly: for so many of its time constants, but not for more periods than so many.
+TIME_CONSTANTS, MOST_PERIODS = 12.0, 20000.0
 # Looks at a trajectory's verdict while its time grows e-fold.
 LOOKS = 8
 
@@ -72,7 +74,10 @@ def follow_all(
     while True:
         _, now = trajectories.tree
         verdict = np.array(now.verdict)
-        in_time = (now.t if t_max is not None else now.t - now.skipped) < limit[group[pending]]
+        if t_max is None:
+            in_time = now.t - now.skipped < np.maximum(limit, basins.settled_by)[group[pending]]
+        else:
+            in_time = now.t < limit[group[pending]]
         if done >= max_steps:
             verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
         which = np.full(len(pending), -1)
@@ -114,6 +119,7 @@ class Basins:
         self.of_group: dict[int, list[int]] = {}  # places in `cycles`
         self.torus = shared.tree.attractor  # views: what is written here is written there
         self.torus_period = np.full(len(distinct), np.nan)
+        self.settled_by = np.zeros(len(distinct))  # s
 
     def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
         """Finds the attractors of these groups, where they are not `known`."""
@@ -128,8 +134,8 @@ class Basins:
             known.update((keys[g], one) for g, one in zip(part, found, strict=True))
         for g in groups:
             one = known[keys[g]]
-            self.of_group[int(g)] = list(range(len(self.cycles), len(self.cycles) + len(one.cycles)))
-            self.cycles += one.cycles
+            self.of_group[int(g)] = []
+            self._add(g, one.cycles)
             self._know_torus(g, one)
 
     def search_alone(self, pending: np.ndarray, now, columns: np.ndarray, crossings: int, report) -> None:
@@ -172,6 +178,10 @@ class Basins:
     def _add(self, g: int, cycles: list[Cycle]) -> None:
         self.of_group[int(g)] += range(len(self.cycles), len(self.cycles) + len(cycles))
         self.cycles += cycles
+        for cycle in cycles:
+            constants = TIME_CONSTANTS * cycle.period / (1 - cycle.multiplier)
+            most = MOST_PERIODS * self.shared.tree.modes.slowest_period[g]
+            self.settled_by[g] = max(self.settled_by[g], min(constants, most))
 
     def _know_torus(self, g: int, found: Attractors) -> None:
         """From now on trajectories of the group are compared with its torus, if one was found."""

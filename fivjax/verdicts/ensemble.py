@@ -34,7 +34,7 @@ MOSTLY = 0.9
 LEAST_MEMBERS = 3
 # Crossing states that are kept: enough for neighbours on a torus to be closer together than `REACHED`.
 KEPT = 256
-# Sets that so few balls of the size `REACHED` cover are periodic, or drift: no tori.
+# Sets that so few balls of the size `REACHED` cover are thin: most are periodic, or drift.
 LEAST_SPREAD = 6
 # Between the two stretches a vibration that nothing sustains would have decayed by so much at least, and theirs has changed in
 # size by no more than this share of that.
@@ -85,12 +85,13 @@ def no_approach(y: State) -> Approach:
     return Approach(none, jnp.zeros((), jnp.int32))
 
 
-def met(ensemble: Ensemble, decay: float) -> Float[np.ndarray, "s 2n"] | None:
+def met(ensemble: Ensemble, decay: float, thin: bool = False) -> Float[np.ndarray, "s 2n"] | None:
     """Crossing states of what the ensemble has met on, if it has and if that may be a torus.
 
     Members have met when nine in ten of their crossing states of late are close to states that *others* were in some time ago.
     In between, a vibration that nothing sustains would have decayed by more than a fifth (`decay` is its slowest rate in
-    1/s); theirs has changed in size by no more than a tenth of that.
+    1/s); theirs has changed in size by no more than a tenth of that. A set that is thin counts only if so asked: next to the
+    bifurcation that it was born in, a torus is.
     """
     looks = len(ensemble.times)
     earlier, later = (slice(*(round(looks * share) for share in stretch)) for stretch in (EARLIER, LATER))
@@ -120,17 +121,17 @@ def met(ensemble: Ensemble, decay: float) -> Float[np.ndarray, "s 2n"] | None:
         return None
     # The more of them, the closer together they are on a torus.
     states = np.concatenate([before[_distance(states, before) <= REACHED], states])
-    chosen = _spread(states)
+    chosen = _spread(states, thin)
     return None if chosen is None else states[chosen]
 
 
-def _spread(states: Float[np.ndarray, "m 2n"]) -> Int[np.ndarray, " KEPT"] | None:
-    """Places of states that lie as far from each other as can be; none where a few are close to all."""
+def _spread(states: Float[np.ndarray, "m 2n"], thin: bool) -> Int[np.ndarray, " KEPT"] | None:
+    """Places of states as far from each other as can be; none where a few are close to all, unless sets may be `thin`."""
     size = np.mean(np.linalg.norm(states, axis=-1))
     chosen = [0]
     away = np.linalg.norm(states - states[0], axis=-1)
     while len(chosen) < KEPT:
-        if len(chosen) == LEAST_SPREAD and np.max(away) < REACHED * size:
+        if not thin and len(chosen) == LEAST_SPREAD and np.max(away) < REACHED * size:
             return None
         chosen.append(int(np.argmax(away)))
         away = np.minimum(away, np.linalg.norm(states - states[chosen[-1]], axis=-1))
