@@ -32,6 +32,7 @@ class Tally:
 
     lanes: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
     undecided: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
+    chaotic: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
     failed: int = 0
     sliding: int = 0
     cycles: int = 0
@@ -45,7 +46,7 @@ class Tally:
     map_time: float = 0.0
     reference_time: float = 0.0
 
-    def add(self, scenes, verdict, amplitude, near=False, name="", threads=1):
+    def add(self, scenes, verdict, amplitude, near=False, name="", threads=1, chaotic=False):
         """Compare lanes (dictionaries of `reference`, codes, m/s); returns what the reference says."""
         began = time.perf_counter()
         truth = judged(scenes, threads)
@@ -54,6 +55,7 @@ class Tally:
         verdict, amplitude = np.ravel(verdict), np.ravel(amplitude)
         self.lanes[side] += len(verdict)
         self.undecided[side] += int((verdict == -1).sum())
+        self.chaotic[side] += int(np.sum(chaotic))
         self.failed += int((verdict < -1).sum())
         said_sliding, said_cycle = verdict == 0, verdict == 1
         fades = truth.fate == "slides"
@@ -103,11 +105,12 @@ class Tally:
             f"> 3 %: {int((errors > 0.03).sum())}, > 50 %: {int((errors > 0.5).sum())}, largest {100 * errors.max():.3g} %"
         )
         for side, lanes in self.lanes.items():
-            share = 100.0 * self.undecided[side] / max(lanes, 1)
+            open_, chaotic = self.undecided[side], self.chaotic[side]
+            share = 100.0 * (open_ - chaotic) / max(lanes, 1)
+            place = "near" if side == "near" else "away from"
             print(
-                f"undecided {side} the stability limit: {self.undecided[side]} of {lanes} ({share:.2f} %)".replace(
-                    "away the", "away from the"
-                )
+                f"undecided {place} the stability limit: {open_} of {lanes}, {chaotic} of them named chaotic; "
+                f"others {share:.2f} %"
             )
         print(f"failed in the map: {self.failed}; given up by the reference: {self.untold}")
         print(f"time: maps {self.map_time:.0f} s, reference {self.reference_time:.0f} s")
@@ -142,7 +145,8 @@ def compare(tally, scene, near=False, name="", threads=1, **axes):
     began = time.perf_counter()
     found = fj.bistability_map(scene, progress=False, **axes)
     tally.map_time += time.perf_counter() - began
-    truth = tally.add(lanes_of(scene, **axes), found["verdict"].values, found["amplitude"].values, near, name, threads)
+    said = found["verdict"].values, found["amplitude"].values
+    truth = tally.add(lanes_of(scene, **axes), *said, near, name, threads, found["chaotic"].values)
     return found, truth
 
 

@@ -95,6 +95,7 @@ def test_chaos_is_no_torus():
     # Its largest speed changes from one tenth of the run to the next.
     assert np.all(np.ptp(fate.amplitudes, axis=1) > 1e-3 * fate.amplitude)
     assert m["verdict"].values.tolist() == [-1, -1, -1]
+    assert m["chaotic"].values.all()
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ QUANTITIES = {
     "amplitude": ("peak tangential speed on the attractor", "m/s"),
     "attractor": ("place of the attractor in the table (-1 none)", "1"),
     "attractors": ("attractors", "1"),
+    "chaotic": ("whether it is undecided and neighbours part from it exponentially", "1"),
     "attractor_amplitude": ("peak tangential speed on the attractor", "m/s"),
     "attractor_period": ("period of the attractor", "s"),
     "attractor_kind": ("kind of the attractor", "1"),

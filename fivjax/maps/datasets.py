@@ -15,7 +15,7 @@ from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
 from .axes import add_linear_limit
 from .crossing import first_crossings
-from .results import Verdicts
+from .results import CHAOTIC, Verdicts
 from .trajectories import Grid
 
 
@@ -51,6 +51,7 @@ def map_dataset(
             "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
             "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
             "attractor": (tuple(axes), place.reshape(shape)),
+            "chaotic": (tuple(axes), (verdicts.attractor_kind == CHAOTIC).reshape(shape)),
             **computed,
             **{name: ("attractors", column) for name, column in table.items()},
             **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},

@@ -8,6 +8,9 @@ from ..simulation.energy import exchanged
 from ..verdicts.verdict import Verdict
 from .progress import Progress
 
+# `attractor_kind` of a trajectory that nothing has captured, and of one whose neighbours, besides, part exponentially.
+NO_ATTRACTOR, CHAOTIC = -1, 2
+
 # What a ledger leaves of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
 ENERGIES = (
     "stick_work",
@@ -28,7 +31,7 @@ class Verdicts(NamedTuple):
 
     verdict: np.ndarray
     amplitude: np.ndarray  # m/s
-    attractor_kind: np.ndarray  # of the one that captured it: 0 periodic, 1 torus, -1 none
+    attractor_kind: np.ndarray  # of the one that captured it: 0 periodic, 1 torus; else `NO_ATTRACTOR` or `CHAOTIC`
     attractor_period: np.ndarray  # s
     attractor_multiplier: np.ndarray  # the largest
     decided_at: np.ndarray  # s
@@ -47,7 +50,7 @@ def not_run(total: int, energy: bool) -> Verdicts:
     return Verdicts(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
         amplitude=np.full(total, np.nan),
-        attractor_kind=np.full(total, -1, np.int8),
+        attractor_kind=np.full(total, NO_ATTRACTOR, np.int8),
         attractor_period=np.full(total, np.nan),
         attractor_multiplier=np.full(total, np.nan),
         decided_at=np.full(total, np.nan),

@@ -21,9 +21,10 @@ from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_n
 from .conclusion import STEPS_PER_LOOK, conclude, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, placed, released, step
-from .results import Ended, Verdicts, record
+from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
 from .sharing import Batch, grouped, shared_by, with_values
+from .tori import is_chaotic
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4
@@ -85,7 +86,8 @@ def follow_all(
             which = basins.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[which >= 0] = Verdict.LIMIT_CYCLE
         finished = (verdict != Verdict.UNDECIDED) | ~in_time
-        ended = Ended(verdict, *basins.described(pending, verdict, which))
+        chaotic = basins.chaotic(pending, now, finished & (verdict == Verdict.UNDECIDED))
+        ended = Ended(verdict, *basins.described(pending, verdict, which, chaotic))
         chosen = np.flatnonzero(finished)
         record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
         report(int(finished.sum()))
@@ -208,7 +210,15 @@ class Basins:
         which = captured(self.maps, self.group[pending], attractors.section_of(now), latest, known)
         return np.where(which >= 0, np.array([*places, -1])[which], -1)
 
-    def described(self, pending: np.ndarray, verdict: np.ndarray, which: np.ndarray):
+    def chaotic(self, pending: np.ndarray, now, chosen: np.ndarray) -> np.ndarray:
+        """Which of the chosen ones have neighbours that part from them exponentially."""
+        found = np.zeros(len(pending), bool)
+        asks = np.flatnonzero(chosen & np.isfinite(now.crossing).all(axis=1))
+        if self.maps is not None and len(asks):
+            found[asks] = is_chaotic(self.maps, self.group[pending[asks]], attractors.section_of(now).rows(asks))
+        return found
+
+    def described(self, pending: np.ndarray, verdict: np.ndarray, which: np.ndarray, chaotic: np.ndarray):
         """Kind, amplitude, period and multiplier of each one's attractor."""
         torus = (verdict == Verdict.LIMIT_CYCLE) & (which < 0)
         group = self.group[pending]
@@ -218,7 +228,7 @@ class Basins:
         for row in np.flatnonzero(which >= 0):
             cycle = self.cycles[which[row]]
             amplitude[row], period[row], multiplier[row] = cycle.amplitude, cycle.period, cycle.multiplier
-        kind = np.where(torus, 1, np.where(which >= 0, 0, -1)).astype(np.int8)
+        kind = np.where(torus, 1, np.where(which >= 0, 0, np.where(chaotic, CHAOTIC, NO_ATTRACTOR))).astype(np.int8)
         return kind, amplitude, period, multiplier
 
 

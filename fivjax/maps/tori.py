@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
 from ..verdicts import tube
@@ -20,6 +20,8 @@ BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 FURTHER, PARTING_OVER, PARTING = 8, 48, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
 LOCKED = -0.01
+# Of a motion that nothing captures, it is asked so many times in a row; the first one finds the directions.
+PARTING_TIMES, CHAOTIC_FROM = 4, 0.03
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 # They then settle for so many returns more, and the largest speed in so many after these is the torus' amplitude.
@@ -124,6 +126,17 @@ def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
             growth = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
             beside = at.y + APART * size * away / distance / weights
     return growth, time / (2 * PARTING_OVER), at
+
+
+def is_chaotic(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Bool[np.ndarray, " m"]:
+    """Whether neighbours part exponentially from motions that start here: by so much per return, over hundreds of returns."""
+    at = maps.returns(group, at, 1).at
+    growths = []
+    for _ in range(PARTING_TIMES):
+        growth, _, at = _parting(maps, group, at)
+        growths.append(growth)
+    with np.errstate(invalid="ignore"):
+        return np.mean(growths[1:], axis=0) > CHAOTIC_FROM
 
 
 def about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
