@@ -11,6 +11,12 @@ import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 
+# Files that take longest. They come first: one of them begun last would leave the other workers idle.
+LONGEST = (
+    "maps cycles energy tradeoff gradients attractor checkpoint notebooks verdicts simulate steppers cea properties"
+)
+LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Workers, and the processes that tests start, find compiled what one of them compiled.
@@ -22,6 +28,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.get(item.path.name, len(LONGEST)))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -12,7 +12,9 @@ REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").rea
 
 
 def paper(belt_speed: float, mu: float = 0.227, **others) -> fj.Scene:
-    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), belt_speed=belt_speed, load=fj.ConstantLoad(100.0), **others)
+    # Friction at rest is named: the block on a belt, which has another, then shares what is compiled.
+    friction = fj.Coulomb(mu, mu)
+    return fj.Scene(fj.belt_oscillator(), friction, belt_speed=belt_speed, load=fj.ConstantLoad(100.0), **others)
 
 
 def benchmark_a(belt_speed: float) -> fj.Scene:
@@ -32,8 +34,11 @@ def saddle(cycle) -> fj.LimitCycle:
 
 
 def test_block_on_a_belt_has_the_closed_form_s_period_and_multipliers():
-    """Stick and slip times follow from Δ = F_s - F_d alone; after sticking nothing is left of a deviation."""
-    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    """Stick and slip times follow from Δ = F_s - F_d alone; after sticking nothing is left of a deviation along the belt.
+
+    The paper's model on a level belt: the mass above it swings on its own, and decays by its own eigenvalues.
+    """
+    structure = fj.belt_oscillator(m1=0.9, m2=0.1, c1=0.0, c2=0.1, k1=1.0, k2=0.04, theta=0.0)
     scene = fj.Scene(structure, fj.Coulomb(0.5, mu_static=1.0), belt_speed=0.2, load=fj.ConstantLoad(1.0))
     cycle = fj.limit_cycle(scene)
     slip, stick = 2.0 * (np.pi - np.arctan(0.5 / 0.2)), 2.0 * 0.5 / 0.2
@@ -41,7 +46,9 @@ def test_block_on_a_belt_has_the_closed_form_s_period_and_multipliers():
     durations = {phase.status: phase.duration for phase in cycle.word}
     assert durations[fj.Status.STICK] == pytest.approx(stick, rel=1e-12)
     assert durations[fj.Status.SLIDE] == pytest.approx(slip, rel=1e-12)
-    np.testing.assert_allclose(cycle.multipliers, [1.0, 0.0], atol=1e-12)
+    above = np.exp(np.roots([0.9, 0.1, 0.04]) * cycle.period)
+    expected = [1.0, *above, 0.0]
+    np.testing.assert_allclose(np.sort_complex(cycle.multipliers), np.sort_complex(expected), atol=1e-12)
     assert cycle.stable
 
 
@@ -97,11 +104,11 @@ def test_the_saddle_has_one_direction_outside_and_lies_between_sliding_and_the_c
     weights = np.asarray(saddle.scene.structure.weights)
     for share, stays in ((1.02, True), (0.98, False)):
         equilibrium = saddle.state - saddle.deviation
-        run = fj.simulate(saddle.scene, t1=3.0, dt_save=0.015, y0=equilibrium + share * saddle.deviation)
+        run = fj.simulate(saddle.scene, t1=3.0, dt_save=3 / 63, y0=equilibrium + share * saddle.deviation)
         sizes = np.linalg.norm(
             weights * (np.concatenate([run.displacement, run.velocity], axis=1) - equilibrium), axis=1
         )
-        assert (sizes[-40:].max() > np.linalg.norm(weights * saddle.deviation)) == stays
+        assert (sizes[-13:].max() > np.linalg.norm(weights * saddle.deviation)) == stays
 
 
 def test_from_a_start_newton_finds_the_unstable_cycle_too(saddle):

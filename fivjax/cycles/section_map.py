@@ -146,7 +146,7 @@ def return_with_jacobian(
 ) -> tuple[Return, Float[np.ndarray, "state state"]]:
     """The return map at a point, and its derivative: saltation at each event and at the section included."""
     found, jacobian = _moved_with_jacobian(
-        scene, stepper, point, jnp.asarray(crossings, jnp.int32), jnp.asarray(jnp.inf)
+        scene, stepper, point, jnp.asarray(crossings, jnp.int32), jnp.asarray(jnp.inf, jnp.float64)
     )
     return found, np.where(found.arrived, np.asarray(jacobian), np.nan)
 
