@@ -172,12 +172,12 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
 
 def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
     structure = maps.structure
-    y, *own = (part[row] for part in closed.at)
+    y, status, direction = closed.at.y[row], closed.at.status[row], closed.at.direction[row]
     if len(structure.contacts) > 1:
         places = np.asarray(maps.tangential), np.asarray(maps.normal)
-        basis = free_directions(maps.weights, maps.section, *places, own[0])
-        return trial_of_several(y, *own, closed.jacobian[row], maps.weights, basis)
-    status, direction = int(own[0]), float(own[1])
+        basis = free_directions(maps.weights, maps.section, *places, status)
+        return trial_of_several(y, status, direction, closed.jacobian[row], maps.weights, basis)
+    status, direction = int(status), float(direction)
     free = free_on_section(structure.size, structure.tangential, structure.normal, status)
     return trial(y, status, direction, closed.jacobian[row], maps.weights, free)
 
