@@ -44,7 +44,7 @@ def parts() -> None:
 
 
 def exported() -> None:
-    """What `jax.export` would spare: three of a map's programs traced and exported, and called from what was kept (the second
+    """What `jax.export` would spare: two of a map's programs traced and exported, and called from what was kept (the second
     time with the compilation cache). Needs the package flatbuffers.
     """
     import equinox as eqx
@@ -55,7 +55,7 @@ def exported() -> None:
     from fivjax.maps import rounds, section
 
     met = {}
-    for module, name in ((rounds, "_follow_block"), (section, "_returned"), (section, "_derived")):
+    for module, name in ((rounds, "_follow_block"), (section, "moved_in_windows")):
         function = getattr(module, name)
 
         def noting(*given, function=function, name=name):

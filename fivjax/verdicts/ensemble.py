@@ -25,7 +25,7 @@ RELEASES = np.linspace(1.5, 6.0, 8)
 SEEN = 4
 # When an ensemble is asked whether it has met, in looks, multiples of `SEEN`; later ones are not waited for. Second, of an
 # ensemble about a motion that has asked for an attractor of its own: it may be one that closes in slowly.
-TESTS, TESTS_ALONE = (64, 96, 128), (64, 96, 128, 256, 512)
+TESTS, TESTS_ALONE = (64, 96, 128), (64, 128, 512)
 # The stretches of its looks that are compared: whether in the later one all are where others were in the earlier one.
 EARLIER, LATER = (0.5, 0.7), (0.8, 1.0)
 # Of its states, so many have to be where others were.
