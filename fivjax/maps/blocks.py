@@ -13,7 +13,7 @@ import numpy as np
 from .flattened import Flattened
 
 # Trajectories that a block holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
-BLOCK_ON_CPU = 128
+BLOCK_ON_CPU = 64
 LARGE_BLOCK_ON_CPU = 512
 # Of several contacts each trajectory is more work, and a block that is filled up with copies costs as much as a full one.
 BLOCK_OF_SEVERAL = 16

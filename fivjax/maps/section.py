@@ -26,7 +26,7 @@ from .sharing import Batch
 from .windowed_returns import KEPT, MOST_WINDOWS, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
 
 # States in a block: few, because often there are few.
-BLOCK = 64
+BLOCK = 32
 DERIVED_BLOCK = 16
 # Of central differences, relative to a state's size: the third root of rounding.
 STEP = 5e-6
