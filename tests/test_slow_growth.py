@@ -112,3 +112,42 @@ def test_on_a_locked_torus_the_amplitude_is_that_of_its_cycle():
     decided = m["verdict"].values == 1
     assert decided.sum() >= 4
     np.testing.assert_allclose(m["amplitude"].values[decided], fate.amplitude[decided], rtol=1e-2)
+
+
+# A cycle of one short touch a period, whose time constant is 1,800 periods; one that lifts off, found from the onset of its first
+# event; a torus a few hundredths wide. Friction, belt speed, kicks; the structure.
+SLOW = {
+    "a cycle that attracts slowly": (
+        (0.039042867658149134, 5.240221755080958, [0.3763075354246095, 4.611101993377526]),
+        dict(m1=0.9498013104992278, m2=0.8034789625904883, k1=407483.1608171772, k2=214767.89586403337,
+             theta=0.02002058537285789, c1=22.985512428437602, c2=1.8983930166795349),
+    ),
+    "a cycle beyond the onset of its events": (
+        (0.09286283523118123, 15.778846006874788, [0.602833738504118, 3.6833699736182215]),
+        dict(m1=0.28923115318311, m2=0.007397071716866399, k1=224572.29431864296, k2=171648.886594073,
+             theta=0.01426321272902244, c1=0.2688457494194192, c2=11.422220029111738),
+    ),
+    "a thin torus": (
+        (0.5065308118559424, 49.79692834858053, [0.09230592716662, 1.816241815461404]),
+        dict(m1=1.1176207114545733, m2=0.03274928366647023, k1=761593.9770259093, k2=637826.5965089685,
+             theta=0.005529029848588996, c1=0.7055260454187169, c2=8.888514758251837),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not reference.available(), reason="needs a C++ compiler")
+@pytest.mark.parametrize("name", SLOW)
+def test_attractors_that_take_thousands_of_periods_are_decided(name):
+    """The version before left all of these undecided; the independent solver has the amplitudes after 10,000 periods."""
+    (mu, belt_speed, p), parts = SLOW[name]
+    scene = fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(mu), belt_speed, fj.Pulse(100.0, 1.0, 0.1))
+    m = fj.bistability_map(scene, p=p, progress=False)
+    fate = reference.fate([{**reference.of_scene(scene), "p": one} for one in p])
+    assert m["verdict"].values.tolist() == [1, 1]
+    assert set(fate.fate) == {"sustained"}
+    # Motions that grow slowly may not have had their first event by then.
+    there = fate.late_events > 0
+    assert there.any()
+    np.testing.assert_allclose(m["amplitude"].values[there], fate.amplitude[there], rtol=5e-3)
+    assert not m["chaotic"].values.any()

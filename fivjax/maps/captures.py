@@ -23,7 +23,7 @@ CROSSINGS, MORE_CROSSINGS = 8, 40
 # A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
 # neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
 WEAKLY, SMALLEST_OF_MANY = 0.95, 1e-3
-NEWTON_STEPS, MISSES = 12, 2
+NEWTON_STEPS, MISSES = 14, 3
 # Points of the section that a group nominates at a time.
 NOMINATED = 2
 # The same cycle: a state this close to one of its own, relative to their size.

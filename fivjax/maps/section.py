@@ -129,6 +129,13 @@ class ReturnMaps:
         derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
         return base, image.time[:count], derivatives
 
+    def peaks_and_ends(self, group, at: Section, crossings) -> tuple[Float[np.ndarray, " m"], Section]:
+        """`peaks`, and where the motions are then."""
+        if self.windows is None:
+            return self.peaks(group, at, crossings), self.returns(group, at, crossings).at
+        *found, peak = self._in_windows(group, at, crossings)
+        return peak, Section(*found[:3])
+
     def _in_windows(self, group, at: Section, crossings):
         rows = _rows(at, crossings)
         return in_blocks(moved_in_windows, self.windows, group, rows, SIDE_BY_SIDE, self.pool, size=self.block).tree

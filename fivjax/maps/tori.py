@@ -24,8 +24,9 @@ LOCKED = -0.01
 PARTING_TIMES, CHAOTIC_FROM = 4, 0.03
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
-# They then settle for so many returns more, and the largest speed in so many after these is the torus' amplitude.
-SETTLE_OVER, PEAK_OVER = 160, 32
+# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share while the motions
+# settled for so many returns. Else they settle again, so often at most: a set whose amplitude still drifts is not accepted.
+PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 32, 128, 1e-3, 12
 
 
 class Torus(NamedTuple):
@@ -69,8 +70,7 @@ def tori_among(
     if not len(kept):
         return {}, cycles
     rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
-    settled = maps.returns(group[rows], later.rows(rows), SETTLE_OVER).at
-    peak = np.max(maps.peaks(group[rows], settled, PEAK_OVER).reshape(-1, FURTHER), axis=1)
+    peak = _settled_peak(maps, group[rows], later.rows(rows))
     tori = {}
     for k, mean, highest in zip(kept, period[kept], peak, strict=True):
         place, states = sets[back[k]]
@@ -126,6 +126,26 @@ def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
             growth = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
             beside = at.y + APART * size * away / distance / weights
     return growth, time / (2 * PARTING_OVER), at
+
+
+def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t"]:
+    """The largest tangential speed (m/s) of motions on tori, `FURTHER` on each; not a number where it does not settle."""
+    peak, last = np.full(len(group) // FURTHER, np.nan), np.full(len(group) // FURTHER, np.nan)
+    running = np.arange(len(peak))
+    for _ in range(SETTLE_TIMES):
+        rows = (FURTHER * running[:, None] + np.arange(FURTHER)).ravel()
+        highest, end = maps.peaks_and_ends(group[rows], at.rows(rows), PEAK_OVER)
+        now = np.max(highest.reshape(-1, FURTHER), axis=1)
+        done = np.abs(now / last[running] - 1) <= SETTLED
+        peak[running[done]], last[running] = now[done], now
+        left = np.repeat(~done & np.isfinite(now), FURTHER)
+        running = running[~done & np.isfinite(now)]
+        if not len(running):
+            break
+        settled = maps.returns(group[rows[left]], end.rows(left), SETTLE_OVER).at
+        for whole, part in zip(at, settled, strict=True):
+            whole[rows[left]] = part
+    return peak
 
 
 def is_chaotic(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Bool[np.ndarray, " m"]:
