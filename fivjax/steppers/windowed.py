@@ -150,7 +150,7 @@ def _advance(
     def peak_near_fastest():
         sample = window.fastest(interval)
         about = stacked(mechanics, contact, load, window.state_at(sample))
-        speed = Series(prepared.series @ about, there, exact, n).speed(mechanics.tangential)
+        speed = Series(prepared.series @ about, series.sizes, exact, n).speed(mechanics.tangential)
         return highest(speed, jnp.maximum(-1.0 * sample, -1.0), interval + share - sample) / prepared.interval
 
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
