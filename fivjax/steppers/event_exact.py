@@ -93,7 +93,7 @@ class EventExact(AbstractStepper):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
-        unit = _time_unit(mechanics)
+        unit = time_unit(mechanics)
         states, guards, mode = _series(mechanics, contact, load, y, self.order_, unit)
         rounding = _rounding(mechanics, contact, load, y, unit, mode)
         # Of several contacts the two guards of the first come first, then those of the second, …
@@ -140,7 +140,7 @@ class EventExact(AbstractStepper):
     ) -> Within:
         # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
         # product of two series is integrated with an error far below that of the series itself.
-        unit = _time_unit(mechanics)
+        unit = time_unit(mechanics)
         states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
         times = 0.5 * (points + 1.0) * h
@@ -152,7 +152,7 @@ class EventExact(AbstractStepper):
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
     ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
         """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
-        unit = _time_unit(mechanics)
+        unit = time_unit(mechanics)
         states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         return jnp.stack(states), unit
 
@@ -165,7 +165,7 @@ class EventExact(AbstractStepper):
         load: Float[Array, ""] | float = 0.0,
     ) -> State:
         """The motion in one contact mode for a time `h` (s, of either sign) under a load (N), whatever its guards say."""
-        unit = _time_unit(mechanics)
+        unit = time_unit(mechanics)
         load = jnp.asarray(load, y.dtype)
 
         def step(carry):
@@ -182,7 +182,7 @@ class EventExact(AbstractStepper):
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
 
 
-def _time_unit(mechanics: Mechanics) -> Float[Array, ""]:
+def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
 
     In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
