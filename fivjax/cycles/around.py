@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation.compiling import compiled, power_of_4
+from ..foundation.polynomial import extremum, value_and_slope
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
@@ -107,25 +108,12 @@ def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: C
 
 
 def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
-    def derivatives(x):
-        value = slope = bend = jnp.zeros_like(x)
-        for c in speeds[::-1]:
-            bend = bend * x + slope
-            slope = slope * x + value
-            value = value * x + c
-        return value, slope, 2 * bend
-
     samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
-    values, _, _ = jax.vmap(derivatives)(samples)
-
-    def newton(_, x):
-        _, slope, bend = derivatives(x)
-        return jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), 0.0, end)
-
-    # A loop, because its body is compiled once. Where the peak is does not matter to the first order.
+    values, _ = value_and_slope(speeds, samples)
+    # Where the peak is does not matter to the first order.
     largest = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
-    x = jax.lax.stop_gradient(jax.lax.fori_loop(0, PEAK_STEPS, newton, largest))
-    refined, _, _ = derivatives(x)
+    x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, end, PEAK_STEPS))
+    refined, _ = value_and_slope(speeds, x)
     ends = jnp.stack([jnp.max(jnp.abs(values)), jnp.abs(refined)])
     return jnp.where(h > 0, jnp.max(ends), 0.0)
 

@@ -26,6 +26,8 @@ from ..steppers.event_exact import EventExact, time_unit
 
 # Segments on the way from one point of the section to the next, at most: hundreds of events in one swing.
 MOST_SEGMENTS = 4096
+# The same on the way to a later one.
+MOST_TO_CROSSING = 64 * MOST_SEGMENTS
 
 
 class Point(eqx.Module):
@@ -123,7 +125,7 @@ def moved(
         return events + jnp.any(segment.after.ended), segments + 1
 
     crossed, after, (events, segments) = to_crossing(
-        stepper, mechanics, start, crossings, longest, (none, none), observe, 64 * MOST_SEGMENTS
+        stepper, mechanics, start, crossings, longest, (none, none), observe, MOST_TO_CROSSING
     )
     arrived = crossed & jnp.all(jnp.isfinite(after.y))
     return Return(Point(after.y, after.contact), longest - after.left, events, segments, arrived)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -17,6 +18,17 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
     """A polynomial and its first two derivatives."""
     value, slope, bend = _with_derivatives(c, x, 2)
     return value, slope, bend
+
+
+def extremum(c: Sequence[Array] | Array, x: Array, low: Array | float, high: Array, steps: int) -> Array:
+    """Where a polynomial's slope is zero, by so many steps of Newton's method from `x`, kept between `low` and `high`."""
+
+    def nearer(_, x):
+        _, slope, bend = value_slope_and_bend(c, x)
+        return jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), low, high)
+
+    # A loop, because its body is compiled once.
+    return jax.lax.fori_loop(0, steps, nearer, x)
 
 
 def _with_derivatives(c: Sequence[Array] | Array, x: Array, count: int) -> list[Array]:

@@ -154,8 +154,7 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         usable = np.isfinite(missed) & np.all(np.isfinite(derived), axis=(1, 2))
         better &= alike & usable
         rows = running[better]
-        for whole, part in zip(best, at, strict=True):
-            whole[rows] = part[better]
+        best.put(rows, at.rows(better))
         closure[rows], jacobian[rows], period[rows] = missed[better], derived[better], time[better]
         misses[running] += ~better
         matrices = np.where(usable[:, None, None], np.eye(n) - derived, np.eye(n))
@@ -164,8 +163,7 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         stepped = at.y + np.linalg.solve(matrices, np.where(usable[:, None], gap, 0.0)[..., None])[..., 0]
         # Where the section is met in another mode, what is sought has that mode.
         following = Section(np.where(alike[:, None], stepped, image.y), image.status, image.direction)
-        for whole, part in zip(here, following, strict=True):
-            whole[running] = part
+        here.put(running, following)
         running = running[usable & solvable & ~(better & (missed <= EXACT)) & (misses[running] < MISSES)]
     return _Closed(best, closure, jacobian, period)
 

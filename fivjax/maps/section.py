@@ -1,7 +1,8 @@
 """The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
 
 The programs here know nothing of a map's axes: all maps of structures of one size and friction of one kind share them. Where
-the trajectories of a map are followed in windows, so are these motions; but for derivatives, which a window does not have.
+the trajectories of a map are followed in windows, so are these motions; derivatives, which a window does not have, are then
+differences.
 """
 
 from typing import NamedTuple
@@ -11,19 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..contact import Contact, Status
+from ..contact import Contact
 from ..cycles.around import peak_speed_along
-from ..cycles.section_map import MOST_SEGMENTS, Point, moved, to_crossing
+from ..cycles.section_map import MOST_SEGMENTS, MOST_TO_CROSSING, Point, moved, to_crossing
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact
 from ..steppers.section import section_weights
 from ..steppers.windowed import Windowed
+from ..verdicts.capture import free_on_section
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .sharing import Batch
-from .windowed_returns import KEPT, MOST_WINDOWS, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
+from .windowed_returns import KEPT, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
 
 # States in a block: few, because often there are few.
 BLOCK = 32
@@ -41,6 +43,11 @@ class Section(NamedTuple):
 
     def rows(self, chosen) -> "Section":
         return Section(*(part[chosen] for part in self))
+
+    def put(self, chosen, rows: "Section") -> None:
+        """Writes these rows to the chosen places."""
+        for whole, part in zip(self, rows, strict=True):
+            whole[chosen] = part
 
 
 class Images(NamedTuple):
@@ -108,10 +115,9 @@ class ReturnMaps:
     def _differences(self, group, at: Section, crossings):
         """By central differences: the same program as everything else; neighbourhoods are checked by the map itself."""
         count, size = at.y.shape
-        free = np.ones((count, size), bool)
-        free[:, self.structure.size + self.tangential] = False
-        touches = at.status != Status.DETACH
-        free[touches, self.normal] = free[touches, self.structure.size + self.normal] = False
+        free = np.zeros((count, size), bool)
+        for own, status in zip(free, at.status, strict=True):
+            own[free_on_section(self.structure.size, self.tangential, self.normal, int(status))] = True
         lengths = STEP * np.linalg.norm(self.weights * at.y, axis=1)
         row, place = np.nonzero(free)
         step = lengths[row] / self.weights[place]
@@ -175,7 +181,7 @@ def _with_path(shared, y, status, direction, crossings):
     nothing = jnp.zeros((), jnp.int32), no_path(y)
     longest = longest * crossings
     crossed, after, (events, path) = to_crossing(
-        EventExact(), mechanics, point, crossings, longest, nothing, observe, MOST_WINDOWS
+        EventExact(), mechanics, point, crossings, longest, nothing, observe, MOST_TO_CROSSING
     )
     y = jnp.where(crossed & jnp.all(jnp.isfinite(after.y)), after.y, jnp.nan)
     return y, after.contact.status, after.contact.direction, events, longest - after.left, path

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from ..contact import Status
 from ..verdicts import tube
 from ..verdicts.tube_of_several import starts_of_several
-from .captures import MORE_CROSSINGS, Cycle, stable_cycles
+from .captures import MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .section import ReturnMaps, Section
 from .windowed_returns import KEPT
 
@@ -56,7 +56,7 @@ def tori_among(
     group, at = own[chosen // tube.STARTS], last.rows(chosen)
     growth, period, later = _parting(maps, group, at)
     growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
-    closing_in = np.flatnonzero(np.repeat(growth < LOCKED, FURTHER))[::4]
+    closing_in = np.flatnonzero(np.repeat(growth < LOCKED, FURTHER))[:: FURTHER // NOMINATED]
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
     if len(closing_in):
@@ -91,8 +91,7 @@ def _back(
     for _ in range(0, within, KEPT):
         report(0)
         image = maps.returns(own[running], last.rows(running), KEPT)
-        for whole, part in zip(last, image.at, strict=True):
-            whole[running] = part
+        last.put(running, image.at)
         ends = weights * np.moveaxis(image.path, 1, 0)
         # One that fades, or fails, does not come back.
         with np.errstate(invalid="ignore"):
@@ -138,13 +137,11 @@ def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t
         now = np.max(highest.reshape(-1, FURTHER), axis=1)
         done = np.abs(now / last[running] - 1) <= SETTLED
         peak[running[done]], last[running] = now[done], now
-        left = np.repeat(~done & np.isfinite(now), FURTHER)
-        running = running[~done & np.isfinite(now)]
+        open_ = ~done & np.isfinite(now)
+        running, left = running[open_], np.repeat(open_, FURTHER)
         if not len(running):
             break
-        settled = maps.returns(group[rows[left]], end.rows(left), SETTLE_OVER).at
-        for whole, part in zip(at, settled, strict=True):
-            whole[rows[left]] = part
+        at.put(rows[left], maps.returns(group[rows[left]], end.rows(left), SETTLE_OVER).at)
     return peak
 
 

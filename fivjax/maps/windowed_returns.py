@@ -7,15 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact
-from ..cycles.section_map import MOST_SEGMENTS
+from ..cycles.section_map import MOST_TO_CROSSING
 from ..foundation.compiling import compiled
 from ..steppers.windowed import Windowed
 from .flattened import Flattened, flatten
 
 # Motions of one group in a row.
 SIDE_BY_SIDE = 8
-# Windows on the way, at most: as many as `section_map.moved` takes segments.
-MOST_WINDOWS = 64 * MOST_SEGMENTS
 # States on the section that are kept of a motion, the last ones.
 KEPT = 16
 
@@ -68,7 +66,7 @@ def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
 
     def any_going(carry):
         count, (_, _, left, crossed, *_) = carry
-        return (count < MOST_WINDOWS) & jnp.any(going(left, crossed))
+        return (count < MOST_TO_CROSSING) & jnp.any(going(left, crossed))
 
     time, none = longest[:, None] * crossings, jnp.zeros(crossings.shape, jnp.int32)
     begin = y, Contact(status.astype(jnp.int32), direction), time, none, none, no_path(y), jnp.zeros_like(time)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..foundation.compiling import computed_once
-from ..foundation.polynomial import value_and_slope, value_slope_and_bend
+from ..foundation.polynomial import extremum, value_and_slope, value_slope_and_bend
 from .propagation import ORDER
 from .window import Bracket, Series
 
@@ -91,12 +91,7 @@ def first_rise(
 
 def highest(c: Float[Array, "k l"], low: Float[Array, " l"], high: Float[Array, " l"]) -> Float[Array, " l"]:
     """The largest size of a polynomial near zero, between `low` and `high`, one of which is zero or on either side of it."""
-
-    def nearer(_, x):
-        _, slope, bend = value_slope_and_bend(c, x)
-        return jnp.clip(x - slope / jnp.where(bend == 0, 1.0, bend), low, high)
-
-    x = jax.lax.fori_loop(0, PEAK_STEPS, nearer, jnp.zeros_like(high))
+    x = extremum(c, jnp.zeros_like(high), low, high, PEAK_STEPS)
     return jnp.maximum(jnp.abs(c[0]), jnp.abs(value_and_slope(c, x)[0]))
 
 
