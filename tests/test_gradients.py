@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import measure_gradients as measure
 import numpy as np
 import pytest
+import scipy.linalg
 from gradient_reference import point_mass
 
 import fivjax as fj
@@ -147,6 +148,27 @@ def test_an_event_at_the_very_end_has_no_derivative(late, exist):
 def test_quiet_motion_has_derivatives_and_says_so():
     d = fj.derivatives(measure.last_state, measure.paper(p=1.0), ["p"], 0.05, 0.05, method=FEW)
     assert d.exist and d.events == 0
+
+
+def test_a_mode_at_rest_is_differentiated_in_steps_of_its_own():
+    """The block rides the belt, a straight line that any step follows; the mass above it rests, and answers more load by a vibration.
+
+    The closed form is the step response of that mass alone. One row is saved: the steps in between are the method's.
+    """
+    structure = fj.belt_oscillator(m1=0.9, m2=0.1, c1=0.0, c2=0.1, k1=1.0, k2=1.0, theta=0.0)
+    scene = fj.Scene(structure, fj.Coulomb(0.5, mu_static=1.0), belt_speed=0.2, load=fj.ConstantLoad(1.0))
+    riding = ([-0.4, -1.0, 0.0], [0.2, 0.0, 0.0])
+    d = fj.derivatives(measure.last_state, scene, ["force"], END, END, y0=riding, method=FEW)
+    rates = np.array([[0.0, 1.0], [-1.0 / 0.9, -0.1 / 0.9]])
+    answer = np.linalg.solve(rates, (scipy.linalg.expm(END * rates) - np.eye(2)) @ [0.0, -1.0 / 0.9])
+    np.testing.assert_allclose(d["force"], [0.0, answer[0], 0.0, 0.0, answer[1], 0.0], rtol=0, atol=1e-12)
+
+
+def test_a_run_that_did_not_reach_its_end_has_no_derivatives():
+    """Too few rows for the steps in between: the value is not finite, and a derivative of zero would be false."""
+    scene = fj.Scene(point_mass(1e6), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
+    d = fj.derivatives(measure.last_state, scene, ["mu"], END, END, y0=([1.0, 0.0], [0.0, 0.0]), method=FEW)
+    assert not d.exist and np.all(np.isnan(d["mu"])) and "not finite" in d.reason
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment, follow
+from ..steppers.event_exact import for_derivatives
 
 # From its first, arbitrary state a motion is followed for so many periods before it is taken for nearly periodic.
 SETTLING_PERIODS = 80
@@ -94,7 +95,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable, forward."""
     mechanics, load = Mechanics(scene), scene.load.final
-    codes = jnp.array([Status.STICK, Status.DETACH])
+    method, codes = for_derivatives(method, mechanics), jnp.array([Status.STICK, Status.DETACH])
 
     def add(total, segment: Segment):
         lines, spent = total

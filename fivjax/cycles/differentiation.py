@@ -6,19 +6,20 @@ $l^H (dJ/dθ)\, r / l^H r$. Event times are differentiated implicitly all throug
 never the way to the cycle. At a grazing event, and at a fold, there is no derivative.
 """
 
+import math
 from collections.abc import Iterable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from .around import once_around, peak_speed, seen_around
 from .cycle import LimitCycle, point_of
 from .section_map import Point, mechanics_about_sliding, section_return, sliding_state
@@ -70,6 +71,7 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
     stepper, point = EventExact(), point_of(cycle)
     arguments.truth("multipliers", multipliers)
     segments = int(seen_around(cycle.scene, stepper, point, cycle.period, 60).segments.count)
+    segments += math.ceil(cycle.period / float(_step(cycle.scene, stepper)))
     correction = jnp.linalg.inv(jnp.eye(len(point.y)) - jnp.asarray(cycle.return_jacobian))
     slopes = _slopes(
         cycle.scene,
@@ -95,6 +97,11 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
 
 
 @compiled
+def _step(scene: Scene, stepper: EventExact) -> Float[Array, ""]:
+    return jnp.asarray(for_derivatives(stepper, mechanics_about_sliding(scene)).dt)
+
+
+@compiled
 def _slopes(
     scene: Scene,
     stepper: EventExact,
@@ -108,9 +115,10 @@ def _slopes(
     def of(values):
         own = scene.replace(**dict(zip(names, values, strict=True)))
         mechanics = mechanics_about_sliding(own)
+        short = for_derivatives(stepper, mechanics)
 
         def image(y):
-            return section_return(stepper, own, mechanics, Point(y, point.contact), crossings)
+            return section_return(short, own, mechanics, Point(y, point.contact), crossings)
 
         # One step of Newton's method from the root: the same root, with its derivative. A second one makes the derivative of
         # what is a derivative itself, the return map's, right.
@@ -123,8 +131,8 @@ def _slopes(
         if twice:
             units = jnp.eye(len(y), dtype=y.dtype)
             jacobian = jax.vmap(lambda unit: jax.jvp(lambda y: image(y).point.y, (y,), (unit,))[1], out_axes=1)(units)
-        around = once_around(stepper, mechanics, Point(y, point.contact), back.time, most)
-        peak = peak_speed(stepper, mechanics, around)
+        around = once_around(short, mechanics, Point(y, point.contact), back.time, most)
+        peak = peak_speed(short, mechanics, around)
         return back.time, peak, y + sliding_state(own, own.load.final), jacobian
 
     values = jnp.stack([jnp.asarray(scene.parameters[name]) for name in names])

@@ -13,7 +13,7 @@ from ..foundation.compiling import compiled
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.core import Segment, follow
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from .multiple_shooting import parameter_direction
 from .section_map import MOST_SEGMENTS, Point, longest_return, mechanics_about_sliding
 
@@ -91,12 +91,13 @@ def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, 
         load = scene.load
         assert isinstance(load, Pulse)
         mechanics = mechanics_about_sliding(scene)
+        short = for_derivatives(stepper, mechanics)
         # Loads are deviations, too.
         more = (load.p - 1.0) * load.force
         begin = physics.status_from_forces(mechanics, more, y)
         quiet = load.duration <= 0
         begin = jax.tree.map(lambda a, b: jnp.where(quiet, a, b), start.contact, begin)
-        after = follow(stepper, mechanics, begin, more, y, load.duration, most=64 * MOST_SEGMENTS, kind="lax")
+        after = follow(short, mechanics, begin, more, y, load.duration, most=64 * MOST_SEGMENTS, kind="lax")
         empty = _Record(
             jnp.full((most, len(y)), jnp.nan),
             Contact(jnp.zeros(most, jnp.int32), jnp.ones(most)),
@@ -105,7 +106,7 @@ def _kicked(scene: Scene, stepper: EventExact, directions: Scene, start: Point, 
             jnp.zeros((), jnp.int32),
         )
         found = follow(
-            stepper,
+            short,
             mechanics,
             after.contact,
             jnp.zeros_like(more),

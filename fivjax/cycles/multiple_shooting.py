@@ -22,7 +22,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation.compiling import compiled, power_of_4
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from .around import Round
 from .section_map import mechanics_about_sliding
 
@@ -133,7 +133,7 @@ def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, follow
 @compiled
 def _images(scene, direction, stepper, y, h, status, pointing, ending, next_status, next_pointing):
     mechanics, mechanics_direction = jax.jvp(mechanics_about_sliding, (scene,), (direction,))
-    n2 = y.shape[1]
+    n2, stepper = y.shape[1], for_derivatives(stepper, mechanics)
     # Directions of the derivatives: the state's, the duration's, the parameter's.
     eye = jnp.eye(n2 + 2, dtype=y.dtype)
 

@@ -22,7 +22,7 @@ from ..contact import Contact, Mechanics, Rest, State
 from ..foundation.compiling import compiled
 from ..model.scene import Scene, steady_sliding
 from ..steppers.core import Followed, Segment, Total, follow
-from ..steppers.event_exact import EventExact, time_unit
+from ..steppers.event_exact import EventExact, for_derivatives
 
 # Segments on the way from one point of the section to the next, at most: hundreds of events in one swing.
 MOST_SEGMENTS = 4096
@@ -167,8 +167,7 @@ def flow_with_jacobian(
 def _moved_with_jacobian(scene: Scene, stepper: EventExact, point: Point, crossings, time):
     mechanics = mechanics_about_sliding(scene)
     longest = jnp.minimum(time, longest_return(scene) * crossings)
-    # A series is trusted as far as the motion allows. Where a mode rests, that is farther than its deviations would.
-    stepper = eqx.tree_at(lambda s: s.dt, stepper, jnp.minimum(stepper.dt, time_unit(mechanics)))
+    stepper = for_derivatives(stepper, mechanics)
 
     def along(direction):
         def state(y):

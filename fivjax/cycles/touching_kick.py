@@ -24,7 +24,7 @@ from ..foundation.precision import in_double_precision
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.core import Segment, follow
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from .kick_response import directions_of
 from .section_map import MOST_SEGMENTS, longest_return, mechanics_about_sliding
 
@@ -183,12 +183,13 @@ def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, ev
 def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene, time, events, guard):
     def of(scene: Scene, time: Float[Array, ""]) -> Float[Array, ""]:
         mechanics, contact, more, y = _begun(scene)
+        short = for_derivatives(stepper, mechanics)
         duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
         in_kick = jnp.minimum(time, duration)
         none = jnp.zeros_like(more)
         for h, load in ((in_kick, more), (time - in_kick, none)):
             after = follow(
-                stepper,
+                short,
                 mechanics,
                 contact,
                 load,
@@ -201,7 +202,7 @@ def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene
                 kind="lax",
             )
             # The last event is behind: on in this mode, whatever its guards say.
-            y = stepper.in_one_mode(mechanics, after.contact, after.y, after.left, load)
+            y = short.in_one_mode(mechanics, after.contact, after.y, after.left, load)
             contact, happened = after.contact, after.total
         guards = physics.guards(mechanics, contact, jnp.where(time < duration, more, none), y)
         return guards.reshape(-1)[guard]

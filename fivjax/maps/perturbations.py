@@ -19,7 +19,7 @@ from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import sliding_states
 from ..steppers.core import follow
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 
 # Instants in a period of the fastest mode, while a history lasts and afterwards.
@@ -258,6 +258,7 @@ def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
 def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
     """The state after a history of the load, from steady sliding on."""
     mechanics, n = mechanics_about_sliding(scene), scene.structure.size
+    stepper = for_derivatives(stepper, mechanics)
 
     def piece(carry, factor):
         y, contact = carry

@@ -18,7 +18,7 @@ from ..cycles.section_map import MOST_SEGMENTS, MOST_TO_CROSSING, Point, moved, 
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import section_weights
 from ..steppers.windowed import Windowed
 from ..verdicts.capture import free_on_section
@@ -164,7 +164,7 @@ def _images(found) -> Images:
 def _arrived(shared, y, status, direction, crossings):
     mechanics, longest = shared
     point = Point(y, Contact(status.astype(jnp.int32), direction))
-    found = moved(EventExact(), mechanics, point, crossings, longest * crossings)
+    found = moved(for_derivatives(EventExact(), mechanics), mechanics, point, crossings, longest * crossings)
     y = jnp.where(found.arrived, found.point.y, jnp.nan)
     return y, found.point.contact.status, found.point.contact.direction, found.time
 

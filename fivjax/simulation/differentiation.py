@@ -47,6 +47,11 @@ class Derivatives(eqx.Module):
     @property
     def reason(self) -> str:
         """Why the derivatives exist or do not, as a sentence."""
+        if not _finite(self.value):
+            return (
+                "No derivative can be relied on: the value itself is not finite. Where the run ends early, "
+                "`fj.simulate(...).meaning` says why; more saved rows, a smaller `dt_save`, allow more steps."
+            )
         if not np.isfinite(self.closest):
             return "The derivatives exist: no contact event comes anywhere near."
         where = (
@@ -120,14 +125,19 @@ def derivatives(
     given = None if y0 is None else begin
     value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
     calls = closest_call(scene, method, begin, float(t1))
+    value = jax.tree.map(known_to_numpy, value)
     return Derivatives(
-        value=jax.tree.map(known_to_numpy, value),
-        by_name={name: jax.tree.map(known_to_numpy, found) for name, found in by_name.items()},
+        value=value,
+        # What was not reached does not depend on anything, as JAX sees it; that is no derivative of zero.
+        by_name={
+            name: jax.tree.map(lambda slope, of: np.where(np.isfinite(of), known_to_numpy(slope), np.nan), found, value)
+            for name, found in by_name.items()
+        },
         events=calls.events,
         closest=calls.closest,
         closest_at=calls.at,
         closest_event=calls.event,
-        exist=bool(calls.closest > margin),
+        exist=bool(calls.closest > margin) and _finite(value),
     )
 
 
@@ -141,6 +151,10 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
     found, value = jacobian(of, has_aux=True)({name: scene.parameters[name] for name in names})
     # A functional of several numbers has the parameters innermost.
     return value, {name: _of_parameter(found, name) for name in names}
+
+
+def _finite(value) -> bool:
+    return all(bool(np.all(np.isfinite(leaf))) for leaf in jax.tree.leaves(value))
 
 
 def _of_parameter(found, name: str):

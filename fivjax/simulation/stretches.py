@@ -39,7 +39,7 @@ class Begin(eqx.Module):
 End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
 
 
-def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str = "both") -> End:
+def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
     """State, contact and ledger after `begin.h`; last, whether `most` advances were enough."""
     if derivatives != "reverse":
         return _advances(begin, method, most, "bounded" if derivatives == "both" else "lax")

@@ -29,7 +29,7 @@ from ..model.scene import Scene, refuse_painleve
 from ..model.sliding import contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
-from ..steppers.event_exact import EventExact
+from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .compiled_sizes import compiled_rows, compiled_steps, with_step_as_array
 from .ending import ENDING, GROWTH, Ending
@@ -189,16 +189,16 @@ def simulate(
     y0 = start_state(scene, y0)
     # Events cut advances short, so there may be more of them than it takes to span the interval.
     steps = math.ceil(dt_save / method.dt - 1e-9)
-    count = rows + 1
+    modes, count = derivatives, rows + 1
     # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled, and of steps.
     if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
-        derivatives, count = "forward", compiled_rows(rows + 1)
+        modes, count = None, compiled_rows(rows + 1)
         steps = compiled_steps(steps)
     most = steps + MOST_ADVANCES
     # With NumPy, and not one small compiled program for each operation.
     instants = np.arange(count)
     saved = real(np.where(instants < rows, np.minimum(float(dt_save) * instants, float(t1)), float(t1)))
-    found = _simulate(scene, with_step_as_array(method), y0, saved, most, bool(energy), derivatives)
+    found = _simulate(scene, with_step_as_array(method), y0, saved, most, bool(energy), modes)
     # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
     grown = found.pop("grown")
@@ -291,11 +291,11 @@ def _simulate(
     saved: Float[Array, " T"],
     most: int,
     energy: bool,
-    derivatives: str,
+    modes: str | None,
 ) -> dict:
     mechanics = Mechanics(scene)
     books = Books(scene) if energy else None
-    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, derivatives)
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, modes)
     load = jax.vmap(scene.load)(saved)
     # What follows a number that was not reached is none either, also where the contact would hold it at zero.
     finite = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
@@ -350,15 +350,18 @@ def states_at(
     instants: Float[Array, " T"],
     most: int,
     books: Books | None = None,
-    derivatives: str = "both",
+    derivatives: str | None = None,
 ) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
     """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
     where `most` advances between two of them were not enough.
 
-    Differentiable in the instants and in the load's jumps too; in "both" modes, or faster in "forward" or "reverse" mode
-    alone. In reverse mode only the states at the instants are kept; what lies between is computed again.
+    Differentiable, in the instants and in the load's jumps too, in "both" modes, or faster in "forward" or "reverse" mode
+    alone; unless asked for, not at all. In reverse mode only the states at the instants are kept; what lies between is
+    computed again.
     """
     mechanics = Mechanics(scene)
+    if derivatives is not None:
+        method = for_derivatives(method, mechanics)
     # Steps end on the load's jumps as well as on the instants.
     jumps = scene.load.jumps
     inside = (jumps >= instants[0]) & (jumps <= instants[-1])

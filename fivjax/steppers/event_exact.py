@@ -6,7 +6,7 @@ friction, so the same functions map Taylor coefficients to Taylor coefficients.
 """
 
 import math
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -25,6 +25,8 @@ from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
 from .section import before_section, section_speed
+
+Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
 # No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
 # Powers of a longer one would be out of range.
@@ -172,6 +174,7 @@ class EventExact(AbstractStepper):
             y, left, _ = carry
             states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
             trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), LONGEST_STEP) * unit)
+            trusted = jnp.minimum(trusted, self.dt)
             last = jnp.abs(left) <= trusted
             part = jnp.where(last, left, jnp.sign(left) * trusted)
             reached, _ = value_and_slope(states, part / unit)
@@ -191,6 +194,19 @@ def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     rate = jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(positions))), jnp.max(jnp.abs(velocities)))
     _, exponent = jnp.frexp(rate)
     return jnp.ldexp(jnp.ones_like(rate), -exponent)
+
+
+def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
+    """The stepper with steps as short as deviations from the motion need.
+
+    A series is trusted as far as the *motion* allows. Where a mode rests that is far, too far for a deviation in that mode.
+    Its fastest possible vibration, of one rad in a unit of time, leaves a term of 1 / (order + 1)!.
+    """
+    if not isinstance(stepper, EventExact):
+        return stepper
+    after = stepper.order_ + 1
+    allowed = min(1.0, (stepper.tolerance * math.factorial(after)) ** (1.0 / after))
+    return eqx.tree_at(lambda own: own.dt, stepper, jnp.minimum(stepper.dt, allowed * time_unit(mechanics)))
 
 
 def _series(
