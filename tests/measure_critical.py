@@ -99,17 +99,30 @@ def derivatives() -> None:
             value, slope = float(scene.parameters[name]), float(found.d_p_crit.sel(parameter=name))
             # So little that p_crit stays smooth (further away another swing touches first), and far above its rounding.
             by = min(1e-3 * (abs(value) or 1.0), 2e-6 / max(abs(slope), 1e-12))
-            kicks = []
-            for side in (-by, by):
-                if value + side < 0:
-                    kicks.append(np.nan)
-                    continue
-                guess = p + slope * side
-                kicks.append(np.mean(bisected(scene.replace(**{name: value + side}), guess - 2e-9, guess + 2e-9)))
-            difference = (kicks[1] - (p if np.isnan(kicks[0]) else kicks[0])) / (by if np.isnan(kicks[0]) else 2 * by)
+            difference = extrapolated(scene, name, p, slope, by)
+            apart = abs(slope - difference)
+            relative = f"{apart / abs(difference):.0e} of it" if difference else ""
             print(
-                f"  v = {speed:g} {name:12s} {slope: .9e}  differences {difference: .9e}  apart {slope - difference: .1e}"
+                f"  {name:12s} {slope: .12e}  differences {difference: .12e}  apart {apart:.0e} {relative}", flush=True
             )
+
+
+def extrapolated(scene: fj.Scene, name: str, p: float, slope: float, by: float) -> float:
+    """The derivative of the independent solver's critical kick: differences over a step and its half, extrapolated to none.
+
+    Of one side alone where the other would be negative, as of a coefficient of restitution of zero.
+    """
+    value = float(scene.parameters[name])
+
+    def kick(side: float) -> float:
+        guess = p + slope * side
+        return float(np.mean(bisected(scene.replace(**{name: value + side}), guess - 2e-9, guess + 2e-9)))
+
+    if value < by:
+        coarse, fine = ((kick(h) - p) / h for h in (by, by / 2))
+        return 2 * fine - coarse
+    coarse, fine = ((kick(h) - kick(-h)) / (2 * h) for h in (by, by / 2))
+    return (4 * fine - coarse) / 3
 
 
 def cost() -> None:
