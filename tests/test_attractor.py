@@ -18,6 +18,7 @@ from fivjax.verdicts.ensemble import (
     Attractor,
     Ensemble,
     approached,
+    distance_to,
     met,
     no_approach,
 )
@@ -85,7 +86,7 @@ def looks_until_reached(distances):
     with jax.enable_x64(True):
         attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0))
         approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
-        step = jax.jit(lambda approach, state: approached(approach, attractor, state))
+        step = jax.jit(lambda approach, state: approached(approach, state, distance_to(attractor, state)))
         for look, distance in enumerate(distances):
             approach, reached = step(approach, attractor.crossings[0] + distance * away)
             if reached:
@@ -112,7 +113,8 @@ def test_nothing_known_is_never_reached():
     with jax.enable_x64(True):
         unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0))
         near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(99))
-        assert not approached(near, unknown, jnp.full(2, 1e-9))[1]
+        state = jnp.full(2, 1e-9)
+        assert not approached(near, state, distance_to(unknown, state))[1]
 
 
 def circle(radius=0.5, count=KEPT):

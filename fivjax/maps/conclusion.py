@@ -18,10 +18,17 @@ STEPS_PER_LOOK = 8
 GROWTH = 1e9
 
 
-def look(setting: Setting, now: Progress, reached: Bool[Array, ""]) -> tuple[Progress, Bool[Array, ""]]:
-    """A look at how near the trajectory is to the known torus, and whether it has `reached` it by now."""
+def distance_to_torus(setting: Setting, now: Progress) -> Float[Array, ""]:
+    """Of the trajectory's last crossing to the known torus."""
+    return attractors.distance_to(setting.attractor, setting.scene.structure.weights * now.crossing)
+
+
+def look(
+    setting: Setting, now: Progress, distance: Float[Array, ""], reached: Bool[Array, ""]
+) -> tuple[Progress, Bool[Array, ""]]:
+    """A look at the trajectory's `distance` to the known torus, and whether it has `reached` it by now."""
     crossing = setting.scene.structure.weights * now.crossing
-    approach, reached_now = attractors.approached(now.approach, setting.attractor, crossing)
+    approach, reached_now = attractors.approached(now.approach, crossing, distance)
     return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
 
 

@@ -18,7 +18,7 @@ from . import attractors
 from .attractors import Attractors, Follower
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
-from .conclusion import STEPS_PER_LOOK, conclude, look
+from .conclusion import STEPS_PER_LOOK, conclude, distance_to_torus, look
 from .flattened import Flattened, flatten
 from .progress import Setting, begin, placed, released, step
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
@@ -304,12 +304,14 @@ def _followed(scene, method, names, history, looks, shared: Flattened, trajector
 
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
-    a_step, a_look, concluded = of_all(step), of_all(look), of_all(conclude)
+    a_step, a_distance, a_look, concluded = map(of_all, (step, distance_to_torus, look, conclude))
+    known, nothing = jnp.any(everything.attractor.known), jnp.full(begun.t.shape, jnp.inf, begun.t.dtype)
 
     def until_look(_, carry):
         now, reached = carry
         now = jax.lax.fori_loop(0, STEPS_PER_LOOK, lambda _, now: a_step(now), now)
-        return a_look(now, reached)
+        # Until a torus is known, which is seldom, there is no distance to compute.
+        return a_look(now, jax.lax.cond(known, a_distance, lambda _: nothing, now), reached)
 
     none = jnp.zeros(begun.t.shape, bool)
     after, reached = jax.lax.fori_loop(0, looks, until_look, (begun, none))

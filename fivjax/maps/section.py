@@ -109,7 +109,7 @@ class ReturnMaps:
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
         if self.windows is not None:
-            return self._in_windows(group, at, crossings)[-1]
+            return self._in_windows(group, at, crossings, peaks=True)[-1]
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 
     def _differences(self, group, at: Section, crossings):
@@ -139,21 +139,21 @@ class ReturnMaps:
         """`peaks`, and where the motions are then."""
         if self.windows is None:
             return self.peaks(group, at, crossings), self.returns(group, at, crossings).at
-        *found, peak = self._in_windows(group, at, crossings)
+        *found, peak = self._in_windows(group, at, crossings, peaks=True)
         return peak, Section(*found[:3])
 
-    def _in_windows(self, group, at: Section, crossings):
-        rows = _rows(at, crossings)
+    def _in_windows(self, group, at: Section, crossings, peaks: bool = False):
+        rows = _rows(at, crossings, np.full(len(at.y), peaks))
         return in_blocks(moved_in_windows, self.windows, group, rows, SIDE_BY_SIDE, self.pool, size=self.block).tree
 
     def _exactly(self, program, size: int, group, at: Section, crossings):
         return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree
 
 
-def _rows(at: Section, crossings) -> Flattened:
+def _rows(at: Section, crossings, *more) -> Flattened:
     status, direction = np.asarray(at.status, np.int32), np.asarray(at.direction, float)
     crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(status))
-    return flatten((np.asarray(at.y), status, direction, crossings.copy()))
+    return flatten((np.asarray(at.y), status, direction, crossings.copy(), *more))
 
 
 def _images(found) -> Images:

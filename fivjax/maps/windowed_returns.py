@@ -34,12 +34,16 @@ def with_newest(
 @compiled
 def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
     """From states of the section to the crossing asked for of each: the state there, contact mode, events and time (s) on the
-    way, the path, the largest tangential speed (m/s). Not a number where the section is not met.
+    way, the path, the largest tangential speed (m/s; 0 unless asked for). Not a number where the section is not met.
     """
     windows, longest = shared.tree
-    y, status, direction, crossings = rows.tree
-    to_section = functools.partial(Windowed().advance, at_section=True)
-    advance = jax.vmap(jax.vmap(to_section, in_axes=(None, 0, 0, 0, 0)))
+    y, status, direction, crossings, peaks = rows.tree
+
+    def side_by_side(of_one):
+        return jax.vmap(jax.vmap(of_one, in_axes=(None, 0, 0, 0, 0)))
+
+    advance = side_by_side(functools.partial(Windowed().advance, at_section=True))
+    highest = side_by_side(Windowed().peak)
 
     def going(left, crossed):
         return (left > 0) & (crossed < crossings)
@@ -47,7 +51,9 @@ def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
     def further(carry):
         count, before = carry
         y, contact, left, crossed, events, path, peak = before
-        after = advance(windows, contact, jnp.zeros_like(left), y, left)
+        none = jnp.zeros_like(left)
+        after = advance(windows, contact, none, y, left)
+        higher = jax.lax.cond(jnp.any(peaks), lambda: highest(windows, contact, none, y, after.h), lambda: none)
         now = (
             after.y,
             after.contact,
@@ -55,7 +61,7 @@ def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
             crossed + after.rise.happened,
             events + jnp.any(after.ended, axis=-1),
             with_newest(path, after.y, after.rise.happened),
-            jnp.maximum(peak, after.peak),
+            jnp.maximum(peak, higher),
         )
         moves = going(left, crossed)
 

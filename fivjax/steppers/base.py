@@ -60,7 +60,6 @@ class Advance(NamedTuple):
     y: State
     contact: Contact
     h: Float[Array, ""]  # how far it came, s
-    peak: Float[Array, ""]  # largest tangential speed it saw, m/s
     rise: Rise
     end: State  # where the mode's own motion ended, before anything that follows from its end
     ended: Bool[Array, "*contacts 2"]  # which of the guards ran out there
@@ -76,9 +75,7 @@ def advance_between(
     mechanics: Mechanics,
 ) -> Advance:
     """An advance from one state to another that knows of what lay between only what these two say."""
-    speed = jnp.abs(y[y.shape[0] // 2 + mechanics.tangential])
-    rise = rise_between(mechanics, before, y)
-    return Advance(y, contact, h, jnp.max(speed) if mechanics.several else speed, rise, end, ended)
+    return Advance(y, contact, h, rise_between(mechanics, before, y), end, ended)
 
 
 class Within(NamedTuple):

@@ -69,10 +69,10 @@ class Window(eqx.Module):
         speed, index = self.speed, jnp.arange(INTERVALS)[:, None]
         return least(jnp.where((speed[:-1] < 0) & (speed[1:] >= 0), index, INTERVALS).astype(jnp.int32))
 
-    def fastest(self, interval: Int[Array, " l"]) -> Int[Array, " l"]:
-        """The sample of the largest tangential speed up to the beginning of an interval."""
+    def fastest(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
+        """The sample of the largest tangential speed within so many intervals."""
         speed, index = jnp.abs(self.speed), jnp.arange(INTERVALS + 1)[:, None]
-        speed = jnp.where(index <= interval, speed, -1.0)
+        speed = jnp.where(index <= steps, speed, -1.0)
         return least(jnp.where(speed == -least(-speed), index, INTERVALS).astype(jnp.int32))
 
 

@@ -76,17 +76,26 @@ def first_rise(
     def at(x):
         return value_and_slope(speed, x)
 
-    rises = (speed[0] < 0) & (at(end)[0] >= 0)
+    last = at(end)[0]
+    rises = (speed[0] < 0) & (last >= 0)
 
-    def nearer(_, carry):
-        low, high, x = carry
+    def nearer(carry):
+        low, high, x, open_, count = carry
         value, slope = at(x)
         low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
         newton = x - value / jnp.where(slope == 0, 1.0, slope)
-        return low, high, jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        inside = (newton >= low) & (newton <= high)
+        # The next error is the square of this one.
+        settled = inside & (jnp.abs(newton - x) <= 1e-8 * end)
+        return low, high, jnp.where(inside, newton, 0.5 * (low + high)), open_ & ~settled, count + 1
 
-    begin = jnp.zeros_like(end), end, 0.5 * end
-    return rises, jnp.where(rises, jax.lax.fori_loop(0, RISE_STEPS, nearer, begin)[2], end)
+    def going(carry):
+        *_, open_, count = carry
+        return jnp.any(open_) & (count < RISE_STEPS)
+
+    secant = end * speed[0] / jnp.where(rises, speed[0] - last, 1.0)
+    found = jax.lax.while_loop(going, nearer, (jnp.zeros_like(end), end, secant, rises, 0))
+    return rises, jnp.where(rises, found[2], end)
 
 
 def highest(c: Float[Array, "k l"], low: Float[Array, " l"], high: Float[Array, " l"]) -> Float[Array, " l"]:

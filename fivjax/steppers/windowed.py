@@ -56,6 +56,12 @@ class Windowed(eqx.Module):
     ) -> Advance:
         return (_to_section if at_section else _advance_one)(prepared, contact, load, y, h)
 
+    def peak(
+        self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """The largest tangential speed (m/s) within an advance that came `h` (s) far, to rounding."""
+        return _peak_of_one(prepared, contact, load, y, h)
+
 
 def _side_by_side(advance: Callable):
     """`advance`, which takes trajectories side by side along the last axis, of one of them; its `jax.vmap` is `advance` again.
@@ -97,7 +103,7 @@ def _advance(
 ) -> Advance:
     """One advance of trajectories side by side: to the next event, the end of the step or that of the window, whichever comes
     first. With `at_section` to the first rise of the tangential velocity, if that comes before (one that comes and goes between
-    two samples of the window is passed over); and its peak is known to rounding.
+    two samples of the window is passed over).
     """
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
@@ -143,28 +149,37 @@ def _advance(
             before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
             at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
             rise = Rise(rises | later | jumps, jnp.where(jumps, y_next, at))
-        speed = jnp.abs(reached[velocity])
-        peak = jnp.maximum(speed, peak_near_fastest()) if at_section else speed
-        return peak, next_contact, y_next, rise, reached
-
-    def peak_near_fastest():
-        sample = window.fastest(interval)
-        about = stacked(mechanics, contact, load, window.state_at(sample))
-        speed = Series(prepared.series @ about, series.sizes, exact, n).speed(mechanics.tangential)
-        return highest(speed, jnp.maximum(-1.0 * sample, -1.0), interval + share - sample) / prepared.interval
+        return next_contact, y_next, rise, reached
 
     @functools.partial(jax.vmap, in_axes=(-1, 0, 0, -1), out_axes=(0, -1))
     def over_trajectories(reached, contact, load, fires):
         state = physics.on_constraint(mechanics, contact, reached)
         return physics.transition(mechanics, contact, load, state, fires, RESTING[state.dtype.name] * prepared.interval)
 
-    like = none, contact, no_state, Rise(none > 0, no_state), no_state
-    peak, next_contact, y_next, rise, end = computed_once(follow, like)
-    return Advance(y_next, next_contact, (interval + share) * prepared.interval, peak, rise, end, fires & ~rises)
+    like = contact, no_state, Rise(none > 0, no_state), no_state
+    next_contact, y_next, rise, end = computed_once(follow, like)
+    return Advance(y_next, next_contact, (interval + share) * prepared.interval, rise, end, fires & ~rises)
+
+
+def _peak(
+    prepared: Propagators,
+    contact: Contact,
+    load: Float[Array, " l"],
+    y: Float[Array, "state l"],
+    h: Float[Array, " l"],
+) -> Float[Array, " l"]:
+    mechanics, n = prepared.mechanics, y.shape[0] // 2
+    steps, sizes, exact = h / prepared.interval, jnp.zeros((8, *load.shape)), physics.exactly_zero(contact)
+    window = Window(prepared.window @ stacked(mechanics, contact, load, y), sizes, exact, n, mechanics.tangential)
+    sample = window.fastest(steps)
+    about = stacked(mechanics, contact, load, window.state_at(sample))
+    speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
+    return highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
 
 
 _advance_one = _side_by_side(_advance)
 _to_section = _side_by_side(functools.partial(_advance, at_section=True))
+_peak_of_one = _side_by_side(_peak)
 
 
 def _rise(

@@ -145,12 +145,16 @@ def _distance(known: Float[np.ndarray, "k state"], states: Float[np.ndarray, "m 
     return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0) / size)
 
 
-def approached(approach: Approach, attractor: Attractor, crossing: State) -> tuple[Approach, Bool[Array, ""]]:
-    """The approach after a look at a crossing state (a weighted deviation), and whether the attractor is reached."""
+def distance_to(attractor: Attractor, crossing: State) -> Float[Array, ""]:
+    """Of a crossing state (a weighted deviation) to the nearest one of a torus, relative to its size; infinite to none."""
     size = jnp.sum(crossing**2)
     apart = size - 2 * attractor.crossings @ crossing + jnp.sum(attractor.crossings**2, axis=-1)
-    distance = jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size)
-    close = attractor.known & (distance <= REACHED)
+    return jnp.where(attractor.known, jnp.sqrt(jnp.maximum(jnp.min(apart), 0.0) / size), jnp.inf)
+
+
+def approached(approach: Approach, crossing: State, distance: Float[Array, ""]) -> tuple[Approach, Bool[Array, ""]]:
+    """The approach after a look at a crossing state at a distance of the known torus, and whether that is reached."""
+    close = distance <= REACHED
     near = jnp.where(close, approach.near + 1, 0)
     reached = near >= LOOKS_NEAR
     fresh = jnp.any(crossing != approach.seen[0])
