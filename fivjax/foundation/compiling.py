@@ -33,11 +33,11 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     @functools.cache
     def alone():
         # What it hands on to JAX is not in the types of its overloads.
-        return eqx.filter_jit(function, compiler_options=_options())  # pyright: ignore[reportCallIssue]
+        return eqx.filter_jit(function, compiler_options=less_thought())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return (within if _transformed((args, kwargs)) else alone())(*args, **kwargs)
+        return (within if transformed((args, kwargs)) else alone())(*args, **kwargs)
 
     return call
 
@@ -65,13 +65,13 @@ def power_of_4(count: int) -> int:
     return 4 ** -(-(count - 1).bit_length() // 2)
 
 
-def _transformed(arguments) -> bool:
+def transformed(arguments) -> bool:
     # Inside `jit`, what is computed of known numbers is not known either.
     return not (is_known(jnp.add(1, 1)) and all(map(is_known, jax.tree.leaves(arguments))))
 
 
 @functools.cache
-def _options() -> dict[str, int | bool]:
+def less_thought() -> dict[str, int | bool]:
     """What of `LESS_THOUGHT` this machine's compiler knows, and the user has not set."""
     if jax.default_backend() != "cpu":
         return {}

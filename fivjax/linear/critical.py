@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.precision import returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
@@ -60,7 +61,7 @@ def _friction_limit(structure, direction):
     return first_limit(friction_loop(structure, direction)[0]).gain
 
 
-_critical_friction = compiled(with_own_gradient(_friction_limit, _is_a_limit))
+_critical_friction = kept(with_own_gradient(_friction_limit, _is_a_limit))
 _critical_friction_of_several = compiled(with_own_gradient(critical_friction_of_several, _is_a_limit))
 
 

@@ -7,12 +7,11 @@ verdict is open.
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..verdicts.verdict import Verdict
 from . import attractors
 from .attractors import Attractors, Follower
@@ -258,7 +257,7 @@ def _block(batch: Batch) -> int | None:
     return BLOCK_OF_SEVERAL if len(batch.scene.structure.contacts) > 1 else None
 
 
-@compiled
+@kept
 def _begin_block(scene, names, history, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
     def group(shared, columns, releases):
         own = with_values(scene, names, shared.values)
@@ -318,4 +317,4 @@ def _followed(scene, method, names, history, looks, shared: Flattened, trajector
     return flatten((columns, concluded(begun.t, after, reached)), row_axes=2)
 
 
-_follow_block, _follow_block_of_many = compiled(_followed), eqx.filter_jit(_followed)
+_follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_compiled=False)

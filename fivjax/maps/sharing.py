@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ..contact import Mechanics
 from ..cycles.section_map import longest_return, mechanics_about_sliding
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -111,7 +111,7 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
     return Flattened(numbers, form)
 
 
-@compiled
+@kept
 def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)

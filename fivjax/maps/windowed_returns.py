@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact
 from ..cycles.section_map import MOST_TO_CROSSING
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..steppers.windowed import Windowed
 from .flattened import Flattened, flatten
 
@@ -31,7 +31,7 @@ def with_newest(
     return jnp.where(crossed[..., None, None], longer, path)
 
 
-@compiled
+@kept
 def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
     """From states of the section to the crossing asked for of each: the state there, contact mode, events and time (s) on the
     way, the path, the largest tangential speed (m/s; 0 unless asked for). Not a number where the section is not met.

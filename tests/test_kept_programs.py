@@ -1,0 +1,127 @@
+"""What was traced is found by a later process, made anew where it is damaged or out of date, and never trusted by name alone."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.contact import Contact
+from fivjax.foundation import kept_programs
+from fivjax.foundation.kept_programs import kept
+from fivjax.maps.flattened import flatten
+
+
+class Counted:
+    """A function that counts how often it is traced."""
+
+    def __init__(self):
+        self.traced = 0
+
+    def __call__(self, how, y, factor):
+        self.traced += 1
+        return flatten((Contact(y, y), {"times": factor * y, "sine": jnp.sin(y)}))
+
+    def in_a_new_process(self):
+        """As a later process has it: nothing is remembered but what the folder keeps."""
+
+        def traced(*args):
+            return self(*args)
+
+        return kept(traced)
+
+
+@pytest.fixture(autouse=True)
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(kept_programs, "_folder", lambda: str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+STEPPER = fj.EventExact(order=8)
+Y = np.linspace(0.0, 1.0, 5)
+
+
+def values(result) -> dict[str, np.ndarray]:
+    return jax.tree.map(np.asarray, result.tree[1])
+
+
+def test_a_later_process_finds_what_was_traced_and_computes_the_same_bits(folder):
+    function = Counted()
+    first = values(function.in_a_new_process()(STEPPER, Y, np.asarray(2.0)))
+    assert function.traced == 1 and len(list(folder.iterdir())) == 1
+    again = function.in_a_new_process()
+    for y in (Y, Y + 1):
+        found = values(again(STEPPER, y, np.asarray(2.0)))
+    assert function.traced == 1
+    np.testing.assert_array_equal(values(again(STEPPER, Y, np.asarray(2.0)))["sine"], first["sine"])
+    np.testing.assert_array_equal(found["times"], 2 * (Y + 1))
+    again(STEPPER, np.zeros(6), np.asarray(2.0))
+    assert function.traced == 2, "another shape is another program"
+
+
+@pytest.mark.parametrize("damage", [b"", b"nothing", "cut", "changed"])
+def test_a_damaged_file_is_made_anew(folder, damage):
+    function = Counted()
+    function.in_a_new_process()(2.0, Y, np.asarray(3.0))
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes({"cut": whole[: len(whole) // 2], "changed": whole[:-9] + bytes(9)}.get(damage, damage))
+    found = values(function.in_a_new_process()(2.0, Y, np.asarray(3.0)))
+    assert function.traced == 2
+    np.testing.assert_array_equal(found["times"], 3 * Y)
+    function.in_a_new_process()(2.0, Y, np.asarray(3.0))
+    assert function.traced == 2 and list(folder.iterdir()) == [path], "and kept again"
+
+
+def test_other_source_and_other_arguments_are_other_programs(folder, monkeypatch):
+    function = Counted()
+    for how in (2.0, 3.0):
+        function.in_a_new_process()(how, Y, np.asarray(1.0))
+    assert function.traced == 2
+    monkeypatch.setattr(kept_programs, "_source", lambda: "another")
+    function.in_a_new_process()(2.0, Y, np.asarray(1.0))
+    assert function.traced == 3 and len(list(folder.iterdir())) == 3
+
+
+def test_what_a_user_wrote_is_traced_each_time(folder):
+    """Its name stays when its text changes: a friction law of one's own must not be another one's."""
+
+    class Own(eqx.Module):
+        strength: float = 0.3
+
+    function = Counted()
+    for _ in range(2):
+        found = function.in_a_new_process()(Own(), Y, np.asarray(4.0))
+        np.testing.assert_array_equal(values(found)["times"], 4 * Y)
+    assert function.traced == 2 and not folder.exists()
+
+
+def test_the_folder_stays_small_and_what_was_used_last_stays(folder, monkeypatch):
+    function = Counted()
+    function.in_a_new_process()(1.0, Y, np.asarray(1.0))
+    (first,) = folder.iterdir()
+    monkeypatch.setattr(kept_programs, "LARGEST", int(2.5 * first.stat().st_size))
+    for how in (2.0, 1.0, 3.0):
+        function.in_a_new_process()(how, Y, np.asarray(1.0))
+    assert first in list(folder.iterdir()) and len(list(folder.iterdir())) == 2
+
+
+def test_a_folder_that_cannot_be_made_is_done_without(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setattr(kept_programs, "_folder", lambda: str(tmp_path / "file" / "kept"))
+    found = values(Counted().in_a_new_process()(1.0, Y, np.asarray(5.0)))
+    np.testing.assert_array_equal(found["times"], 5 * Y)
+
+
+def test_under_a_transformation_it_is_part_of_what_the_caller_compiles(folder):
+    function = Counted()
+    slope = jax.jacfwd(lambda y: function.in_a_new_process()(1.0, y, jnp.asarray(2.0)).tree[1]["times"])(jnp.ones(2))
+    np.testing.assert_array_equal(slope, 2 * np.eye(2))
+    assert not folder.exists()
