@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..contact import Contact, Mechanics, State
 from ..steppers.base import AbstractStepper
 from ..steppers.core import Segment, follow
+from ..steppers.event_exact import for_derivatives
 from . import energy as accounts
 from .energy import Books, Ledger
 
@@ -42,12 +43,15 @@ End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
 def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
     """State, contact and ledger after `begin.h`; last, whether `most` advances were enough."""
     if derivatives != "reverse":
-        return _advances(begin, method, most, "bounded" if derivatives == "both" else "lax")
+        return _advances(begin, method, most, derivatives)
     return _reversible(begin, method, most)
 
 
-def _advances(begin: Begin, method: AbstractStepper, most: int, kind: str) -> End:
+def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
     mechanics, load, books = begin.mechanics, begin.load, begin.books
+    if derivatives is not None:
+        # For each stretch anew: its reverse derivative may use nothing that was computed outside of it.
+        method = for_derivatives(method, mechanics)
 
     def enter(ledger, segment: Segment):
         return None if books is None else accounts.enter(books, method, mechanics, ledger, segment)
@@ -62,17 +66,18 @@ def _advances(begin: Begin, method: AbstractStepper, most: int, kind: str) -> En
         total=begin.ledger,
         observe=enter,
         most=most,
-        kind=kind,
+        kind="bounded" if derivatives == "both" else "lax",
     )
     return after.y, after.contact, after.total, after.enough
 
 
 def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
-    numbers, rest = eqx.partition(begin, eqx.is_inexact_array)
+    # The method, too: its step may be an array.
+    numbers, rest = eqx.partition((begin, method), eqx.is_inexact_array)
     counts, names = eqx.partition(rest, eqx.is_array)
 
     def end(numbers, counts):
-        return _advances(eqx.combine(numbers, counts, names), method, most, "lax")
+        return _advances(*eqx.combine(numbers, counts, names), most, "reverse")
 
     def backward(start, cotangent):
         numbers, counts = start

@@ -29,7 +29,7 @@ from ..model.scene import Scene, refuse_painleve
 from ..model.sliding import contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
 from ..steppers.description import describe_method
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .compiled_sizes import compiled_rows, compiled_steps, with_step_as_array
 from .ending import ENDING, GROWTH, Ending
@@ -360,8 +360,6 @@ def states_at(
     computed again.
     """
     mechanics = Mechanics(scene)
-    if derivatives is not None:
-        method = for_derivatives(method, mechanics)
     # Steps end on the load's jumps as well as on the instants.
     jumps = scene.load.jumps
     inside = (jumps >= instants[0]) & (jumps <= instants[-1])
