@@ -1,6 +1,6 @@
 """Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed] [start] [memory]
+    python tests/measure_maps.py [errors] [table2] [map] [speed] [start] [memory] [roofline]
 
 Each word picks one study; without any, all run (some minutes on two cores). The reference is `tests/oracle.py`.
 """
@@ -138,13 +138,77 @@ def memory() -> None:
     print(f"{(highest[0] - before) / 1e3 / 256**2:.2f} kB per trajectory, 65,536 trajectories")
 
 
+def roofline() -> None:
+    """Arithmetic and traffic of a step of a map's trajectories, by XLA's own count, against what one core can do."""
+    import jax
+    import jax.numpy as jnp
+
+    from fivjax.contact import Contact
+    from fivjax.cycles.section_map import mechanics_about_sliding, sliding_state
+    from fivjax.foundation.compiling import less_thought
+    from fivjax.steppers.windowed import Windowed
+
+    groups, beside, steps = 4, 16, 400
+    run = fj.simulate(scene(p=1.3), 2.0, 1e-3)
+    with jax.enable_x64(True):
+        rows = np.random.default_rng(0).choice(np.arange(200, 2000), (groups, beside))
+        states = np.concatenate([run.displacement[rows], run.velocity[rows]], axis=-1)
+        y = jnp.asarray(states - np.asarray(sliding_state(scene(), scene().load.final)))
+        begin = Contact(jnp.asarray(run.status[rows], jnp.int32), jnp.sign(3.0 - jnp.asarray(run.velocity[rows, 0])))
+        mu = jnp.linspace(0.2, 0.227, groups)
+        prepared = jax.vmap(lambda mu: Windowed().prepare(mechanics_about_sliding(scene().replace(mu=mu))))(mu)
+        none, long = jnp.zeros((groups, beside)), jnp.ones((groups, beside))
+        one = jax.vmap(jax.vmap(Windowed().advance, in_axes=(None, 0, 0, 0, 0)))
+
+        def step(y, contact):
+            after = one(prepared, contact, none, y, long)
+            return after.y, after.contact
+
+        def many(y, contact):
+            return jax.lax.fori_loop(0, steps, lambda _, now: step(*now), (y, contact))
+
+        counted = jax.jit(step, compiler_options=less_thought()).lower(y, begin).compile().cost_analysis()
+        timed = jax.jit(many, compiler_options=less_thought()).lower(y, begin).compile()
+        matrix, long_row = jnp.ones((1024, 1024)), jnp.ones(2**26)
+        product = jax.jit(lambda a: a @ a).lower(matrix).compile()
+        copy = jax.jit(lambda a: a + 1.0).lower(long_row).compile()
+
+        def seconds(program, *args) -> float:
+            found = []
+            for _ in range(5):
+                start = time.perf_counter()
+                jax.block_until_ready(program(*args))
+                found.append(time.perf_counter() - start)
+            return min(found)
+
+        peak, traffic = 2 * 1024**3 / seconds(product, matrix), 16 * 2**26 / seconds(copy, long_row)
+        each = seconds(timed, y, begin) / steps
+    flops, moved, count = counted["flops"], counted["bytes accessed"], groups * beside
+    table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / groups
+    print(f"{groups} structures with {beside} trajectories each: {1e6 * each / count:.2f} µs a trajectory-step")
+    print(f"a trajectory-step: {flops / count:.0f} operations, {moved / count / 1e3:.1f} kB between kernels")
+    print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
+    print(f"the machine: {peak / 1e9:.0f} Gflop/s in a large product (all cores), {traffic / 1e9:.1f} GB/s in memory")
+    print(
+        f"reached: {flops / each / 1e9:.1f} Gflop/s, {flops / each / peak:.0%} of that; {moved / each / 1e9:.0f} GB/s in cache"
+    )
+
+
 def paper_map(points: int):
     axes = {name: np.linspace(low, high, points) for name, (low, high) in MAP.items()}
     return fj.bistability_map(scene(), progress=False, **axes)
 
 
 if __name__ == "__main__":
-    studies = {"errors": errors, "table2": table2, "map": map_, "speed": speed, "start": start, "memory": memory}
+    studies = {
+        "errors": errors,
+        "table2": table2,
+        "map": map_,
+        "speed": speed,
+        "start": start,
+        "memory": memory,
+        "roofline": roofline,
+    }
     for name in sys.argv[1:] or studies:
         print(f"--- {name}: {studies[name].__doc__}")
         studies[name]()

@@ -52,7 +52,8 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array(leaf.shape, leaf.dtype.name) if eqx.is_array(leaf) else leaf for leaf in leaves)
-        key = folder, structure, rest, jax.config.jax_enable_x64
+        # A program that is compiled is one device's own.
+        key = folder, structure, rest, jax.config.jax_enable_x64, jax.config.jax_default_device
         if key not in programs:
             # Threads that want the same program wait for the one that makes it.
             with lock:

@@ -23,9 +23,9 @@ MANY = 8192
 
 
 def workers() -> int:
-    # A block is too small for XLA to split among cores; blocks side by side use them all.
+    # A block is too small for XLA to split among cores; blocks side by side use them all. Elsewhere each device has one.
     if jax.default_backend() != "cpu":
-        return 1
+        return len(jax.local_devices())
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
@@ -50,14 +50,15 @@ def in_blocks(
         size = BLOCK_ELSEWHERE
     elif size is None:
         size = LARGE_BLOCK_ON_CPU if len(group) >= MANY else BLOCK_ON_CPU
-    rows = max(1, size // width)
+    rows, devices = max(1, size // width), jax.local_devices()
 
     def run(start: int, numbers: np.ndarray | None) -> Flattened:
         # The last block is filled up with copies of its first row.
         chosen = np.arange(start, start + rows)
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
         place = slots[np.where(chosen < len(slots), chosen, start)]
-        with jax.enable_x64(True):  # the setting is a thread's own
+        device = devices[start // rows % len(devices)] if len(devices) > 1 else None
+        with jax.enable_x64(True), jax.default_device(device):  # these settings are a thread's own
             own = Flattened(shared.numbers[group[place[:, 0]]], shared.form)
             result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
             part = np.asarray(result.numbers)
