@@ -132,7 +132,7 @@ def critical_kick(
     # From the side that slides: all that repeats on the way there, with events, is the saddle.
     p, best, crossings = low, np.inf, MOST_CROSSINGS
     for taken in range(1, MOST_TRAJECTORIES + 1):
-        path = kicked(scene.replace(p=p), stepper, along_p, crossings)
+        path = kicked(scene.replace(p=p), stepper, along_p, crossings, rough=True)
         if saddle is None:
             saddle = saddle_passed(scene, stepper, path)
             if saddle is None:
