@@ -146,7 +146,7 @@ def section_of(now) -> Section:
 def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray) -> Flattened:
     """Trajectories that have begun, put to these states of the section."""
     columns, now = begun.tree
-    contact = eqx.tree_at(
-        lambda c: c.status, now.contact, section_at(y, normal).status.astype(now.contact.status.dtype)
-    )
+    # They have been released: friction points the way it does on the section.
+    status = section_at(y, normal, np.asarray(now.contact.direction)).status.astype(now.contact.status.dtype)
+    contact = eqx.tree_at(lambda c: c.status, now.contact, status)
     return flatten(jax.tree.map(np.asarray, (columns, eqx.tree_at(lambda n: (n.y, n.contact), now, (y, contact)))))

@@ -70,6 +70,8 @@ class ReturnMaps:
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)
+        # Which way friction points where the contact slides on the section: the belt is the faster one there.
+        self.sliding = np.sign(np.asarray(tree.mechanics.belt_speed))
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
         # Of several contacts, places of all of them.
         self.tangential, self.normal = contact_coordinates(self.structure)

@@ -85,7 +85,8 @@ def _back(
     """About which of the sets all starts come back within so many crossings; and where the starts are then, set by set."""
     weights, count = maps.weights, tube.STARTS
     starts = [about(maps, states[:: len(states) // count] / weights) for states in sets]
-    own, last = np.repeat(group, count), section_at(np.concatenate(starts) / weights, maps.normal)
+    own = np.repeat(group, count)
+    last = section_at(np.concatenate(starts) / weights, maps.normal, maps.sliding[own])
     running, back, ok = np.arange(len(own)), np.zeros(len(own), bool), np.ones(len(sets), bool)
     smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
     for _ in range(0, within, KEPT):
@@ -166,7 +167,9 @@ def about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
     return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate)
 
 
-def section_at(y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray) -> Section:
-    """States of the section with the contact mode that they tell."""
+def section_at(
+    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
+) -> Section:
+    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
     status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
-    return Section(y, status, np.ones(status.shape))
+    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))
