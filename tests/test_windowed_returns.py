@@ -37,7 +37,7 @@ def starts(maps, exactly) -> tuple[np.ndarray, Section]:
     """Groups and states on the section, from small ones, which slide, to large ones, which stick and lift off."""
     group = np.arange(24) % 3
     states = np.random.default_rng(3).normal(size=(24, 6)) * np.geomspace(0.1, 8.0, 24)[:, None]
-    at = section_at(np.where(np.arange(6) == 3, 0.0, states) / maps.weights, maps.normal)
+    at = section_at(np.where(np.arange(6) == 3, 0.0, states) / maps.weights, maps.normal, np.ones(len(states)))
     closed = at.status[:, None] != fj.Status.DETACH
     at = at._replace(y=np.where(closed & np.isin(np.arange(6), (2, 5)), 0.0, at.y))
     # Where the velocity rises, as it does on the section, and not only is zero.

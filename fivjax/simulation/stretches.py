@@ -77,7 +77,8 @@ def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
     counts, names = eqx.partition(rest, eqx.is_array)
 
     def end(numbers, counts):
-        return _advances(*eqx.combine(numbers, counts, names), most, "reverse")
+        begin, method = eqx.combine(numbers, counts, names)
+        return _advances(begin, method, most, "reverse")
 
     def backward(start, cotangent):
         numbers, counts = start

@@ -25,13 +25,13 @@ from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
 from .section import before_section, section_speed
+from .step_length import LONGEST_STEP, attainable, fastest_rate, time_unit, trusted
 
 Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
-# No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
-# Powers of a longer one would be out of range.
-LONGEST_STEP = 1e6
 MOST_ROOT_STEPS = 60
+# A step's error in a derivative, relative to that in the motion.
+LOOSER = 100
 
 
 class EventExact(AbstractStepper):
@@ -108,7 +108,7 @@ class EventExact(AbstractStepper):
             guards = [jnp.append(guard, row) for guard, row in zip(guards, rows, strict=True)]
             # Of several contacts what is not on the section is before it, however little.
             rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, mechanics.several)
-        reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, _trusted(states, self.tolerance))
+        reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
             scaled.append(guard * power)
@@ -173,10 +173,10 @@ class EventExact(AbstractStepper):
         def step(carry):
             y, left, _ = carry
             states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
-            trusted = jax.lax.stop_gradient(jnp.minimum(_trusted(states, self.tolerance), LONGEST_STEP) * unit)
-            trusted = jnp.minimum(trusted, self.dt)
-            last = jnp.abs(left) <= trusted
-            part = jnp.where(last, left, jnp.sign(left) * trusted)
+            longest = jax.lax.stop_gradient(jnp.minimum(trusted(states, self.tolerance), LONGEST_STEP) * unit)
+            longest = jnp.minimum(longest, self.dt)
+            last = jnp.abs(left) <= longest
+            part = jnp.where(last, left, jnp.sign(left) * longest)
             reached, _ = value_and_slope(states, part / unit)
             return reached, left - part, ~last
 
@@ -185,28 +185,18 @@ class EventExact(AbstractStepper):
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
 
 
-def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
-    """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
-
-    In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
-    """
-    positions, velocities = jax.lax.stop_gradient((mechanics.free_position, mechanics.free_velocity))
-    rate = jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(positions))), jnp.max(jnp.abs(velocities)))
-    _, exponent = jnp.frexp(rate)
-    return jnp.ldexp(jnp.ones_like(rate), -exponent)
-
-
 def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
     """The stepper with steps as short as deviations from the motion need.
 
-    A series is trusted as far as the *motion* allows. Where a mode rests that is far, too far for a deviation in that mode.
-    Its fastest possible vibration, of one rad in a unit of time, leaves a term of 1 / (order + 1)!.
+    A series is trusted as far as the *motion* allows. Where a mode rests that is far, too far for a deviation in that mode:
+    the fastest vibration, if it turns by an angle a in a step, leaves a term of a^(order + 1) / (order + 1)!.
     """
     if not isinstance(stepper, EventExact):
         return stepper
-    after = stepper.order_ + 1
-    allowed = min(1.0, (stepper.tolerance * math.factorial(after)) ** (1.0 / after))
-    return eqx.tree_at(lambda own: own.dt, stepper, jnp.minimum(stepper.dt, allowed * time_unit(mechanics)))
+    rate, after = fastest_rate(mechanics), stepper.order_ + 1
+    tolerance = LOOSER * attainable(stepper.tolerance, rate.dtype)
+    angle = (tolerance * math.factorial(after)) ** (1.0 / after)
+    return eqx.tree_at(lambda own: own.dt, stepper, jnp.minimum(stepper.dt, angle / rate))
 
 
 def _series(
@@ -279,31 +269,6 @@ def _together(
     of_contacts = coupled & (fires[:count] | (nearly & ~own))
     # The row of the section, if there is one, is no contact's.
     return jnp.concatenate([of_contacts, fires[count:]])
-
-
-def _trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
-    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in its units of time."""
-    order, n = len(states) - 1, states[0].shape[0] // 2
-    # A term that is lost in the rounding of the first ones cannot be asked to be smaller still.
-    tolerance = max(tolerance, 0.25 * float(jnp.finfo(states[0].dtype).eps))
-
-    def size(k):
-        return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
-
-    tiny = float(jnp.finfo(states[0].dtype).tiny)
-    moves = (size(0) > 0) | (size(1) > 0)
-    # At rest, but not for long: a load has just jumped.
-    starts = size(2) > 0
-
-    def reach(last):
-        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
-        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
-        end = jnp.maximum(size(last), tiny)
-        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1, 2)]
-        longest = jnp.where(moves, jnp.maximum(steps[0], steps[1]), jnp.where(starts, steps[2], jnp.inf))
-        return jnp.where(moves | starts, jnp.minimum(longest, LONGEST_STEP), jnp.inf)
-
-    return jnp.minimum(reach(order), reach(order - 1))
 
 
 def _march_to_roots(

@@ -1,0 +1,55 @@
+"""How long the steps of a Taylor series may be: as far as it can be trusted, in units of the fastest vibration."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..contact import Mechanics, State
+
+# No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
+# Powers of a longer one would be out of range.
+LONGEST_STEP = 1e6
+
+
+def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
+    """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
+
+    In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
+    """
+    rate = fastest_rate(mechanics)
+    _, exponent = jnp.frexp(rate)
+    return jnp.ldexp(jnp.ones_like(rate), -exponent)
+
+
+def fastest_rate(mechanics: Mechanics) -> Float[Array, ""]:
+    positions, velocities = jax.lax.stop_gradient((mechanics.free_position, mechanics.free_velocity))
+    return jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(positions))), jnp.max(jnp.abs(velocities)))
+
+
+def attainable(tolerance: float, dtype) -> float:
+    # A term that is lost in the rounding of the first ones cannot be asked to be smaller still.
+    return max(tolerance, 0.25 * float(jnp.finfo(dtype).eps))
+
+
+def trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
+    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in its units of time."""
+    order, n = len(states) - 1, states[0].shape[0] // 2
+    tolerance = attainable(tolerance, states[0].dtype)
+
+    def size(k):
+        return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
+
+    tiny = float(jnp.finfo(states[0].dtype).tiny)
+    moves = (size(0) > 0) | (size(1) > 0)
+    # At rest, but not for long: a load has just jumped.
+    starts = size(2) > 0
+
+    def reach(last):
+        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
+        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
+        end = jnp.maximum(size(last), tiny)
+        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1, 2)]
+        longest = jnp.where(moves, jnp.maximum(steps[0], steps[1]), jnp.where(starts, steps[2], jnp.inf))
+        return jnp.where(moves | starts, jnp.minimum(longest, LONGEST_STEP), jnp.inf)
+
+    return jnp.minimum(reach(order), reach(order - 1))
