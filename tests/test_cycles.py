@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.cycles.torus import off_the_curve
 
 REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
 
@@ -121,12 +122,31 @@ def test_from_a_start_newton_finds_the_unstable_cycle_too(saddle):
 
 def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     """At 3 m/s the motion beats for ever, some 14 returns to a beat; its peak is the reference's over a long run."""
-    torus = fj.limit_cycle(paper(3.0))
+    scene = paper(3.0)
+    torus = fj.limit_cycle(scene)
     assert torus.kind == "torus" and torus.stable
     peaks = {case["belt_speed"]: case["peak_speed"] for case in REFERENCE["paper"]["peaks"]}
     assert torus.amplitude == pytest.approx(peaks[3.0], rel=1e-4)
     assert 1 / abs(torus.rotation_number) == pytest.approx(14, abs=0.5)
     assert abs(abs(torus.multipliers[0]) - 1) < 0.01 and abs(torus.multipliers[1]) < 0.99
+    # The curve's points, on cubics through their neighbours: half as many lie farther off, by the fourth power or so.
+    path = np.asarray(scene.structure.weights) * torus.points
+    size = np.mean(np.linalg.norm(path, axis=1))
+    coarse = np.median(off_the_curve(path[::2])) / size
+    assert torus.residual == pytest.approx(np.median(off_the_curve(path)) / size, rel=1e-6)
+    assert torus.residual < 1e-8 and coarse > 8 * torus.residual
+
+
+def test_points_of_an_ellipse_lie_on_cubics_to_the_fourth_power_of_their_distance():
+    """As on a torus they are not evenly spread, and the curve has jumps, where nothing is said."""
+    errors = []
+    for count in (200, 400):
+        angle = 2 * np.pi * (np.arange(count) + 0.3 * np.sin(np.arange(count))) / count
+        path = np.stack([2 * np.cos(angle), np.sin(angle), np.where(angle < np.pi, 0.0, 5.0)], axis=-1)
+        distance = off_the_curve(path)
+        assert np.sum(distance > 1e-3) <= 8
+        errors.append(np.median(distance))
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.1)
 
 
 @pytest.mark.parametrize("belt_speed", [0.3, 1.0])
