@@ -110,7 +110,7 @@ def start() -> None:
     """From the start of `fivjax map` to its end, 64 × 64: nothing compiled before, and with the compilation cache."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": folder}
-        command = [Path(sys.executable).with_name("fivjax"), "map", "--out", f"{folder}/map"]
+        command = [Path(sys.executable).with_name("fivjax"), "map", "--overwrite", "--out", f"{folder}/map"]
         for name in ("cold", "cached", "cached"):
             begin = time.perf_counter()
             subprocess.run(command, env=environment, check=True, capture_output=True)

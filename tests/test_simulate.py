@@ -153,7 +153,7 @@ def test_batch_equals_loop(paper_scene):
     kicks = np.array([1.1, 1.3, 2.0, 3.5])
 
     def end(p):
-        run = fj.simulate(paper_scene.replace(p=p), 0.3, 0.05, LOW_ORDER, derivatives="forward")
+        run = fj.simulate(paper_scene.replace(p=p), 0.3, 0.05, LOW_ORDER, derivatives="none")
         return run.displacement, run.status
 
     with jax.enable_x64(True):

@@ -22,7 +22,7 @@ from ..steppers.event_exact import for_derivatives
 from . import energy as accounts
 from .energy import Books, Ledger
 
-MODES = ("both", "forward", "reverse")
+MODES = ("both", "forward", "reverse", "none")
 
 
 class Begin(eqx.Module):
