@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.contact import Contact
 from fivjax.maps.section import ReturnMaps, Section
 from fivjax.maps.sharing import Batch, shared_by
 from fivjax.maps.tori import section_at
@@ -74,3 +75,25 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     free = np.array([0, 1, 4])
     difference = (scale * (ours - theirs))[:, :, free]
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
+
+
+def test_the_peak_of_an_advance_may_be_at_its_end(maps):
+    """Advances end between the samples of a window, where the velocity may be larger than at any of them."""
+    random = np.random.default_rng(5)
+    with jax.enable_x64(True):
+        windows = jax.tree.map(lambda leaf: leaf[0], maps.windows.tree[0])
+        y = jax.numpy.asarray(random.normal(size=(300, 6)) / maps.weights).at[:, [2, 5]].set(0.0)
+        h = 16 * windows.interval * random.uniform(0.05, 1.0, 300)
+
+        def both(y, h):
+            contact = Contact(jax.numpy.asarray(fj.Status.SLIDE, jax.numpy.int32), jax.numpy.asarray(1.0))
+            after = Windowed().advance(windows, contact, 0.0 * h, y, h)
+            peak = Windowed().peak(windows, contact, 0.0 * h, y, after.h, after.end)
+            times = after.h * jax.numpy.linspace(0.0, 1.0, 400)
+            inside = jax.vmap(lambda t: fj.EventExact().in_one_mode(windows.mechanics, contact, y, t))(times)
+            speeds = jax.numpy.abs(inside[:, 3])
+            return peak, jax.numpy.max(speeds), jax.numpy.argmax(speeds)
+
+        peak, sampled, place = map(np.asarray, jax.jit(jax.vmap(both))(y, h))
+    assert np.any(place == 399) and np.any((place > 0) & (place < 399))
+    assert np.all(peak >= sampled * (1 - 1e-12)) and np.all(peak <= sampled * (1 + 1e-4))

@@ -40,7 +40,7 @@ def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
     y, status, direction, crossings, peaks = rows.tree
 
     def side_by_side(of_one):
-        return jax.vmap(jax.vmap(of_one, in_axes=(None, 0, 0, 0, 0)))
+        return jax.vmap(lambda windows, *own: jax.vmap(functools.partial(of_one, windows))(*own))
 
     advance = side_by_side(functools.partial(Windowed().advance, at_section=True))
     highest = side_by_side(Windowed().peak)
@@ -53,7 +53,9 @@ def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
         y, contact, left, crossed, events, path, peak = before
         none = jnp.zeros_like(left)
         after = advance(windows, contact, none, y, left)
-        higher = jax.lax.cond(jnp.any(peaks), lambda: highest(windows, contact, none, y, after.h), lambda: none)
+        higher = jax.lax.cond(
+            jnp.any(peaks), lambda: highest(windows, contact, none, y, after.h, after.end), lambda: none
+        )
         now = (
             after.y,
             after.contact,

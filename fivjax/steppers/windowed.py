@@ -57,10 +57,10 @@ class Windowed(eqx.Module):
         return (_to_section if at_section else _advance_one)(prepared, contact, load, y, h)
 
     def peak(
-        self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
+        self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""], end: State
     ) -> Float[Array, ""]:
-        """The largest tangential speed (m/s) within an advance that came `h` (s) far, to rounding."""
-        return _peak_of_one(prepared, contact, load, y, h)
+        """The largest tangential speed (m/s) within an advance that came `h` (s) far, to its `end`; to rounding."""
+        return _peak_of_one(prepared, contact, load, y, h, end)
 
 
 def _side_by_side(advance: Callable):
@@ -167,6 +167,7 @@ def _peak(
     load: Float[Array, " l"],
     y: Float[Array, "state l"],
     h: Float[Array, " l"],
+    end: Float[Array, "state l"],
 ) -> Float[Array, " l"]:
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps, sizes, exact = h / prepared.interval, jnp.zeros((8, *load.shape)), physics.exactly_zero(contact)
@@ -174,7 +175,9 @@ def _peak(
     sample = window.fastest(steps)
     about = stacked(mechanics, contact, load, window.state_at(sample))
     speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
-    return highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
+    near_sample = highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
+    # The end lies between samples, and may be faster than all of them.
+    return jnp.maximum(near_sample, jnp.abs(end[n + mechanics.tangential]))
 
 
 _advance_one = _side_by_side(_advance)
