@@ -46,9 +46,8 @@ class LimitCycle(eqx.Module):
     multipliers: Complex[np.ndarray, " m"]  # by size, largest first
     stable: bool
     amplitude: float  # peak tangential speed, m/s
-    residual: (
-        float  # how far it is from closing; of a torus, how far points are, in the median, from the curve of the others
-    )
+    # How far it is from closing; of a torus, how far its points are, in the median, from the curve of the others.
+    residual: float  # relative to its size
     crossings: int  # points of the section in one period
     harmonics: Complex[np.ndarray, "count n"]  # lines of the velocities, m/s
     points: Float[np.ndarray, "k state"]  # of the section, on one period or the torus, as deviations from sliding

@@ -162,9 +162,6 @@ def _source() -> str:
 class _Pickler(pickle.Pickler):
     """Refuses what it would only name; a tree's structure it writes as such a tree, with zeros."""
 
-    # Without this, what is written depends on which of several equal strings are one.
-    fast = True
-
     def reducer_override(self, obj):
         if isinstance(obj, jax.tree_util.PyTreeDef):
             return jax.tree.structure, (_with_zeros(obj),)
@@ -178,6 +175,7 @@ class _Pickler(pickle.Pickler):
 def _pickled(what) -> bytes:
     buffer = io.BytesIO()
     pickler = _Pickler(buffer, protocol=5)
+    # Without this, what is written depends on which of several equal strings are one.
     pickler.fast = True
     pickler.dump(what)
     return buffer.getvalue()
