@@ -1,1 +1,1 @@
-"""What every room stands on: double precision, compiling, checks of arguments, small linear systems."""
+"""What all other packages use: double precision, compilation, checks of arguments, small linear systems."""

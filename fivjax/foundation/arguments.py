@@ -1,7 +1,7 @@
 """Checks on what users pass in: each failure is a sentence that names the argument, the rule and the value.
 
-Values that are not known yet (inside `jit`, `grad` or `vmap`) cannot be checked and pass; trajectories of a map that turn out
-to be bad end in a named status instead.
+Values that are not known yet (inside `jit`, `grad` or `vmap`) cannot be checked and pass. A trajectory of a map whose values
+are bad ends in a named status instead.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
-"""How functions are compiled: so that the first call does not take longer than the work.
+"""How functions are compiled: with fewer optimisations where a program runs for less time than it takes to compile.
 
-Most of what fivjax compiles runs for less time than XLA takes to compile it with all its might. Told to think less, XLA
-compiles in half the time what then runs as fast; only a large map repays the rest.
+That holds for most of what fivjax compiles. With fewer optimisations XLA compiles these programs in half the time, and they
+run as fast; only the programs of large maps repay full optimisation.
 """
 
 import functools
@@ -18,21 +18,21 @@ from .precision import is_known
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# The level leaves out what LLVM does beyond the obvious. The emitters are XLA's newer way to make kernels of fused
-# operations; the older one is quicker by far where there are many of them.
+# Level 1 leaves out LLVM's costly optimisations. The fusion emitters are XLA's newer way to make kernels of fused operations;
+# the older way compiles much faster where there are many of them.
 LESS_THOUGHT = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """`equinox.filter_jit`, compiled with `LESS_THOUGHT` on a CPU.
+    """`equinox.filter_jit`, with the compiler options `LESS_THOUGHT` on a CPU.
 
-    Under a caller's transformation it is part of what the caller compiles.
+    Under a caller's transformation the function becomes part of the caller's program, which has the caller's options.
     """
     within = eqx.filter_jit(function)
 
     @functools.cache
     def alone():
-        # What it hands on to JAX is not in the types of its overloads.
+        # `filter_jit` hands further arguments on to JAX, but its overloads do not say so.
         return eqx.filter_jit(function, compiler_options=less_thought())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
@@ -43,12 +43,11 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def computed_once(function, like):
-    """`function()`, computed once and kept.
+    """`function()`, computed once and kept. `like` has the structure and types of the result.
 
-    XLA on a CPU repeats arithmetic in every kernel that wants its result, so long chains with many results cost their
-    square. A loop that runs once is a border over which it repeats nothing; the sevenfold speed of maps is owed to it.
-    `like` has the structure and types of the result. Elsewhere the loop would be a border over which nothing is fused: there
-    it is left out.
+    XLA on a CPU repeats arithmetic in every kernel that uses its result, so the cost of a long chain with many results grows
+    with the square of its length. It repeats nothing across the border of a loop, even of one that runs once; this makes maps
+    seven times faster. On other devices the loop would only prevent fusion, so it is left out there.
     """
     if jax.default_backend() != "cpu":
         return jax.tree.map(lambda new, old: new.astype(old.dtype), function(), like)
@@ -61,18 +60,19 @@ def computed_once(function, like):
 
 
 def power_of_4(count: int) -> int:
-    """The next one at or above a count: arrays filled up to it have few sizes, so not each of them is compiled."""
+    """The smallest power of 4 at or above a count. Arrays padded to it have few different sizes, so few are compiled."""
     return 4 ** -(-(count - 1).bit_length() // 2)
 
 
 def transformed(arguments) -> bool:
-    # Inside `jit`, what is computed of known numbers is not known either.
+    """Whether a call is made under `jit`, `grad` or `vmap`."""
+    # Inside `jit` even the result of known numbers is a tracer.
     return not (is_known(jnp.add(1, 1)) and all(map(is_known, jax.tree.leaves(arguments))))
 
 
 @functools.cache
 def less_thought() -> dict[str, int | bool]:
-    """What of `LESS_THOUGHT` this machine's compiler knows, and the user has not set."""
+    """The options of `LESS_THOUGHT` that this machine's compiler knows and the user has not set."""
     if jax.default_backend() != "cpu":
         return {}
     return {name: value for name, value in LESS_THOUGHT.items() if _is_free(name, value)}
@@ -83,6 +83,6 @@ def _is_free(name: str, value: int | bool) -> bool:
         return False
     try:
         jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
-    except Exception:  # which one is not said anywhere
+    except Exception:  # JAX does not document which one
         return False
     return True

@@ -1,11 +1,11 @@
-"""What JAX has traced, kept from one start to the next in a folder of its compilation cache.
+"""Traced programs, kept for later processes in a folder of JAX's compilation cache.
 
-That cache saves compilation alone: to look there, JAX traces and lowers a function first, which of large ones takes seconds. So
-the result of tracing is kept, too (`jax.export`). Its name is a digest of all that it depends on: fivjax's own source, the
-versions of what it is built on, the platform, the function, shapes and types of its arrays, and the rest of its arguments.
+That cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large ones. So
+the traced program is kept, too (`jax.export`). Its file name is a digest of all that it depends on: fivjax's own source, the
+versions of Python, JAX, equinox and NumPy, the device, the function, shapes and types of its arrays, and its other arguments.
 
-A file that was damaged is removed and made anew. Where an argument was written by others (a friction law of a user's own), its
-name does not tell what it does; such functions are traced each time.
+A damaged file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its
+name does not tell what it does; such programs are traced in each process.
 """
 
 import functools
@@ -29,16 +29,16 @@ from .compiling import compiled, less_thought, transformed
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# The folder in that of the compilation cache, and how many bytes it may hold: what was used longest ago goes first.
+# The folder inside that of the compilation cache, and how many bytes it may hold: what was used longest ago is removed first.
 FOLDER, LARGEST = "fivjax-traced", 200 * 2**20
-# What these define is told by their versions, or by fivjax's source.
+# What these packages define is fixed by their versions, or by fivjax's source.
 KNOWN_PACKAGES = ("fivjax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "builtins", "functools")
 DIGEST_BYTES = 32
 
 
 def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable[P, R]:
-    """`compiling.compiled`, or `equinox.filter_jit` if not `quickly_compiled`; what was traced is kept where JAX has a folder
-    for what it compiles, and is found there by later processes.
+    """`compiling.compiled`, or `equinox.filter_jit` unless `quickly_compiled`; where JAX has a compilation cache, the traced
+    program is kept there for later processes.
     """
     otherwise = compiled(function) if quickly_compiled else eqx.filter_jit(function)
     programs: dict[Any, Callable | None] = {}
@@ -52,7 +52,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         rest = tuple(_Array(leaf.shape, leaf.dtype.name) if eqx.is_array(leaf) else leaf for leaf in leaves)
-        # A program that is compiled is one device's own.
+        # A compiled program belongs to one device.
         key = folder, structure, rest, jax.config.jax_enable_x64, jax.config.jax_default_device
         if key not in programs:
             # Threads that want the same program wait for the one that makes it.
@@ -160,7 +160,9 @@ def _source() -> str:
 
 
 class _Pickler(pickle.Pickler):
-    """Refuses what it would only name; a tree's structure it writes as such a tree, with zeros."""
+    """Refuses classes and functions of other packages, because pickle would only write their names. The structure of a tree
+    is written as such a tree of zeros.
+    """
 
     def reducer_override(self, obj):
         if isinstance(obj, jax.tree_util.PyTreeDef):
@@ -175,7 +177,7 @@ class _Pickler(pickle.Pickler):
 def _pickled(what) -> bytes:
     buffer = io.BytesIO()
     pickler = _Pickler(buffer, protocol=5)
-    # Without this, what is written depends on which of several equal strings are one.
+    # Without memoisation: with it, the result would depend on which of several equal strings are the same object.
     pickler.fast = True
     pickler.dump(what)
     return buffer.getvalue()
@@ -194,7 +196,7 @@ def _read(path: Path) -> bytes:
 
 
 def _write(path: Path, text: bytes) -> None:
-    """Whole or not at all; a folder that cannot be written to keeps nothing."""
+    """Writes a file whole or not at all; in a folder that cannot be written to, nothing is kept."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent)

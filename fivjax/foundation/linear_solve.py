@@ -1,8 +1,8 @@
 """Small linear systems by elimination, written out.
 
-In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device. The library's
-own `jax.numpy.linalg.solve` calls LAPACK system by system instead; worse, two of them in one compiled batch of some
-ten thousand can wait for each other for ever (jaxlib 0.10.2 on two cores: batched triangular solves share a pool of
+In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device.
+`jax.numpy.linalg.solve` calls LAPACK system by system instead. Worse, two such calls in one compiled batch of some ten
+thousand systems can wait for each other for ever (jaxlib 0.10.2 on two cores: batched triangular solves share a pool of
 threads and block it).
 """
 
@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-# Beyond, LAPACK is the better choice, and batches are small.
+# For larger systems LAPACK is the better choice, and batches of them are small.
 LARGEST = 10
 
 
 def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, " n *k"]) -> Inexact[Array, " n *k"]:
     """The solution of a linear system, by Gauss–Jordan elimination with partial pivoting.
 
-    Not finite for a singular matrix. Derivatives take one more solution each, not the derivative of every step.
+    Not finite for a singular matrix. A derivative takes one more solution; the elimination itself is not differentiated.
     """
     if matrix.shape[0] > LARGEST:
         return jnp.linalg.solve(matrix, right)

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 
 def value_and_slope(c: Sequence[Array] | Array, x: Array) -> tuple[Array, Array]:
-    """A polynomial and its first derivative; what is not used of them costs nothing once compiled."""
+    """A polynomial and its first derivative; a value that is not used costs nothing once compiled."""
     value, slope = _with_derivatives(c, x, 1)
     return value, slope
 
@@ -21,7 +21,7 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
 
 
 def extremum(c: Sequence[Array] | Array, x: Array, low: Array | float, high: Array, steps: int) -> Array:
-    """Where a polynomial's slope is zero, by so many steps of Newton's method from `x`, kept between `low` and `high`."""
+    """Where a polynomial's slope is zero, by `steps` steps of Newton's method from `x`, kept between `low` and `high`."""
 
     def nearer(_, x):
         _, slope, bend = value_slope_and_bend(c, x)

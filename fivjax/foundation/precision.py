@@ -1,10 +1,10 @@
-"""Double precision for everyone, and for nobody behind their back.
+"""Double precision inside fivjax, without touching the caller's JAX settings.
 
 JAX computes in single precision unless the user turns `jax_enable_x64` on. Contact dynamics near a stability limit
 needs more: the two modes differ by 0.03 Hz in 68 Hz. So each public function of fivjax runs inside JAX's own
 `enable_x64` context, which ends with the call: the caller's settings are never touched.
 
-Two consequences are dealt with here, once:
+Two consequences are dealt with here:
 
 - what a user builds (scenes) holds float64 *JAX* arrays, which keep their precision under `jax.grad` and `jax.vmap`;
 - what a user gets back (trajectories, eigenvalues) holds *NumPy* arrays when its values are known, because JAX would
@@ -24,7 +24,7 @@ from jaxtyping import Array
 
 P = ParamSpec("P")
 R = TypeVar("R")
-# What a user gets back: NumPy's where values are known, JAX's under a transformation; see above.
+# Arrays that a user gets back: NumPy's where values are known, JAX's under a transformation; see above.
 Returned = Array | np.ndarray
 
 
@@ -66,9 +66,9 @@ def is_known(value) -> bool:
 
 
 def is_differentiated_in_reverse(value) -> bool:
-    """Whether `jax.grad`, `jax.vjp` or `jax.linearize` waits for this value, as far as a tracer tells."""
+    """Whether this value is traced by `jax.grad`, `jax.vjp` or `jax.linearize`, as far as a tracer tells."""
     while isinstance(value, jax.core.Tracer):
-        # Its class is not public. Where it has another name, the refusal that asks for this is left to JAX.
+        # The tracer's class is not public. In a version of JAX that calls it otherwise, JAX's own error comes instead of ours.
         if type(value).__name__ == "LinearizeTracer":
             return True
         value = getattr(value, "primal", getattr(value, "val", None))
@@ -76,9 +76,9 @@ def is_differentiated_in_reverse(value) -> bool:
 
 
 def refusing_reverse_in_single_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, refused under reverse derivatives in a program in single precision, which JAX cannot take.
+    """`function`, refused under reverse-mode derivatives in a single-precision program, where JAX cannot take them.
 
-    It transposes double-precision code after the call, outside the context that makes double precision available.
+    JAX transposes the double-precision code after the call, outside the context that makes double precision available.
     """
 
     @functools.wraps(function)
@@ -94,7 +94,7 @@ def refusing_reverse_in_single_precision(function: Callable[P, R]) -> Callable[P
 
 
 def real_if_real(leaf):
-    """A real number or array of them as `real` has it; anything else (integers, words) unchanged."""
+    """Real numbers and arrays of them as `real` returns them; anything else (integers, strings) unchanged."""
     is_real = isinstance(leaf, float) or (hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.floating))
     return real(leaf) if is_real else leaf
 

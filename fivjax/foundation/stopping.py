@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM in a long run: noted when they arrive, obeyed where nothing is left half done.
+"""Ctrl-C and SIGTERM in a long run: noted when they arrive, obeyed at a point where no work is left half done.
 
-Python raises `KeyboardInterrupt` between any two instructions: in the middle of a record, or inside a destructor, where
-it is swallowed and the run goes on.
+Python raises `KeyboardInterrupt` between any two instructions: perhaps while a file is being written, or inside a destructor,
+where it is swallowed and the run goes on.
 """
 
 import contextlib
@@ -12,12 +12,12 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """Within, the first signal is only added to the list that this gives; who asks a second time is obeyed at once.
+    """Inside this context the first signal is only added to the list that it gives; a second one stops the run at once.
 
-    At the end the signals mean what they meant before, and a SIGTERM that was noted is sent again.
+    At the end the former handlers are back, and a SIGTERM that was noted is sent again.
     """
     caught: list[int] = []
-    # Only a program's main thread may say what a signal does.
+    # Only a program's main thread may set signal handlers.
     if threading.current_thread() is not threading.main_thread():
         yield caught
         return
