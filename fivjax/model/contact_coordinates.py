@@ -1,6 +1,6 @@
-r"""A structure in coordinates that hold its contacts' directions: what contact computes in.
+r"""A structure in coordinates that contain the displacements of its contacts. Contact is computed in these.
 
-Exact zeros decide in contact: a gap that is closed, slip that has run out. They exist only where gap and tangential
+Contact needs exact zeros: of a closed gap, and of the slip velocity while sticking. They exist only where gap and tangential
 displacement are coordinates. For contacts given by vectors, $q = X z$ replaces as many coordinates by $w^T q$ as there are
 directions; the others stay. Energies, forces and eigenvalues do not change.
 """
@@ -19,7 +19,7 @@ def transformation(structure: Structure) -> tuple[np.ndarray, list[int]]:
     n = structure.size
     columns = np.concatenate(directions(structure.contacts, n), axis=1)
     places = pivots(columns)
-    # z_places = Wᵀ q; all else is left alone.
+    # z at these places is Wᵀ q; the other coordinates stay.
     inverse = np.eye(n)
     inverse[places] = columns.T
     return np.linalg.inv(inverse), places
@@ -27,9 +27,9 @@ def transformation(structure: Structure) -> tuple[np.ndarray, list[int]]:
 
 @in_double_precision
 def in_contact_coordinates(structure: Structure) -> Structure:
-    """The same structure with every contact at coordinates; itself, where they are there already.
+    """The same structure with the directions of all contacts as coordinates; itself, where they are coordinates already.
 
-    New coordinates are called "tangential", "normal", or "tangential_0", "normal_0", … of several contacts; the others keep
+    New coordinates are called "tangential" and "normal", with several contacts "tangential_0", "normal_0", …; the others keep
     their names.
 
     **Example:**

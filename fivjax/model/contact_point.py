@@ -120,7 +120,7 @@ def directions(contacts: Sequence[ContactPoint], n: int) -> tuple[np.ndarray, np
 
 
 def pivots(columns: np.ndarray) -> list[int]:
-    """For each column a row that it may replace: the largest entries in an elimination, column after column."""
+    """For each column the row of its pivot in Gaussian elimination: the coordinate that this direction may replace."""
     left, rows = columns / np.linalg.norm(columns, axis=0), []
     for k in range(left.shape[1]):
         sizes = np.abs(left[:, k])

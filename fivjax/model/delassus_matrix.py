@@ -1,4 +1,4 @@
-r"""The Delassus matrix $G = W^T M^{-1} W$: how contact forces accelerate the contacts, and when sliding has one answer."""
+r"""The Delassus matrix $G = W^T M^{-1} W$: how contact forces accelerate the contacts, and whether sliding is unique."""
 
 import itertools
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from ..foundation.compiling import compiled
 from ..foundation.precision import returning_numpy
 from .structure import Structure
 
-# All subsets of contacts in all directions of slip are looked at: 65,536 determinants for eight contacts.
+# All subsets of contacts are checked in all directions of slip: at most 65,536 determinants for eight contacts.
 MOST_CONTACTS = 8
 
 
@@ -63,13 +63,14 @@ def _delassus(structure: Structure) -> Delassus:
 
 
 def has_one_solution(g: Delassus, friction: np.ndarray) -> bool:
-    r"""Whether any sliding under friction coefficients up to these has one answer, by NumPy.
+    r"""Whether sliding has a unique solution for all friction coefficients up to these, by NumPy.
 
-    Sliding contacts obey $(G_{nn} + G_{nt} D) N = -a_n$ with $D = \mathrm{diag}(σ_i μ_i)$; that has one solution with $N ≥ 0$
-    for every right-hand side where the matrix is a P-matrix: all principal minors positive. They are linear in each
-    $σ_i μ_i$, so the ends $±μ_i$ decide for all values between. For one contact this is $μ < G_{nn}/|G_{nt}|$ (Painlevé).
+    Sliding contacts obey $(G_{nn} + G_{nt} D) N = -a_n$ with $D = \mathrm{diag}(σ_i μ_i)$. A solution with $N ≥ 0$ (contacts
+    that would need less lift off) is unique for every right-hand side if the matrix is a P-matrix: all principal minors
+    positive. These are linear in each $σ_i μ_i$, so it is enough to check $±μ_i$. For one contact this is
+    $μ < G_{nn}/|G_{nt}|$ (Painlevé).
 
-    **Raises:** `ValueError` for more contacts than can be looked at, unless the coupling is so small that nothing has to be.
+    **Raises:** `ValueError` for more contacts than can be checked, unless the coupling is so small that no check is needed.
     """
     g = Delassus(*map(np.asarray, g))
     count = len(friction)

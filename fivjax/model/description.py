@@ -74,8 +74,8 @@ def arguments_of_scene(description: Mapping) -> dict:
     A structure made by a function that fivjax does not know comes back as its matrices: the same motion, without the
     names of its parameters.
 
-    **Raises:** `ValueError` for a friction law or a load of a class that is nowhere defined, or that its own numbers do not
-    make again.
+    **Raises:** `ValueError` for a friction law or a load whose class is not defined, or whose constructor does not take the
+    numbers that were saved.
     """
     parameters = description["parameters"]
     return {

@@ -1,8 +1,8 @@
 """Friction laws: the coefficient of friction as a function of slip speed.
 
-A law is a callable of the slip speed |v_rel| ≥ 0 (m/s). Its direction, and whether the contact slides at all, is the
-business of `contact`. Laws are smooth in the slip speed, also a little below zero, so that a step may look past the
-instant where sliding ends.
+A law is a callable of the slip speed |v_rel| ≥ 0 (m/s). The direction of slip, and whether the contact slides at all, are
+worked out in `contact`. Laws are smooth in the slip speed, also a little below zero, so that a step may go past the instant
+where sliding ends.
 """
 
 import abc
@@ -19,7 +19,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
 from .printing import as_call
 
-# Where a law is looked at: m/s.
+# Slip speeds at which a law is checked, in m/s.
 SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 121)])
 
 
@@ -27,9 +27,9 @@ class AbstractFriction(eqx.Module):
     r"""A friction law: what `contact` and the verdicts ask of one, and what they rely on.
 
     - `law(v)` is the coefficient at slip speed $v \ge 0$ in m/s, smooth and also defined a little below zero.
-    - $0 \le μ(v) \le$ `static` for all $v \ge 0$: a contact that slips more easily while it sticks would chatter without end,
-      and Painlevé's limit is asked of `static`.
-    - `variation(v)` bounds $|μ'|$ and $|μ''|$ at and above $v$: proofs that sliding goes on rest on it.
+    - $0 \le μ(v) \le$ `static` for all $v \ge 0$: a contact with less static than sliding friction would chatter without end,
+      and Painlevé's limit is checked with `static`.
+    - `variation(v)` bounds $|μ'|$ and $|μ''|$ at and above $v$ (in s/m and s²/m²): proofs that sliding goes on rest on it.
     - `constant` says that μ never changes.
 
     A scene checks this where values are known, at slip speeds from 0 to 1e6 m/s, and holds the law's numbers in double
@@ -41,10 +41,10 @@ class AbstractFriction(eqx.Module):
         >>> isinstance(scene.friction, fj.AbstractFriction)
         True
 
-    `docs/extending.md` has a law of one's own.
+    `docs/extending.md` shows how to write a law of your own.
     """
 
-    # Constant friction makes every status linear; exact methods rest on that.
+    # Constant friction makes the motion in every status linear; exact methods rest on that.
     constant: eqx.AbstractClassVar[bool]
 
     @property
@@ -79,14 +79,14 @@ class AbstractFriction(eqx.Module):
         if self.constant:
             refuse(mu != mu[0], "not change with slip speed where `constant` is true")
         for what, values, bound in (("|μ'|", slope, bounds[0]), ("|μ''|", bend, bounds[1])):
-            # The largest from each speed on.
+            # The largest value at this speed and above.
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
             refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
 
     def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
         """The next Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one).
 
-        `friction` has the coefficients of μ that are known; a law with a recurrence of its own needs no more than these.
+        `friction` has the coefficients of μ that are known already; a law with a recurrence formula may need only these.
         """
         del friction
         order = len(slip) - 1
@@ -96,7 +96,7 @@ class AbstractFriction(eqx.Module):
 
     @abc.abstractmethod
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Bounds on |μ'| and |μ''| at and above this slip speed, for proofs about the future."""
+        """Bounds on |μ'| (s/m) and |μ''| (s²/m²) at and above this slip speed, for proofs about the future."""
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))
@@ -193,7 +193,7 @@ class ExponentialDecay(AbstractFriction):
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)
 
     def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
-        # The exponential's own recurrence, Ė = -d u̇ E, does not start anew at every order as the general way does.
+        # The recurrence Ė = -d u̇ E takes one more term; the general way computes all orders anew each time.
         order = len(slip) - 1
         falling = [friction[0] - self.mu_dynamic, *friction[1:]]
         return -self.decay / order * sum(j * slip[j] * falling[order - j] for j in range(1, order + 1))

@@ -27,7 +27,7 @@ class FrictionPerContact(AbstractFriction):
             arguments.instance(f"friction[{i}]", law, AbstractFriction, "a friction law, such as Coulomb(mu=0.2)")
         self.laws = tuple(laws)
 
-    # What the class promises as a class variable depends here on the laws.
+    # A class variable of the base class, but here it depends on the laws.
     @property
     def constant(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return all(law.constant for law in self.laws)

@@ -1,7 +1,7 @@
 """The load that presses the structure onto the belt: piecewise constant in time.
 
-A load says its value and the instants where it jumps, so that no step straddles a jump and no derivative is taken
-through one.
+A load gives its value and the instants where it jumps, so that every step ends at a jump and none is differentiated across
+one.
 """
 
 import abc
@@ -31,10 +31,10 @@ class AbstractLoad(eqx.Module):
         >>> isinstance(scene.load, fj.AbstractLoad)
         True
 
-    `docs/extending.md` has a load of one's own.
+    `docs/extending.md` shows how to write a load of your own.
     """
 
-    # Before any jump: the load whose sliding equilibrium a run starts from.
+    # Before the first jump, in N: a run starts from sliding equilibrium under this load.
     force: eqx.AbstractVar[Float[Array, ""]]
 
     @property

@@ -29,10 +29,10 @@ def check_matrix(name: str, matrix, *, definite: bool) -> None:
             f"Argument `{name}` must be symmetric, but entry ({i}, {j}) is {array[i, j]:g} and entry ({j}, {i}) is "
             f"{array[j, i]:g}. Friction does not belong here: give the symmetric matrix of the free structure."
         )
-    # Judged after scaling the diagonal to one, so that masses of very different size do not look indefinite.
+    # Checked after scaling the diagonal to one, so that masses of very different size do not look indefinite.
     diagonal = np.diag(array)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    # One side after the other: of the smallest numbers there are, the product of two such scales is infinite.
+    # Rows first, then columns: the product of two scales of the smallest possible numbers would be infinite.
     lowest = np.linalg.eigvalsh(array * scale * scale[:, None])[0]
     if definite and lowest <= 0:
         raise ValueError(

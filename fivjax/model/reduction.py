@@ -1,8 +1,8 @@
-r"""Craig–Bampton reduction: a structure of many thousand degrees of freedom by its contacts and a few modes.
+r"""Craig–Bampton reduction: a structure of many thousand degrees of freedom, described by its contacts and a few modes.
 
-The displacements are written as $q = T z$. Among the columns of $T$ are the static shapes that each coordinate at a contact
-causes while the others are held, the modes of the structure with all of these held, up to a frequency, and the static answer
-to the load. (Craig, Bampton, AIAA Journal 6, 1968.) What is static is exact; the error of frequencies is reported.
+The displacements are written as $q = T z$. The columns of $T$ are the static shape for a unit displacement of each coordinate
+at a contact while the others are held, the modes up to a frequency with all of these coordinates held, and the static response
+to the load (Craig and Bampton, AIAA Journal 6, 1968). Static displacements are exact; the error of frequencies is reported.
 """
 
 import dataclasses
@@ -17,9 +17,9 @@ from .sparse_structure import SparseStructure
 from .structure import Structure
 from .structure_checks import lowest_modes
 
-# Modes are asked for in lots that grow, until one lies above the frequency.
+# Modes are computed in growing numbers, until one lies above the frequency; first so many.
 FIRST_LOT = 20
-# A static shape that modes make up to this share adds nothing but rounding.
+# A static shape of which the modes leave less than this share would add only rounding.
 NEW_SHAPE = 1e-6
 
 
@@ -29,8 +29,8 @@ class Reduction:
 
     - `structure`: the reduced `fj.Structure`; its contacts are at coordinates of their own.
     - `basis`: `(n, m)`, displacements of the full structure for each reduced coordinate: `q = basis @ z`.
-    - `frequencies`: of the full structure, free of contact and undamped, up to the frequency asked for, in Hz.
-    - `reduced_frequencies`: those of the reduced structure beside them, in Hz.
+    - `frequencies`: of the full structure, without contact and damping, up to the frequency asked for, in Hz.
+    - `reduced_frequencies`: the same frequencies of the reduced structure, in Hz.
 
     **Example:** see `fj.craig_bampton`.
     """
@@ -67,19 +67,20 @@ def craig_bampton(
         print(reduction)
         scene = fj.Scene(reduction.structure, fj.Coulomb(0.4), belt_speed=2.0)
 
-    Twice the highest frequency of interest is a common choice. The frequencies of the full structure are computed, too, and
-    compared.
+    Twice the highest frequency of interest is a common choice for `up_to`. The frequencies of the full structure are computed,
+    too, and compared.
 
     **Arguments:**
 
     - `structure`: as `fj.read_structure` gives it, with at least one contact.
     - `up_to`: the frequency in Hz up to which modes with held contacts are kept.
     - `keep`: further coordinates to keep, by node and direction (or by index where there are no labels).
-    - `damping_ratio`: damping to add, the same share of critical in each mode of the free reduced structure.
+    - `damping_ratio`: damping to add, the same share of critical damping in each mode of the reduced structure without contact.
 
     **Returns:** a `Reduction`.
 
-    **Raises:** `ValueError` for a structure without contacts, not symmetric, or loose where its contacts are held.
+    **Raises:** `ValueError` for a structure that has no contacts, is not symmetric, or has a part that moves freely although
+    the contacts are held.
 
     **Example:**
 
@@ -127,7 +128,7 @@ def craig_bampton(
         columns[0][inner] = -factors.solve(stiffness[inner][:, outer].toarray())
         shape = factors.solve(structure.load_direction[inner])
         if np.any(shape):
-            # What the modes do not hold of it already, in their measure.
+            # The part of it that the modes do not represent (they are orthonormal in the mass matrix).
             rest = shape - modes @ (modes.T @ (mass[inner][:, inner] @ shape))
             if rest @ held @ rest > NEW_SHAPE**2 * (shape @ held @ shape):
                 norm = np.sqrt(rest @ mass[inner][:, inner] @ rest)
@@ -162,7 +163,7 @@ def _structure(full: SparseStructure, basis: np.ndarray, outer: np.ndarray, mode
     count = full.normal_directions.shape[1]
     tangential, normal = basis.T @ full.tangential_directions, basis.T @ full.normal_directions
     raw = seen_through(basis, [ContactPoint(tangential[:, i], normal[:, i]) for i in range(count)])
-    # Contacts at coordinates of their own: what else takes structures asks for that.
+    # Contacts get coordinates of their own, because other functions need them there.
     turn, places = transformation(raw)
     basis = basis @ turn
     for i in range(count):

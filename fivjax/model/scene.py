@@ -30,9 +30,9 @@ class Scene(eqx.Module):
     **Arguments:**
 
     - `structure`: a `Structure`, for instance from `belt_oscillator()`.
-    - `friction`: `Coulomb` or `ExponentialDecay`; a list of laws for several contacts, one each.
+    - `friction`: `Coulomb`, `ExponentialDecay` or a law of your own; for several contacts, one law for all or a list of laws.
     - `belt_speed`: in m/s; sliding equilibrium needs one that is not zero. One number, or one for each contact.
-    - `load`: `ConstantLoad` or `Pulse`.
+    - `load`: `ConstantLoad`, `Pulse` or a load of your own; `ConstantLoad()` unless given.
     - `restitution`: Newton's coefficient for the closing gap, 0 (inelastic) to 1. One number, or one for each contact.
     - `impact_law`: what happens where the gap closes: "coulomb" (an impulse with Coulomb friction), "frictionless" (an impulse
       along the normal alone) or "reset" (the gap stops closing, all other velocities stay).
@@ -96,7 +96,7 @@ class Scene(eqx.Module):
         if isinstance(self.friction, FrictionPerContact):
             found.update(self.friction.parameters)
         for part in (self.friction, self.load):
-            # What else is in a law of the user's own, words and switches, is no parameter.
+            # Other fields of a user's own law, such as strings and switches, are no parameters.
             found.update({name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)})
         return {**found, **self.structure.parameters}
 
@@ -196,13 +196,15 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
 
 
 def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:
-    """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is none."""
+    """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is no such
+    state.
+    """
     structure = scene.structure
     friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
     _, _, stiffness = sliding_matrices(structure, friction)
     load = sliding_load(structure, friction)
     reduced = jnp.linalg.solve(stiffness, load * force)
-    # A motion that is free but for rounding answers with displacements whose rounding alone outweighs the load.
+    # Where the stiffness is singular but for rounding, the displacements are so large that their rounding outweighs the load.
     rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
     reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
     _, normal = contact_coordinates(structure)
@@ -217,7 +219,7 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
 
 
 def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
-    """The slip speed of steady sliding; of several contacts, of each."""
+    """The slip speed of steady sliding, in m/s; one for each of several contacts."""
     speed, count = jnp.abs(scene.belt_speed), len(scene.structure.contacts)
     return speed if count == 1 else jnp.broadcast_to(speed, count)
 
@@ -231,6 +233,8 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
 
     For the belt oscillator this is $(m_2 + m_1 \cos^2θ)/(m_1 \sinθ \cosθ)$: 108.49 at θ = 0.01. Infinite where the
     mass matrix does not couple the two contact coordinates.
+
+    **Raises:** `ValueError` for several contacts, or for one whose directions are no coordinates.
 
     **Example:**
 
@@ -249,7 +253,7 @@ def _painleve_friction(structure: Structure):
 
 
 def refuse_several_contacts(structure: Structure, who: str) -> None:
-    """Refuse, for `who` takes only that, anything but one contact at two coordinates."""
+    """Refuse anything but one contact at two coordinates; `who`, the function that needs this, is named in the error."""
     if len(structure.contacts) > 1:
         raise ValueError(
             f"{who} takes structures with one contact, but this one has {len(structure.contacts)}. `simulate` takes several."
@@ -258,7 +262,7 @@ def refuse_several_contacts(structure: Structure, who: str) -> None:
 
 
 def refuse_vector_contacts(structure: Structure, who: str) -> None:
-    """Refuse, for `who` takes only that, contacts that are not at coordinates."""
+    """Refuse contacts that are not at coordinates; `who`, the function that needs this, is named in the error."""
     if not structure.contacts_at_coordinates:
         raise ValueError(
             f"{who} takes contacts whose directions are coordinates, but some of these are vectors. Give the structure as "

@@ -2,8 +2,8 @@ r"""Sliding as a projection of the structure: the normal coordinate is held, and
 
 While a contact slides, its normal coordinate stays at zero and that row gives the normal force $N$. Friction
 $T = σμN$ then adds $-σμ$ times that row to the tangential one; of several contacts, all slide.
-Everything that needs the sliding motion's matrices, its coordinates or its load takes them from here; without friction
-($μ = 0$) they are the structure's own, normal rows left out.
+Everything that needs the matrices, the coordinates or the load of the sliding motion takes them from here. Without friction
+($μ = 0$) they are the structure's own without the normal rows and columns.
 """
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ Places = int | np.ndarray
 
 
 def contact_coordinates(structure: Structure) -> tuple[Places, Places]:
-    """The tangential and the normal coordinate of a structure's contact; of several contacts, those of all of them."""
+    """The tangential and the normal coordinate of a structure's contact; with several contacts, an array of each."""
     if len(structure.places) == 1:
         return structure.tangential, structure.normal
     tangential, normal = zip(*structure.places, strict=True)
@@ -30,7 +30,7 @@ def sliding_coordinates(size: int, normal: Places) -> np.ndarray:
 
 
 def sliding_states(size: int, normal: Places) -> np.ndarray:
-    """Places of the same coordinates in a state: displacements first, then velocities."""
+    """Places of these coordinates in a state: displacements first, then velocities."""
     free = sliding_coordinates(size, normal)
     return np.concatenate([free, size + free])
 

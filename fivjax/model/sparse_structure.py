@@ -23,7 +23,7 @@ class SparseStructure:
     - `labels`: node and direction of each coordinate; None where the files do not say.
     - `checks`: what was found about the matrices; print it.
 
-    It is made small for simulations and maps by `fj.craig_bampton`, and read by `fj.cea.complex_modes` as it is.
+    `fj.craig_bampton` reduces it for simulations and maps; `fj.cea.complex_modes` takes it as it is.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""A stiffness matrix as springs that are each stretched by the motion, so that a rigid motion stretches none."""
+"""A stiffness matrix as independent springs, none of which is stretched by a rigid motion."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,10 +6,10 @@ from jaxtyping import Array, Float
 
 
 class Springs(eqx.Module):
-    r"""A stiffness matrix as so many springs, $K = B^T \mathrm{diag}(k) B$ with a triangular $B$.
+    r"""A stiffness matrix as n springs, $K = B^T \mathrm{diag}(k) B$ with a triangular $B$.
 
-    Structures may be free to move as a whole. In $Kq$ the stiff springs cancel then only to rounding, which pulls a soft
-    structure back that has come far; the stretches $Bq$ of such a motion are zero, and so are the forces.
+    A structure may be free to move as a whole. In $Kq$ its stiff springs then cancel only to rounding; far from the origin this
+    leaves a force that pulls it back. The stretches $Bq$ of a rigid motion are zero, and so are the forces computed from them.
     """
 
     stretch: Float[Array, "n n"]  # B, how displacements stretch the springs
@@ -20,7 +20,7 @@ class Springs(eqx.Module):
         eps = float(jnp.finfo(stiffness.dtype).eps)
         for k in range(n):
             rate = left[k, k]
-            # What elimination leaves of a stiffness that is no larger than its rounding is none.
+            # A remainder of the elimination that is no larger than its rounding stands for zero.
             rate = jnp.where(rate > 16 * n * eps * stiffness[k, k], rate, 0.0)
             column = jnp.where(jnp.arange(n) > k, left[:, k] / jnp.where(rate > 0, rate, 1.0), 0.0)
             column = jnp.where(rate > 0, column, 0.0).at[k].set(1.0)

@@ -1,10 +1,10 @@
-"""The vibrating structure: symmetric matrices, where the load acts, and which coordinates touch the belt.
+"""The vibrating structure: symmetric matrices, the direction of the load, and the directions of its contacts.
 
-A structure knows nothing of contact or friction. Sliding and sticking are projections of its matrices, done in
-`contact`; nothing outside `belt_oscillator` knows a spring or an angle by name.
+A structure has no contact forces and no friction. Sliding and sticking are projections of its matrices (`sliding`, `contact`);
+nothing outside `belt_oscillator` depends on the names of springs or angles.
 
-A structure holds either matrices, or the parameters that its matrices are worked out from whenever they are asked for:
-one truth, so that the two cannot disagree.
+A structure holds either its matrices, or the parameters from which they are worked out each time, never both: so the two
+cannot disagree.
 """
 
 import functools
@@ -25,7 +25,7 @@ from .printing import as_call
 
 
 class Matrices(NamedTuple):
-    """What a structure is to those who compute with it."""
+    """The four arrays of a structure that computations need."""
 
     mass: Float[Array, "n n"]  # kg
     damping: Float[Array, "n n"]  # N·s/m
@@ -41,7 +41,7 @@ class FromParameters(eqx.Module):
     matrices_of: Callable[..., tuple] = eqx.field(static=True)
     # Which parameters are dampers: the damping matrix is a sum of parts, each proportional to one of them.
     dampers: tuple[str, ...] = eqx.field(static=True)
-    # What made the structure from parameters, and refuses bad ones: `replace` calls it again.
+    # The function that made the structure from parameters and checks them: `replace` calls it again.
     builder: "Callable[..., Structure] | None" = eqx.field(static=True)
 
     @property
@@ -56,8 +56,8 @@ class FromParameters(eqx.Module):
 
     @property
     def damping_parts(self) -> dict[str, Float[Array, "n n"]]:
-        """The damping matrix apart by damper, in N·s/m."""
-        # The matrix is linear in the dampers, so a part is what is left of it without the others.
+        """The part of the damping matrix of each damper, in N·s/m."""
+        # The matrix is linear in the dampers, so a part is the matrix with the other dampers at zero.
         return {
             name: self._at(
                 {
@@ -83,7 +83,7 @@ def _matrices(matrices_of: Callable[..., tuple], parameters: dict[str, Float[Arr
     def matrices(parameters):
         return Matrices(*map(jnp.asarray, matrices_of(**parameters)))
 
-    # What comes out of `vmap` has leading axes; so have its matrices.
+    # Parameters that come out of `vmap` have leading axes; so have the matrices made from them.
     names, values = list(parameters), jnp.broadcast_arrays(*parameters.values())
     for _ in range(values[0].ndim):
         matrices = jax.vmap(matrices)
@@ -114,7 +114,7 @@ class Structure(eqx.Module):
     `Structure.from_parameters` makes one whose matrices follow from named parameters, as `belt_oscillator` does.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for a wrong shape, a non-finite entry, an unsymmetric or
-    indefinite matrix, an index out of range, directions that follow from one another, or names that are not as many as
+    indefinite matrix, an index out of range, directions that are linearly dependent, or a number of names that is not that of
     the coordinates.
 
     **Example:**
@@ -124,7 +124,7 @@ class Structure(eqx.Module):
         2
     """
 
-    # The one truth: matrices, or what they follow from. Everything else is read from here.
+    # The matrices, or the parameters that they follow from. Everything else is read from here.
     source: "Matrices | FromParameters"
     coordinates: tuple[str, ...] = eqx.field(static=True)
     # The contacts' directions: indices, or vectors as tuples.
@@ -191,12 +191,11 @@ class Structure(eqx.Module):
           written with `jax.numpy`.
         - `parameters`: their values by name.
         - `tangential`, `normal`, `contacts`, `coordinates`: as for `Structure`.
-        - `dampers`: names of the parameters that the damping matrix is proportional to, a part to each; the energy
-          ledger then tells their losses apart.
-        - `builder`: the function of the parameters by name that called this one, for `replace` to call again, with its
-          own refusals.
+        - `dampers`: names of the dampers: the damping matrix is a sum of parts, each proportional to one of these parameters.
+          The energy ledger then has a line for each.
+        - `builder`: the function of the parameters by name that calls this one. `replace` calls it again, with its own checks.
 
-        **Raises:** what `Structure` does, of the matrices at these values.
+        **Raises:** what `Structure` raises for the matrices at these values.
         """
         for name, value in parameters.items():
             arguments.real_number(name, value)
@@ -210,7 +209,7 @@ class Structure(eqx.Module):
 
     @property
     def contacts(self) -> tuple[ContactPoint, ...]:
-        """Where it may touch the belt."""
+        """The contacts, in order."""
 
         def direction(place: Place) -> int | np.ndarray:
             return np.array(place) if isinstance(place, tuple) else place
@@ -264,7 +263,7 @@ class Structure(eqx.Module):
 
     @property
     def matrices(self) -> Matrices:
-        """All four at once, for those who need more than one."""
+        """Mass, damping, stiffness and load direction at once, worked out together."""
         return self.source.matrices if isinstance(self.source, FromParameters) else self.source
 
     @property
@@ -274,7 +273,7 @@ class Structure(eqx.Module):
 
     @property
     def builder(self) -> "Callable[..., Structure] | None":
-        """The function that made the structure from its parameters, if it said so."""
+        """The function that made the structure from its parameters, if `from_parameters` was given one."""
         return self.source.builder if isinstance(self.source, FromParameters) else None
 
     @property
@@ -299,7 +298,7 @@ class Structure(eqx.Module):
 
     @property
     def damping_parts(self) -> dict[str, Float[Array, "n n"]]:
-        """The damping matrix apart by damper, in N·s/m; empty where the structure was given as matrices."""
+        """The part of the damping matrix of each damper, in N·s/m; empty where the structure was given as matrices."""
         return self.source.damping_parts if isinstance(self.source, FromParameters) else {}
 
     @property
@@ -310,7 +309,9 @@ class Structure(eqx.Module):
     @property
     @in_double_precision
     def weights(self) -> Float[Array, " state"]:
-        """What makes the squares of displacements and velocities comparable energies: the square roots of the diagonals."""
+        """Factors that make squares of displacements and velocities comparable, as energies: square roots of the diagonals
+        of stiffness and mass.
+        """
         matrices = self.matrices
         return jnp.sqrt(jnp.concatenate([jnp.diag(matrices.stiffness), jnp.diag(matrices.mass)]))
 

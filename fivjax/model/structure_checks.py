@@ -18,9 +18,9 @@ class StructureChecks:
 
     - `asymmetry`: by matrix, the largest difference across the diagonal over the largest entry.
     - `negative_masses`, `negative_springs`: how many eigenvalues of the mass and of the stiffness matrix are negative; None
-      where it was not to be had, because the matrix is not symmetric.
+      where this could not be found, because the matrix is not symmetric.
     - `massless`: how many degrees of freedom have no mass.
-    - `rigid_body_modes`, `lowest_frequencies` (Hz): of the undamped, free structure, without contact; None as above.
+    - `rigid_body_modes`, `lowest_frequencies` (Hz): of the structure without damping and contact; None as above.
     - `total_mass`: in kg along x, y and z; None where no labels say which rows belong to which direction.
     - `fixed`: how many degrees of freedom the file marks as held, which were left out.
     - `remarks`: what else is worth a look, one sentence each.
@@ -83,7 +83,7 @@ def _of(count: int, one: str, many: str = "") -> str:
 
 
 def check_matrices(mass, damping, stiffness, directions, *, fixed: int = 0, remarks=()) -> StructureChecks:
-    """The checks of sparse matrices; `directions`, one for each row, 1 to 3 for translations along x, y, z, or None."""
+    """The checks of sparse matrices. `directions`: one for each row, 1 to 3 for translations along x, y, z; or None."""
     matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
     asymmetry = {name: _asymmetry(matrix) for name, matrix in matrices.items()}
     massless = int(np.sum(np.diff(mass.tocsr().indptr) == 0))
@@ -116,9 +116,9 @@ def _asymmetry(matrix) -> float:
 
 
 def negative_eigenvalues(matrix) -> int | None:
-    """How many eigenvalues of a symmetric sparse matrix are negative, beyond rounding; None where that cannot be told.
+    """How many eigenvalues of a symmetric sparse matrix are negative beyond rounding; None where this cannot be found.
 
-    By Sylvester's law of inertia: as many as there are negative pivots in a symmetric elimination.
+    By Sylvester's law of inertia there are as many as negative pivots in a symmetric elimination.
     """
     from scipy import sparse
     from scipy.sparse.linalg import splu
@@ -152,7 +152,7 @@ def lowest_modes(stiffness, mass, count: int) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse.linalg import eigsh
 
     n = stiffness.shape[0]
-    # What spring and mass of one degree of freedom make, as a measure of ω².
+    # Stiffness over mass of each degree of freedom, as a measure of ω².
     with np.errstate(divide="ignore", invalid="ignore"):
         squares = stiffness.diagonal() / mass.diagonal()
     squares = squares[np.isfinite(squares) & (squares > 0)]
