@@ -1,4 +1,4 @@
-r"""The one physics: accelerations, contact forces, what ends a status, and what follows.
+r"""The physics of contact, written once: accelerations, contact forces, what ends a status, and what follows.
 
 A contact sticks (0), slides (1) or is detached (2). With the free acceleration $a^f = M^{-1}(fF - C\dot q - Kq)$ and the
 contact's compliance $G = E^T M^{-1} E$, $E = [e_t, e_n]$, every status is the free structure plus contact forces
@@ -10,20 +10,19 @@ $a = a^f + M^{-1}(e_t T + e_n N)$ that keep what the status demands:
 | slide | $a_n = 0$, $T = \sigma \mu N$ | $N = -a^f_n / (G_{nn} + \sigma \mu G_{nt})$ |
 | detach | | $T = N = 0$ |
 
-with $\sigma = -\mathrm{sign}(\dot q_t - v_{belt})$. These are Eqs. 3, 6 and 5 of the paper, for any structure: the
-projection of the symmetric free matrices replaces typing each set in.
+with $\sigma = -\mathrm{sign}(\dot q_t - v_{belt})$. These are Eqs. 6, 3 and 5 of the paper, for any structure: each follows by
+projection from the symmetric matrices of the free structure.
 
 A status lasts while its *guards* are positive: the two edges of the friction cone while sticking, N and the slip speed
 while sliding, the gap while detached. When one is used up, `transition` puts the state on its constraint, applies the
 impact law where the gap closed, and chooses the next status from the forces, never from which guard it was.
 
-Where a high load stores much more energy than a small vibration moves, states as totals cannot hold the vibration: its
-digits are lost in the rounding of what is at rest. `Mechanics.about` makes mechanics for displacements and loads that are
-deviations from a `Rest` instead. The free acceleration is then that under the contact forces at rest, and `ModeForces`
-are what is *added* to those; `guards` and `contact_forces` are of the total forces either way.
+Under a high load, a small vibration is lost in the rounding of the static displacements. `Mechanics.about` therefore makes
+mechanics for displacements and loads that are deviations from a `Rest`. The free acceleration then includes the contact forces
+at rest, and `ModeForces` are *added* to those; `guards` and `contact_forces` are those of the total forces in both cases.
 
-Everything here is about one instant; batches come from `jax.vmap`. Of one contact a status, a force or a guard's value is a
-number. Of several, each has a last axis over the contacts: the demands of all of them are one linear system
+Everything here is about one instant; batches come from `jax.vmap`. With one contact a status, a force or a guard's value is a
+number. With several, each has a last axis over the contacts: the demands of all contacts are one linear system
 (`mode_forces`), and what follows from an event is found for all of them at once (`contact_problem`).
 """
 

@@ -1,7 +1,7 @@
 r"""Which mode several contacts take at an instant: the laws of Signorini and Coulomb, solved together.
 
-Forces change what the contacts do, $a = b + G λ$: accelerations by forces, or velocities by impulses. Each contact is in one of
-four states, and every state demands something and is admissible under a condition:
+The contacts' accelerations $a = b + G λ$ depend on the contact forces λ; in an impact, velocities depend in the same way on
+impulses. Each contact is in one of four states; every state demands something, and is admissible under a condition:
 
 | state | demands | admissible where |
 |---|---|---|
@@ -10,9 +10,10 @@ four states, and every state demands something and is admissible under a conditi
 | BACKWARD | $T = -μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≥ 0$ |
 | OPEN | $T = N = 0$ | $a_n ≥ 0$ |
 
-For a P-matrix of sliding one combination is admissible but for ties. Up to three contacts all are tried at once (`enumerated`),
-beyond that one contact's state is changed after another (`pivoted`). Ties go to what sticks. At an event some condition is
-zero but for rounding; the state that has just `ended` must then be admissible clearly, or it would be taken again.
+If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to three contacts all
+combinations are tried at once (`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to
+sticking. At an event some condition is zero up to rounding, so the state that has just `ended` must be admissible by a clear
+margin, or it would be chosen again.
 """
 
 import itertools
@@ -31,7 +32,7 @@ STICK, FORWARD, BACKWARD, OPEN = range(4)
 NONE = -1
 # All combinations are tried for up to this many contacts: 64.
 MOST_ENUMERATED = 3
-# Conditions are met where they are this share of the terms in them, or less, on the wrong side.
+# A condition counts as met if it is violated by no more than this share of the terms in it.
 TIE = {"float64": 1e-12, "float32": 1e-5}
 
 
@@ -45,11 +46,11 @@ class ContactProblem(NamedTuple):
     cone_edges: Float[Array, " c 2"]  # added to T's distances from the edges of its cone; zero for total forces
     static: Float[Array, " c"]  # coefficient of friction that sticking holds
     pressing: Float[Array, " c"]  # added to N for the total; zero for total forces
-    otherwise: Float[Array, "c 4"]  # what each state asks of T beside its law, of forces that are not totals
+    otherwise: Float[Array, "c 4"]  # right-hand side of each state's equation for T; zero for total forces
     open_normal: Float[Array, " c"]  # N of an open contact; zero for total forces
     allowed: Bool[Array, "c 4"]
-    slips: Bool[Array, " c"]  # already, so that the state does not have to agree with its acceleration
-    away: Bool[Array, " c"]  # off the belt, so that nothing is asked of its gap
+    slips: Bool[Array, " c"]  # slips already, so that there is no condition on its acceleration
+    away: Bool[Array, " c"]  # off the belt, so that there is no condition on its gap
     ended: Int[Array, " c"]  # the state that has just ended, or NONE
     force_size: Float[Array, " c"]  # of the terms in forces, and in accelerations
     change_size: Float[Array, " c"]
@@ -68,8 +69,8 @@ def forces_of(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[A
 
 
 def margins(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """By how much the conditions of these states on forces and on accelerations are met, relative to the terms in them;
-    infinite where there is none.
+    """By how much the conditions of these states on forces, and those on accelerations, are met, relative to the terms in them;
+    infinite where there is no condition.
     """
     holding, normal_force = forces_of(problem, state)
     g_tt, g_tn, g_nn = problem.mechanics.compliance
@@ -88,7 +89,7 @@ def margins(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[Arr
 
 
 def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " c"]:
-    """How far each contact is from being admissible in these states, relative to the terms in its conditions; zero if it is."""
+    """How far each contact's state is from admissible, relative to the terms in its conditions; zero if it is admissible."""
     force_margin, change_margin = margins(problem, state)
     tie = TIE[problem.normal.dtype.name]
     need = jnp.where(state == problem.ended, tie, -tie)
@@ -98,19 +99,19 @@ def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " 
 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
-    """The admissible states of all contacts, or those that come closest; `start` is a guess."""
+    """The admissible states of all contacts, or the states that come closest to it; `start` is a guess."""
     problem, start = jax.lax.stop_gradient((problem, start))
     return (enumerated if len(start) <= MOST_ENUMERATED else pivoted)(problem, start)
 
 
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
-    """By trying all combinations. Ties go to what most contacts are in at the `start`, then to what sticks most."""
+    """By trying all combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking."""
     every = np.array(sorted(itertools.product(range(4), repeat=len(problem.slips)), key=_preference), np.int32)
     violations = jax.vmap(lambda state: jnp.max(_judged(problem, state)))(jnp.asarray(every))
-    # A contact that has just lifted off may be put back as well as not; it is left alone.
+    # A contact that has just lifted off may be admissible on the belt as well; it stays off.
     changes = jnp.sum(every != start, axis=1) * (0.1 * TIE[violations.dtype.name])
     best = jax.lax.argmin(violations + changes, 0, jnp.int32)
-    # A sum over a row of ones and a rest of zeros: in a batch, no gather.
+    # The best row as a masked sum: an index would become a gather in a batch.
     return jnp.sum(jnp.where((jnp.arange(len(every)) == best)[:, None], every, 0), axis=0).astype(jnp.int32)
 
 
@@ -119,10 +120,10 @@ def _preference(states: tuple[int, ...]) -> tuple[int, int]:
 
 
 def pivoted(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
-    """By principal pivoting: one contact that is not admissible after another takes the state that is, as the others are.
+    """By principal pivoting: in each step one contact whose state is not admissible takes a state that is, given the others'.
 
-    First the worst of them, which seldom takes more than a few changes from a good guess; then, as Murty's rule has it, the
-    first, which for a P-matrix comes to an end. The best states met are kept.
+    At first the worst contact changes, which seldom takes more than a few steps from a good guess; later the first one (Murty's
+    rule), which for a P-matrix is sure to end. The best states met are kept.
     """
     count = len(problem.slips)
 
@@ -138,7 +139,7 @@ def pivoted(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"
         mine = np.arange(count) == chosen
         options = jnp.where(mine, jnp.arange(4, dtype=jnp.int32)[:, None], state)
         own = jax.vmap(lambda option: jnp.sum(jnp.where(mine, _judged(problem, option), 0.0)))(options)
-        # Its present state is not the answer, whatever rounding says.
+        # Its present state is excluded, whatever rounding says.
         own = jnp.where(jnp.arange(4) == jnp.sum(jnp.where(mine, state, 0)), jnp.inf, own)
         change = jax.lax.argmin(own, 0, jnp.int32)
         return jnp.where(mine, change, state), best, least, step + 1, worst > 0

@@ -1,4 +1,4 @@
-"""Reading and writing the contacts' coordinates in vectors that have all of them; the same of one contact and of several."""
+"""Reading and writing the contacts' entries of a vector over all coordinates, for one contact and for several."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ Places = int | np.ndarray
 
 
 def spread(columns: Float[Array, "n *contacts"], forces: Float[Array, "*contacts"]) -> Float[Array, " n"]:
-    """What contact forces do to all coordinates: columns times forces, summed over the contacts."""
+    """The effect of contact forces on all coordinates: columns times forces, summed over the contacts."""
     return columns * forces if columns.ndim == 1 else columns @ forces
 
 
 def at_places(size: int, places: Places, condition: Bool[Array, "*contacts"]) -> Bool[Array, " size"]:
-    """Where a vector belongs to contacts of which something is true."""
+    """Which entries of a vector belong to contacts for which the condition holds."""
     index = np.arange(size)
     if isinstance(places, np.ndarray):
         return jnp.any((index == places[:, None]) & condition[:, None], axis=0)
@@ -23,7 +23,7 @@ def at_places(size: int, places: Places, condition: Bool[Array, "*contacts"]) ->
 
 
 def with_values(vector: Float[Array, " k"], values: Sequence[tuple[Places, Array]]) -> Float[Array, " k"]:
-    """The vector with other values in the contacts' places."""
+    """The vector with new values at the contacts' places."""
     index = np.arange(vector.shape[0])
     for places, value in values:
         if not isinstance(places, np.ndarray):
@@ -31,7 +31,7 @@ def with_values(vector: Float[Array, " k"], values: Sequence[tuple[Places, Array
     several = [(places, value) for places, value in values if isinstance(places, np.ndarray)]
     if not several:
         return vector
-    # One gather for all of them.
+    # One gather for all places.
     source = index.copy()
     at = len(index)
     for places, _ in several:

@@ -9,10 +9,10 @@ from .mode import Contact, Status
 from .mode_forces import ModeForces
 
 State = Float[Array, " state"]  # displacements, then velocities
-# A value of one contact, or one for each of several.
+# One value, or with several contacts one for each.
 Each = Float[Array, "*contacts"]
 
-# Structures up to this size multiply matrices column by column.
+# For structures up to this size, matrix products are written as sums over columns.
 LARGEST_BY_COLUMNS = 12
 
 
@@ -22,7 +22,7 @@ def relative_velocity(mechanics: Mechanics, y: State) -> Each:
 
 
 def slip_speed(mechanics: Mechanics, contact: Contact, y: State) -> Each:
-    """Slip against the friction force, in m/s; positive while the contact slides in the direction of its status."""
+    """Slip against the direction of the friction force, in m/s; positive while the contact slides as its mode says."""
     return -contact.direction * relative_velocity(mechanics, y)
 
 
@@ -52,7 +52,7 @@ def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) ->
 
 
 def total_forces(mechanics: Mechanics, tangential_force: Each, normal_force: Each) -> tuple[Each, Each]:
-    """(T, N) in N from what is added to those at rest."""
+    """The total (T, N) in N, from the forces added to those at rest."""
     if mechanics.rest is None:
         return tangential_force, normal_force
     return tangential_force + mechanics.rest.tangential_force, normal_force + mechanics.rest.normal_force
@@ -64,7 +64,7 @@ def contact_forces(mechanics: Mechanics, contact: Contact, load: Float[Array, ""
 
 
 def added_forces(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> tuple[Each, Each]:
-    """(T, N) in N in the given status, what is added to those at rest."""
+    """(T, N) in N that the given status adds to the forces at rest."""
     mode = ModeForces(mechanics, contact, mechanics.friction(slip_speed(mechanics, contact, y)))
     return mode.added(mechanics, free_acceleration(mechanics, load, y))
 
@@ -88,12 +88,12 @@ def acceleration_under(
 
 
 def degrees_of_freedom(y: State) -> int:
-    """Of a structure with this state."""
+    """Number of degrees of freedom of a structure with this state."""
     return y.shape[0] // 2
 
 
 def with_contact_coordinates(mechanics: Mechanics, y: State, *, gap, gap_rate, tangential_velocity) -> State:
-    """The state with other values of what the contact holds or changes."""
+    """The state with new values of gap (m), gap rate and tangential velocity (m/s)."""
     n = degrees_of_freedom(y)
     return with_values(
         y,

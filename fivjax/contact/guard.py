@@ -10,9 +10,10 @@ from .mode_forces import by_status
 
 
 def guards(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "*contacts 2"]:
-    """What must stay positive for the status to last; N, or m/s and m where that is what counts.
+    """What must stay positive for the status to last.
 
-    stick: distances of T from both edges of the friction cone; slide: N and the slip speed; detach: the gap, twice.
+    stick: distances of T from both edges of the friction cone (N); slide: N (N) and the slip speed (m/s); detach: the gap (m),
+    twice.
     """
     forces = added_forces(mechanics, contact, load, y)
     return guards_under(mechanics, contact, *forces, slip_speed(mechanics, contact, y), gap(mechanics, y))
@@ -38,8 +39,8 @@ def cone_margins(mechanics: Mechanics, tangential_force: Each, normal_force: Eac
     margins = jnp.stack([edge - tangential_force, edge + tangential_force], axis=-1)
     if mechanics.rest is None:
         return margins
-    # Apart from what is added, and not as a difference of forces that are rounded: at rest one of them is exactly zero
-    # unless static friction is larger.
+    # The margins at rest are worked out from the coefficients, not as a difference of rounded forces: unless static friction is
+    # larger, one of them is exactly zero.
     friction = mechanics.rest.friction
     widths = jnp.stack([static - friction, static + friction], axis=-1)
     return margins + widths * mechanics.rest.normal_force[..., None]

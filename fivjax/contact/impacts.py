@@ -8,17 +8,17 @@ from .several_contacts import impulses_of_impact
 
 
 def impact(mechanics: Mechanics, y: State) -> State:
-    """Velocities after the gap has closed: Newton's restitution normally, and the scene's impact law tangentially.
+    """The state after the gap has closed: Newton's restitution for the normal velocity, the scene's impact law for the rest.
 
-    - "coulomb" (default): the tangential impulse obeys Coulomb's law; the one that ends slip is taken if the friction
-      cone at the approaching slip speed holds it.
+    - "coulomb" (default): the tangential impulse obeys Coulomb's law: it ends the slip if it then lies in the friction cone
+      (with the friction at the slip speed before the impact), else it lies on the cone's edge.
     - "frictionless": no tangential impulse; the normal one moves whatever the mass matrix couples to it.
-    - "reset": the normal velocity alone is changed, as a code does that resets one number. Not consistent with momentum.
+    - "reset": only the normal velocity is changed, as in codes that reset this one number. Not consistent with momentum.
 
-    Of several contacts, all whose gap is closed take part: an impulse on one may lift, stop or turn another.
+    With several contacts, all with a closed gap take part: an impulse on one may lift or stop another, or reverse its slip.
 
-    Newton's restitution above zero together with friction can create energy where the normal impulse turns the slip round
-    (Kane's paradox); that takes a strong coupling of the two coordinates in the mass matrix. Restitution 0 never does.
+    Newton's restitution above zero together with friction can create energy where the normal impulse reverses the slip (Kane's
+    paradox); that takes a strong coupling of the two coordinates in the mass matrix. Restitution 0 never creates energy.
 
     The paper does not state its law; its Table 2 comes out the same with all three.
     """
@@ -31,14 +31,14 @@ def impact(mechanics: Mechanics, y: State) -> State:
         return y.at[n + mechanics.normal].add(jump)
     if mechanics.several:
         y, struck, ends_slip = impulses_of_impact(mechanics, y)
-        # On the belt without an impulse: a rate that rounding leaves below zero does not close the gap.
+        # A contact on the belt that got no impulse: a gap rate that is negative by rounding only is set to zero.
         own = gap_rate(mechanics, y)
         own = jnp.where(gap(mechanics, y) <= 0, jnp.maximum(own, 0.0), own)
         rate = jnp.where(struck, -mechanics.restitution * approach, own)
     else:
         y, ends_slip = _one(mechanics, y)
         rate = -mechanics.restitution * approach
-    # What the law demands exactly, free of rounding: a mass that comes to rest on the belt rests.
+    # The law's demands are set exactly, without rounding: a mass that comes to rest on the belt has the belt's speed.
     tangential_velocity = y[n + mechanics.tangential]
     if mechanics.impact_law == "coulomb":
         tangential_velocity = jnp.where(ends_slip, mechanics.belt_speed, tangential_velocity)

@@ -1,4 +1,4 @@
-"""A scene in the form that accelerations need, as totals or as deviations from steady sliding."""
+"""A scene in the form that accelerations need, for total displacements or for deviations from steady sliding."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from ..model.structure import Structure
 
 
 class Rest(eqx.Module):
-    """A state of steady sliding, as the forces that hold it; displacements and loads may be measured from there."""
+    """The forces of a state of steady sliding, from which displacements and loads may be measured."""
 
     load: Float[Array, ""]  # N
     tangential_force: Float[Array, "*contacts"]  # N
@@ -21,7 +21,7 @@ class Rest(eqx.Module):
     friction: Float[Array, "*contacts"]  # σμ, the ratio of the two
 
     def __init__(self, scene: Scene, load: Float[Array, ""], normal_force: Float[Array, "*contacts"]):
-        """Of a scene that presses with `normal_force` under `load`, see `scene.steady_sliding`."""
+        """The rest of a scene whose contacts press with `normal_force` (N) under `load` (N), from `steady_sliding`."""
         self.load = load
         self.friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
         self.tangential_force = self.friction * normal_force
@@ -31,8 +31,8 @@ class Rest(eqx.Module):
 class Mechanics(eqx.Module):
     """A scene in the form that accelerations need: everything divided by the mass matrix, once.
 
-    Of one contact everything about it is a number. Of several it is an array with a last axis over the contacts, and the
-    compliances are matrices; `tangential` and `normal` index whatever has coordinates either way.
+    With one contact, each of its quantities is a number. With several it is an array with a last axis over the contacts, and
+    the compliances are matrices. `tangential` and `normal` index arrays over the coordinates in both cases.
     """
 
     free_position: Float[Array, "n n"]  # -M⁻¹K, 1/s²
@@ -45,7 +45,7 @@ class Mechanics(eqx.Module):
     restitution: Float[Array, "*contacts"]
     impact_law: str = eqx.field(static=True)
     places: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of the contacts: tangential and normal coordinates
-    # See `about`; none: states are totals.
+    # Set by `about`; without it, displacements and loads are totals.
     rest: Rest | None = None
     springs: Springs | None = None
     from_springs: Float[Array, "n n"] | None = None  # -M⁻¹Bᵀk, 1/s²
@@ -85,22 +85,22 @@ class Mechanics(eqx.Module):
 
     @property
     def tangential(self) -> int | np.ndarray:
-        """The coordinate along the belt; of several contacts, those of all of them."""
+        """The coordinate along the belt; with several contacts, an array of them."""
         return self._coordinates(0)
 
     @property
     def normal(self) -> int | np.ndarray:
-        """The coordinate of the gap; of several contacts, those of all of them."""
+        """The coordinate of the gap; with several contacts, an array of them."""
         return self._coordinates(1)
 
     def _coordinates(self, kind: int) -> int | np.ndarray:
         return np.array([place[kind] for place in self.places]) if self.several else self.places[0][kind]
 
     def about(self, rest: Rest, structure: Structure) -> "Mechanics":
-        """The same mechanics for displacements and loads measured from a rest; velocities stay what they are.
+        """The same mechanics for displacements and loads measured from a rest; velocities stay totals.
 
-        Forces are then as exact as a small deviation can tell them, those of the springs included: of a rigid motion,
-        however far it goes, there are none.
+        Forces then have the relative precision of the deviation. The springs' forces do as well: they are zero in a rigid
+        motion, however far it goes.
         """
         matrices = structure.matrices
         springs = Springs(matrices.stiffness)
@@ -109,12 +109,14 @@ class Mechanics(eqx.Module):
 
     @property
     def of_totals(self) -> "Mechanics":
-        """The same mechanics for displacements and loads as they are, whatever they were measured from."""
+        """The same mechanics for total displacements and loads."""
         return self._with_reference(None, None, None)
 
     @property
     def homogeneous(self) -> "Mechanics":
-        """Without what does not change in time, belt and rest: under no load, the physics of derivatives."""
+        """The same mechanics without belt speed and rest, the terms that are constant in time; without load, derivatives with
+        respect to the state obey it.
+        """
         still = eqx.tree_at(lambda m: m.belt_speed, self, jnp.zeros_like(self.belt_speed))
         return still._with_reference(None, self.springs, self.from_springs)
 
@@ -133,7 +135,7 @@ class Mechanics(eqx.Module):
         )
 
     def normal_compliance(self, direction: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, ""]:
-        """G_nn + σμ G_nt of one contact: how the gap accelerates under a normal force that drags friction along, in 1/kg.
+        """G_nn + σμ G_nt of one contact, in 1/kg: acceleration of the gap by a unit normal force with the friction it causes.
 
         Where it is not positive the contact problem has no unique solution (Painlevé's paradox).
         """

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 
 class Status(enum.IntEnum):
-    """The paper's codes.
+    """What a contact does; the codes are the paper's.
 
     **Example:**
 
@@ -23,7 +23,7 @@ class Status(enum.IntEnum):
 class Contact(eqx.Module):
     """The discrete state of the contact: a `Status`, and the direction σ of the friction force while it slides.
 
-    Of several contacts both have a last axis over them.
+    With several contacts both have a last axis over them.
     """
 
     status: Int[Array, "*batch"]

@@ -1,9 +1,9 @@
-r"""The contact forces of a mode, as a linear answer to what accelerates the contacts without them.
+r"""The contact forces of a mode, as a linear function of the accelerations that the contacts would have without them.
 
-Of one contact the answers of the three statuses are written out. Of several, the demands of all contacts are one linear system:
-with the Delassus matrix G and $D = \mathrm{diag}(σ_i μ_i)$, the row of a contact's T says $(G λ)_t = -a_t$ (stick),
-$T - σ μ N = 0$ (slide) or $T = 0$ (detach); that of its N says $(G λ)_n = -a_n$ or $N = 0$. Its inverse is worked out once and
-serves all that happens in the mode.
+For one contact the forces in the three statuses are written out. For several, the demands of all contacts are one linear
+system: with the Delassus matrix G and the contact forces λ, the row of a contact's T says $(G λ)_t = -a_t$ (stick),
+$T - σ μ N = 0$ (slide) or $T = 0$ (detach); that of its N says $(G λ)_n = -a_n$ (stick, slide) or $N = 0$ (detach). Its inverse
+is worked out once for the whole time that a mode lasts.
 """
 
 import equinox as eqx
@@ -23,7 +23,7 @@ class ModeForces(eqx.Module):
     contact: Contact
     dragging: Float[Array, "*contacts"]  # σμ
     compliance: Float[Array, ""] | None  # G_nn + σμ G_nt, of one contact
-    answer: Float[Array, "k k"] | None  # the inverse of several contacts' system: (T, N) from its right-hand sides
+    answer: Float[Array, "k k"] | None  # the inverse of the system of several contacts: from right-hand sides to (T, N)
 
     def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]):
         self.contact = contact
@@ -38,10 +38,10 @@ class ModeForces(eqx.Module):
     def added(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Each | None = None) -> tuple[Each, Each]:
         """(T, N) in N that the mode adds to those at `mechanics.rest`.
 
-        `otherwise` is friction of a sliding contact besides σμN, in N.
+        `otherwise` is a part of the friction force of a sliding contact besides σμN, in N.
         """
         if mechanics.rest is not None:
-            # What friction pulls otherwise than at rest under the same pressing force: exactly zero where friction is constant.
+            # The change of friction at the normal force of rest: exactly zero where friction is constant.
             more = (self.dragging - mechanics.rest.friction) * mechanics.rest.normal_force
             otherwise = more if otherwise is None else otherwise + more
         if self.answer is not None:
@@ -80,7 +80,7 @@ class ModeForces(eqx.Module):
 def mode_matrix(
     mechanics: Mechanics, sticking: Bool[Array, " c"], closed: Bool[Array, " c"], dragging: Float[Array, " c"]
 ) -> Float[Array, "k k"]:
-    """The system of several contacts' forces; rows and columns are all T, then all N."""
+    """The matrix of the system for the forces of several contacts; rows and columns are all T, then all N."""
     g_tt, g_tn, g_nn = mechanics.compliance
     one = jnp.eye(sticking.shape[0], dtype=g_tt.dtype)
     slides = jnp.where(closed & ~sticking, -dragging, 0.0)
@@ -94,7 +94,7 @@ def mode_matrix(
 
 
 def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(T, N) in N that hold the one contact still, added to those at rest."""
+    """(T, N) in N, added to those at rest, that make a single contact stick."""
     g_tt, g_tn, g_nn = mechanics.compliance
     free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
     determinant = g_tt * g_nn - g_tn**2
@@ -102,7 +102,7 @@ def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Flo
 
 
 def by_status(contact: Contact, *, stick, slide, detach):
-    """What belongs to the contact's status, of three values; they may have one axis more than it."""
+    """The one of three values that belongs to the contact's status; the values may have one axis more than the status."""
     status = contact.status
     if max(jnp.ndim(value) for value in (stick, slide, detach)) > status.ndim:
         status = status[..., None]

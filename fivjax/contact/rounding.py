@@ -1,4 +1,4 @@
-"""How large the rounding of guards and rates is, and which of them are zero exactly."""
+"""How large the rounding errors of guards and rates are, and which guards start at exactly zero."""
 
 from collections.abc import Sequence
 
@@ -12,27 +12,27 @@ from .mechanics import Mechanics
 from .mode import Contact, Status
 from .mode_forces import ModeForces, by_status
 
-# A guard whose first coefficient is this much smaller than all of them together starts at zero, but for rounding.
-# If it does, the same goes for the next two: where a status begins, they are differences that cancel less well.
+# A guard starts at zero, up to rounding, if its first Taylor coefficient is no larger than this share of all of them together.
+# The other two shares are for the next two coefficients, which are differences that cancel less well where a status begins.
 SHARES = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
-# Or if it is this many roundings of the terms that it is a sum of.
+# Or if it is no larger than this many roundings of the terms that it is a sum of.
 ROUNDINGS = 64
-# Rebounds shorter than this share of an advance are at rest; what they would still change is below rounding.
+# Rebounds shorter than this share of an advance count as rest; their effect is below rounding.
 RESTING = {"float64": 1e-7, "float32": 1e-4}
 
 
 def largest_rounding(sizes: Array) -> Array:
-    """What rounding may leave of sums whose largest terms have these sizes (see `magnitudes`)."""
+    """Bound on the rounding error of sums whose largest terms have these sizes (see `magnitudes`)."""
     return ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes
 
 
 def zero_at_start(
     c: Sequence[Array] | Array, size: Array, rounding: Sequence[Array] | Array, exact: Bool[Array, "..."]
 ) -> list[Bool[Array, "..."]]:
-    """Whether the first, the first two and the first three Taylor coefficients of guards are zero but for rounding.
+    """Whether the first, the first two and the first three Taylor coefficients of guards are zero up to rounding.
 
-    `size` is that of all coefficients together, `rounding` what the first three may be rounded by; of a guard whose start is
-    `exact`, little is not nothing.
+    `size` is that of all coefficients together, `rounding` the bound on the rounding of each of the first three. Where the start
+    of a guard is `exact`, its first coefficient is compared with `rounding` only: a small value is not zero.
     """
     zero, found = jnp.ones_like(size, bool), []
     for k, share in enumerate(SHARES[size.dtype.name]):
@@ -43,10 +43,10 @@ def zero_at_start(
 
 
 def exactly_zero(contact: Contact) -> Bool[Array, "2 *batch"]:
-    """Which guards are put at zero exactly where their status begins: slip and gap.
+    """Which guards are set to exactly zero where their status begins: the slip speed while sliding, the gap while detached.
 
-    If these are small, they are small, and not zero but for rounding: a slow belt under a high load has a slip that the
-    motion outgrows a billionfold before it is used up.
+    A small value of these is no rounding error: on a slow belt under a high load the slip speed starts a billion times smaller
+    than it becomes before it is used up.
     """
     sliding, detached = contact.status == Status.SLIDE, contact.status == Status.DETACH
     return jnp.stack([detached, sliding | detached])
@@ -55,10 +55,10 @@ def exactly_zero(contact: Contact) -> Bool[Array, "2 *batch"]:
 def magnitudes(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, mode: ModeForces | None = None
 ) -> tuple[Float[Array, "*contacts 2"], State]:
-    """Sizes of the largest terms that the guards and the rates are sums of: their rounding is that share of these.
+    """Sizes of the largest terms in the sums that make guards and rates; rounding errors are proportional to them.
 
-    `y` holds sizes, too. Where a stiff structure presses hard, forces are small differences of huge terms; whether one
-    is zero is a question that only these sizes answer. `mode` is that of the contact, where it is known already.
+    `y` holds sizes, too. In a stiff structure under a high load, forces are small differences of huge terms; only these sizes
+    tell whether such a force is zero. `mode` holds the forces of the contact's mode, where they are known already.
     """
     n = degrees_of_freedom(y)
     free = jnp.abs(mechanics.free_load) * jnp.abs(load)
@@ -76,7 +76,7 @@ def magnitudes(
     pressing, margins = normal_force, jnp.zeros((*none.shape, 2), none.dtype)
     if mechanics.rest is not None:
         at_rest = mechanics.rest
-        # What is added to the forces at rest is all that is rounded in the rates, but for forces that are not those.
+        # In the rates only the forces added to those at rest are rounded, and the part by which others replace those at rest.
         tangential_force = tangential_force + by_status(
             contact,
             stick=none,
@@ -104,7 +104,7 @@ def magnitudes(
 
 
 def _otherwise(mechanics: Mechanics, contact: Contact) -> Each:
-    """How far σμ may be from that at rest."""
+    """How far σμ may be from its value at rest."""
     assert mechanics.rest is not None
     static = mechanics.friction.static
     dragging = contact.direction * mechanics.friction(jnp.zeros_like(static))
@@ -112,8 +112,8 @@ def _otherwise(mechanics: Mechanics, contact: Contact) -> Each:
 
 
 def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], mode) -> tuple[Each, Each, Each, Each]:
-    """Sizes of T and N of one contact; of N by what a mode lacks of the forces at rest; of the acceleration at which slip sets
-    out.
+    """Sizes of T and N of one contact, of the part of N by which the mode replaces the force at rest, and of the acceleration
+    with which slip begins.
     """
     del mode
     g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
@@ -133,8 +133,8 @@ def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], 
     resting_n = by_status(
         contact, stick=none, slide=g_tn * _otherwise(mechanics, contact) * rest_n / compliance, detach=rest_n
     )
-    # Slip sets out with the acceleration that rounding leaves of the margin at which sticking ended; were that taken for
-    # more than nothing, the two would hand over to each other for ever.
+    # Slip begins with an acceleration that is the rounding error of the margin at which sticking ended. If it counted as more
+    # than zero, sticking and sliding would follow each other for ever.
     edge = static * stick_n + stick_t
     onset = jnp.where(contact.status == Status.SLIDE, edge * jnp.abs(determinant) / compliance, 0.0)
     return tangential_force, normal_force, resting_n, onset
@@ -143,7 +143,7 @@ def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], 
 def _several_sizes(
     mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], mode: ModeForces | None
 ) -> tuple[Each, Each, Each, Each]:
-    """The same of several contacts."""
+    """The same for several contacts."""
     static = mechanics.friction.static
     mode = ModeForces(mechanics, contact, static) if mode is None else mode
     assert mode.answer is not None
@@ -166,7 +166,7 @@ def _several_sizes(
 
 
 def on_constraint_rates(mechanics: Mechanics, contact: Contact, rates: State) -> State:
-    """Rates with what the status forbids set to exactly zero: those of the gap, and creep while sticking."""
+    """Rates with those that the status forbids set to exactly zero: those of a closed gap, and slip while sticking."""
     n = degrees_of_freedom(rates)
     touching, sticking = contact.status != Status.DETACH, contact.status == Status.STICK
     held = at_places(2 * n, mechanics.normal, touching) | at_places(2 * n, n + mechanics.normal, touching)

@@ -1,4 +1,4 @@
-"""What follows of several contacts at an event: their modes from the forces, and the impulses where gaps have closed."""
+"""What follows an event of several contacts: their modes, from the forces, and the impulses where gaps have closed."""
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,10 @@ def modes_from_forces(
     before: Contact | None = None,
     ended: Int[Array, " c"] | None = None,
 ) -> Contact:
-    """The modes that a state on its constraints is in, from the forces that they would need.
+    """The modes of a state on its constraints, from the forces that each mode would need.
 
-    `before` is a guess, and `ended` what `ContactProblem` says: states that must not go on by a hair.
+    `before` is a guess. `ended` has the states that have just ended, as in `ContactProblem`: they must not be chosen again
+    because of rounding.
     """
     problem = _mode_problem(mechanics, load, y, ended)
     away, slips, slip = problem.away, problem.slips, relative_velocity(mechanics, y)
@@ -35,10 +36,10 @@ def modes_from_forces(
 
 
 def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
-    """The state after gaps have closed, Newton's restitution and Coulomb's law for all contacts on the belt at once; who of
-    them got an impulse, and whose slip it ended.
+    """The state after gaps have closed, by Newton's and Coulomb's laws for all contacts on the belt at once; which of them got an
+    impulse; and whose slip it ended.
 
-    Every contact on the belt takes part: what strikes one may lift, stop or turn another.
+    Every contact on the belt takes part: an impulse on one may lift or stop another, or reverse its slip.
     """
     n, frictionless = degrees_of_freedom(y), mechanics.impact_law == "frictionless"
     problem = _impact_problem(mechanics, y)
@@ -91,7 +92,7 @@ def _impact_problem(mechanics: Mechanics, y: State) -> ContactProblem:
         (jnp.abs(slip), jnp.abs(demanded)),
         sliding=mu,
         static=mu,
-        # Without friction there is nothing to choose but whether there is an impulse.
+        # Without friction the only choice is whether there is an impulse.
         allowed=_allowed(away, jnp.full_like(away, frictionless), ~nobody),
         slips=jnp.full_like(away, frictionless),
         away=away,
@@ -101,26 +102,26 @@ def _impact_problem(mechanics: Mechanics, y: State) -> ContactProblem:
 
 
 def clearness_of_modes(mechanics: Mechanics, load: Float[Array, ""], y: State, contact: Contact) -> Float[Array, " c"]:
-    """By how much the modes that a state on its constraints is in are admissible, relative to the terms in their conditions."""
+    """Margins by which the modes of a state on its constraints are admissible, relative to the terms in their conditions."""
     return jnp.abs(jnp.minimum(*margins(_mode_problem(mechanics, load, y), state_of(contact))))
 
 
 def clearness_of_impact(mechanics: Mechanics, y: State) -> Float[Array, " c"]:
-    """The same of the impulses that follow where gaps have closed."""
+    """The same for the impulses where gaps have closed."""
     problem = _impact_problem(mechanics, y)
     found = settled_states(problem, jnp.where(problem.away, OPEN, STICK).astype(jnp.int32))
     return jnp.abs(jnp.minimum(*margins(problem, found)))
 
 
 def state_of(contact: Contact) -> Int[Array, " c"]:
-    """The state of a `ContactProblem` that a mode stands for."""
+    """The state in a `ContactProblem` that belongs to a mode."""
     slides = jnp.where(contact.direction > 0, FORWARD, BACKWARD)
     by = jnp.where(contact.status == Status.SLIDE, slides, OPEN)
     return jnp.where(contact.status == Status.STICK, STICK, by).astype(jnp.int32)
 
 
 def coupled_with(mechanics: Mechanics, which: Int[Array, ""]) -> Bool[Array, " c"]:
-    """Which contacts feel at once what happens to one, itself included: those that the mass matrix couples with it."""
+    """Which contacts an event at one of them affects at once, itself included: those that the mass matrix couples with it."""
     g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
     size = jnp.sqrt(jnp.diagonal(g_tt) * jnp.diagonal(g_nn))
     # Relative to the contacts' own compliances.
@@ -133,7 +134,7 @@ def coupled_with(mechanics: Mechanics, which: Int[Array, ""]) -> Bool[Array, " c
 
 
 def _allowed(away: Bool[Array, " c"], slips: Bool[Array, " c"], forward: Bool[Array, " c"]) -> Bool[Array, "c 4"]:
-    """The states that each contact may be in, by what it does already; friction is `forward` where it slips back."""
+    """The states that each contact may be in, by its velocity; `forward` is the direction of friction where it slips."""
     closed = ~away
     return jnp.stack(
         [closed & ~slips, closed & (~slips | forward), closed & (~slips | ~forward), jnp.ones_like(away)], axis=-1
@@ -155,7 +156,7 @@ def _problem(
         )
         pressing, open_normal = n_0, -n_0
     own_t, own_n = jnp.diagonal(g_tt), jnp.diagonal(g_nn)
-    # Of contacts that nothing acts on alone, forces are those that the others hand on.
+    # The size of a contact's forces: by its own free acceleration, and by the forces that other contacts pass on to it.
     alone = sizes[0] / own_t + sizes[1] / own_n
     if rest is not None:
         alone = alone + jnp.abs(rest.normal_force) + jnp.abs(rest.tangential_force)

@@ -25,7 +25,7 @@ from .several_contacts import modes_from_forces, state_of
 
 
 def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
-    """The state with what the status forbids set to exactly zero: gap and its rate, and creep while sticking."""
+    """The state with what the status forbids set to exactly zero: gap and gap rate in contact, and slip while sticking."""
     touching = contact.status != Status.DETACH
     sticking = contact.status == Status.STICK
     return with_contact_coordinates(
@@ -45,14 +45,14 @@ def transition(
     ended: Bool[Array, "*contacts 2"],
     resolution: Float[Array, ""],
 ) -> tuple[Contact, State]:
-    """What follows where the guards in `ended` are used up: the next status, and the state on its constraint.
+    """The next mode where the guards in `ended` are used up, and the state on its constraint.
 
-    Where none is, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) is taken
-    to have come to rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
+    Without any such guard, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) counts as
+    rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
     """
     any_ended = jnp.any(ended)
     if mechanics.several:
-        # Much work, for which there is seldom a reason.
+        # Costly, and seldom needed.
         return jax.lax.cond(
             any_ended, lambda: _following(mechanics, contact, load, y, ended, resolution), lambda: (contact, y)
         )
@@ -67,7 +67,7 @@ def transition(
 
 
 def stopped(mechanics: Mechanics, contact: Contact, y: State, ended: Bool[Array, "*contacts 2"]) -> State:
-    """The state with gaps that have closed, and slip that has run out, at exactly zero; sticking has none to begin with."""
+    """The state with exactly zero gap where it has closed, and exactly zero slip where slip has ended or the contact stuck."""
     n = degrees_of_freedom(y)
     touched = (contact.status == Status.DETACH) & ended[..., 0]
     at_rest = ((contact.status == Status.SLIDE) & ended[..., 1]) | (contact.status == Status.STICK)
@@ -95,8 +95,8 @@ def _following(
     def struck():
         return _resting(mechanics, contact, load, impact(mechanics, y_stopped), touched, resolution)
 
-    # At the edge of the friction cone, or where N has just reached zero, rounding alone would decide whether the status
-    # that has ended goes on. It does not.
+    # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
+    # ended goes on. So it is excluded.
     if mechanics.several:
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
         own = ended[..., 0] | ended[..., 1]
@@ -114,11 +114,11 @@ def _following(
 def status_from_forces(
     mechanics: Mechanics, load: Float[Array, ""], y: State, may_stick: Bool[Array, ""] | bool = True
 ) -> Contact:
-    """The status that a state on its constraints is in, found from the forces that each status would need.
+    """The status of a state on its constraints, found from the forces that each status would need.
 
-    Open or opening: detached. Slipping: sliding if pressed, else detached. At rest on the belt: sticking if the holding
-    force lies in the friction cone, else sliding the way it is pushed, else detached. Of several contacts, all of that at
-    once (`contact_problem`).
+    Gap open or opening: detached. Slipping: sliding if pressed, else detached. At rest on the belt: sticking if the force that
+    this needs lies in the friction cone, else sliding the way it is pushed, else detached. With several contacts, all are found
+    at once (`contact_problem`).
     """
     if mechanics.several:
         return modes_from_forces(mechanics, load, y)
@@ -150,10 +150,10 @@ def _resting(
     touched: Bool[Array, "*contacts"],
     resolution: Float[Array, ""],
 ) -> State:
-    """The state with rebounds that would be over at once left out."""
+    """The state without rebounds that would end within `resolution` (s)."""
     rate = gap_rate(mechanics, y)
     if mechanics.several:
-        # As long as nothing holds it: in the mode before.
+        # The acceleration before the impact, while the contact was free.
         fall = acceleration(mechanics, contact, load, y)[mechanics.normal]
     else:
         fall = free_acceleration(mechanics, load, y)[mechanics.normal]

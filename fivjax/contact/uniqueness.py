@@ -1,8 +1,8 @@
-r"""Whether sliding contacts have one answer whatever acts on them: the P-matrix test, in JAX, for one of many scenes.
+r"""Whether sliding has a unique solution under any load: the P-matrix test, in JAX, for batches of scenes.
 
-Sliding contacts obey $(G_{nn} + G_{nt} D) N = -a_n$ with $D = \mathrm{diag}(σ_i μ_i)$. One solution with $N ≥ 0$ for every
-right-hand side needs all principal minors positive (else: Painlevé's paradox). They are linear in each $σ_i μ_i$, so the ends
-decide. `model.delassus_matrix` has the same for one structure, by NumPy.
+Sliding contacts obey $(G_{nn} + G_{nt} D) N = -a_n$ with $D = \mathrm{diag}(σ_i μ_i)$. A solution with $N ≥ 0$ is unique for
+every right-hand side only if all principal minors are positive (else: Painlevé's paradox). They are linear in each $σ_i μ_i$,
+so it is enough to check $±μ_i$. `model.delassus_matrix` has the same test for one structure, by NumPy.
 """
 
 import itertools
@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool
 
 from .mechanics import Mechanics
 
-# Contacts of which all principal minors are looked at; of more contacts those of up to so many of them together.
+# Up to `ALL` contacts, all principal minors are checked; with more contacts, those of up to `TOGETHER` contacts at a time.
 ALL, TOGETHER = 4, 3
 
 
 def slides_uniquely(mechanics: Mechanics) -> Bool[Array, ""]:
-    """False where the sliding problem of some mode, in some directions of slip, is no P-matrix. Of more than `ALL` contacts it
-    may be true although more than `TOGETHER` of them have none.
+    """Whether the matrix of sliding is a P-matrix for all directions of slip. With more than `ALL` contacts it may say so
+    although a principal minor of more than `TOGETHER` contacts is not positive.
     """
     if not mechanics.several:
         static = mechanics.friction.static
