@@ -31,8 +31,8 @@ def zero_at_start(
 ) -> list[Bool[Array, "..."]]:
     """Whether the first, the first two and the first three Taylor coefficients of guards are zero up to rounding.
 
-    `size` is that of all coefficients together, `rounding` the bound on the rounding of each of the first three. Where the start
-    of a guard is `exact`, its first coefficient is compared with `rounding` only: a small value is not zero.
+    `size` is that of all coefficients together, `rounding` the bound on the rounding of each of the first three. Where the
+    start of a guard is `exact`, its first coefficient is compared with `rounding` only: a small value is not zero.
     """
     zero, found = jnp.ones_like(size, bool), []
     for k, share in enumerate(SHARES[size.dtype.name]):

@@ -36,8 +36,8 @@ def modes_from_forces(
 
 
 def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
-    """The state after gaps have closed, by Newton's and Coulomb's laws for all contacts on the belt at once; which of them got an
-    impulse; and whose slip it ended.
+    """The state after gaps have closed, by Newton's and Coulomb's laws for all contacts on the belt at once; which of them got
+    an impulse; and whose slip it ended.
 
     Every contact on the belt takes part: an impulse on one may lift or stop another, or reverse its slip.
     """

@@ -83,7 +83,7 @@ def _entries(line: str) -> list[str]:
 
 
 def _table(place: str, numbers: list[int], lines: list[str]) -> np.ndarray:
-    """The rows as an array with five columns, or three; read at once, and line by line where that fails, to say which."""
+    """The rows as an array with five columns, or three; read at once. Where that fails, line by line, to name the bad one."""
     try:
         width = len(_entries(lines[0]))
         text = "\n".join(lines).replace("D", "E").replace("d", "e")
@@ -164,7 +164,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
                 reading = ""  # load vectors and recovery matrices are not needed
         elif reading == "directions":
             entries = [_integer(here, entry) for entry in _entries(stripped)]
-            # The first line is of the first node; each later one begins with the place of the node from which it holds.
+            # The first line is for the first node; each later one begins with the number of the first node that it is for.
             first = 1 if not directions else entries[0]
             directions[first] = entries if not directions else entries[1:]
         elif reading:

@@ -1,8 +1,7 @@
-"""`dataset.fivjax`: the picture and the scene of a dataset that fivjax made, without taking over how datasets show.
+"""`dataset.fivjax`: the picture and the scene of a dataset that fivjax made. How xarray displays datasets is left alone.
 
-xarray is told of the accessor when fivjax makes or opens its first dataset, because only then is xarray loaded. What
-draws stands in rooms above this one and cannot be imported here; whoever puts the package together (`fivjax/__init__.py`)
-says who draws, by `draw_with`.
+The accessor is registered when fivjax makes or opens its first dataset, because only then is xarray loaded. Plotting lies
+above this package and cannot be imported here; `fivjax/__init__.py` hands the function that draws to `draw_with`.
 """
 
 import functools
@@ -18,19 +17,19 @@ _drawing: list[Callable] = []
 
 
 def draw_with(function: Callable) -> None:
-    """Have datasets drawn by `function(dataset, **options)`, which returns a matplotlib figure."""
+    """Let `function(dataset, **options)`, which returns a matplotlib figure, draw datasets."""
     _drawing[:] = [function]
 
 
 class Accessor:
-    """What a dataset of fivjax's offers beside xarray's own: `m.fivjax.plot()`, `m.fivjax.scene`."""
+    """What fivjax adds to a dataset: `m.fivjax.plot()`, `m.fivjax.scene`."""
 
     def __init__(self, dataset: "xr.Dataset"):
         self._dataset = dataset
 
     @property
     def scene(self) -> "Scene":
-        """The scene that the dataset came from, as `Scene.from_dataset`."""
+        """The scene that the dataset came from, see `Scene.from_dataset`."""
         from ..model.scene import Scene
 
         return Scene.from_dataset(self._dataset)
@@ -43,13 +42,13 @@ class Accessor:
         return _drawing[0](self._dataset, **options)
 
     def show(self):
-        """The picture of the dataset, as `fj.show`."""
+        """The picture of the dataset, as `fj.show` draws it."""
         return self.plot()
 
 
 @functools.cache
 def register() -> None:
-    """Tell xarray of `dataset.fivjax`, once."""
+    """Register `dataset.fivjax` with xarray, once."""
     import xarray as xr
 
     xr.register_dataset_accessor("fivjax")(Accessor)

@@ -12,7 +12,7 @@ def matrix_market(path: Path) -> dict[str, FileMatrix]:
     """The matrix of a Matrix Market file, by the file's name."""
     from scipy.io import mmread
 
-    # What its reader raises where a file is damaged depends on where; a sentence is made of all of it.
+    # The reader raises many kinds of errors for damaged files; all become one sentence.
     try:
         matrix = mmread(path)
     except (ValueError, OSError, EOFError, OverflowError, IndexError, TypeError) as error:
@@ -21,7 +21,7 @@ def matrix_market(path: Path) -> dict[str, FileMatrix]:
 
 
 def matlab(path: Path) -> dict[str, FileMatrix]:
-    """The matrices of a MATLAB file, by name; what is no matrix in it is passed over."""
+    """The matrices of a MATLAB file, by name; anything else in it is passed over."""
     import scipy.io
 
     try:
@@ -108,7 +108,7 @@ def _matrix(path: Path, name: str, value) -> FileMatrix:
 def _unreadable(path: Path, kind: str, error: Exception) -> ValueError:
     said = str(error).strip().rstrip(".").splitlines()
     if said and "pickle" in said[0]:
-        # NumPy takes whatever it does not know for pickled objects.
+        # NumPy takes any file that it does not know for pickled objects.
         said = ["it holds no arrays of numbers"]
     return ValueError(
         f"File `{path}` cannot be read as {kind}: {said[0] if said else type(error).__name__}. Write it again."

@@ -35,7 +35,7 @@ def label(variable: "xr.DataArray") -> "xr.DataArray":
 
 
 def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
-    """The dataset with units on everything it holds, and where it came from."""
+    """The dataset with units on all variables, and the scene, the settings and the versions that made it."""
     accessor.register()
     for name in list(dataset.variables):
         label(dataset[name])
@@ -57,13 +57,13 @@ def save(result, path: str | Path) -> Path:
         fj.save(fj.simulate(scene), "run.nc")
         fj.save(fj.bistability_map(scene, mu=…, p=…), "map.nc")
 
-    **Arguments:** `result`, an xarray dataset, or what turns into one: a `Trajectory`, a `Calibration`, sensitivities;
-    `path`, the file, which is replaced if it is there.
+    **Arguments:** `result`, an xarray dataset or an object that turns into one: a `Trajectory`, a `Calibration`, sensitivities;
+    `path`, the file, which is replaced if it exists.
 
     **Returns:** the path.
 
-    **Raises:** `TypeError` for what is no result, `ValueError` for a path that cannot be written, `OSError` where the disk
-    is full.
+    **Raises:** `TypeError` for an object that is no result, `ValueError` for a path that cannot be written, `OSError` if the
+    disk is full.
 
     **Example:**
 
@@ -71,17 +71,17 @@ def save(result, path: str | Path) -> Path:
     """
     dataset = _as_dataset(result)
     path = check_writable(path)
-    # Made in memory: HDF5 brings the whole process down where a disk is full.
+    # Made in memory first: on a full disk HDF5 crashes the whole process.
     content = BytesIO()
     dataset.to_netcdf(content, engine="h5netcdf")
     return replace_whole(path, content.getvalue())
 
 
 def open(path: str | Path) -> "xr.Dataset":
-    """A saved result, read into memory, as the xarray dataset that it was or became.
+    """A saved result as an xarray dataset, read into memory.
 
-    A trajectory comes back as its dataset (`Trajectory.to_dataset`), not as a `Trajectory`: what is on disk is the same
-    for everyone, also without fivjax. The scene that it came from is `fj.Scene.from_dataset(fj.open(path))`.
+    A trajectory comes back as its dataset (`Trajectory.to_dataset`; `fj.Trajectory.from_dataset` makes a trajectory of it). The
+    files can be read without fivjax, too. The scene of a result is `fj.Scene.from_dataset(fj.open(path))`.
 
     **Raises:** `ValueError` for a path without a file, or a file that is no NetCDF.
 

@@ -1,4 +1,4 @@
-"""A matrix as a file gives it, with the node and direction of its rows; made from entries one by one."""
+"""A matrix as a file gives it, with the node and direction of its rows; and how it is made from single entries."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ class Label(NamedTuple):
     direction: int
 
     def __str__(self) -> str:
-        # Direction 0 is that of a scalar point, and of rows that a file only counts.
+        # Direction 0: a scalar point, or a row that the file only numbers.
         return f"node {self.node}, direction {self.direction}" if self.direction else f"point {self.node}"
 
 
@@ -56,20 +56,20 @@ def from_entries(
     lines: np.ndarray,
     symmetric: bool | None,
 ) -> FileMatrix:
-    """A matrix from its entries by label: one row of node and direction, one column, one value each.
+    """A matrix from its entries: row label, column label and value of each.
 
-    `symmetric`: whether the file gives one triangle of a symmetric matrix; None where it does not say. Then a file in which
-    no pair of labels comes in both orders gives one triangle.
+    `symmetric`: whether the file gives one triangle of a symmetric matrix; None where it does not say. Then the entries are
+    taken for one triangle if no pair of labels comes in both orders.
 
-    **Raises:** `ValueError` for an entry that is there twice, and for a matrix that gives some pairs in both orders and
-    others in one, where the file does not say what that means.
+    **Raises:** `ValueError` for an entry that comes twice; and, where the file does not say whether it gives one triangle, for
+    a matrix with some pairs in both orders and others in only one.
     """
     rows, columns = np.asarray(rows, np.int64).reshape(-1, 2), np.asarray(columns, np.int64).reshape(-1, 2)
     table, index = np.unique(np.concatenate([rows, columns]), axis=0, return_inverse=True)
     index = index.ravel()
     labels = tuple(Label(int(node), int(direction)) for node, direction in table)
     n, i, j = len(labels), index[: len(rows)], index[len(rows) :]
-    # Each pair of labels as one number, whatever its order.
+    # Each pair of labels as one number, the same for both orders.
     ordered, pair = i * n + j, np.minimum(i, j) * n + np.maximum(i, j)
     _twice(place, labels, ordered, i, j, lines)
     off = i != j

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written beside their target, then given its name."""
+"""Files that are whole or absent: written under another name in the same folder, then renamed."""
 
 import os
 import tempfile
@@ -7,9 +7,9 @@ from pathlib import Path
 
 
 def check_writable(path: str | Path) -> Path:
-    """Refuse, before any work is done, a path that could not be written afterwards.
+    """Refuse a path that could not be written, before any work is done.
 
-    **Raises:** `ValueError` naming what stands in the way.
+    **Raises:** `ValueError` with the reason.
     """
     path = Path(path)
     if path.is_dir():
@@ -51,14 +51,14 @@ def save_text(text: str, path: str | Path) -> Path:
 
 
 def replace_whole(path: Path, content: bytes) -> Path:
-    """Put a file with this content in place of whatever is there, in one instant; returns its path."""
-    # Beside the target, so that the final rename stays within one file system and cannot be half done.
+    """Write a file with this content in place of whatever is there, atomically; returns its path."""
+    # In the same folder, so that the final rename stays within one file system and is atomic.
     handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
-            # On the disk before it has its name: a machine that loses power keeps the old file or the new one.
+            # On the disk before it gets its name: after a power failure there is the old file or the new one.
             os.fsync(file.fileno())
         # `mkstemp` makes private files; a result has the permissions of any other new file.
         mask = os.umask(0)

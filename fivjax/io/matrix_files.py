@@ -1,7 +1,7 @@
-"""Matrices from the files that finite-element codes and numerical libraries write: which formats are read, and by what.
+"""Matrices from files of finite-element codes and numerical libraries: which formats are read, and by which module.
 
-Each reader gives matrices by name, with the node and direction of every row where the file tells them. What is refused is
-refused with the file, and the line or the matrix, named.
+Each reader gives matrices by name, with the node and direction of every row where the file has them. Errors name the file, and
+the line or the matrix.
 """
 
 from pathlib import Path
@@ -24,8 +24,8 @@ def read_matrices(path: str | Path) -> dict[str, FileMatrix]:
     - `.pch`, `.bdf`, `.dat`: Nastran DMIG entries. `.op4`: Nastran OUTPUT4, read by pyyeti (`pip install "fivjax[fe]"`).
     - `.mat`: MATLAB. `.npy`, `.npz`: NumPy, also sparse matrices that SciPy saved.
 
-    Names are those of the file; where the file names none, the file's own without its suffix. Matrices in Abaqus `.mtx`
-    files that give one triangle are completed to symmetric ones.
+    Matrices have the names that the file gives them, else the name of the file without its suffix. One triangle in an Abaqus
+    `.mtx` file is completed to a symmetric matrix.
 
     **Raises:** `ValueError` naming the file with the line, or the matrix, that cannot be used; `ImportError` where pyyeti is
     not installed.
@@ -71,7 +71,7 @@ def _mtx(path: Path) -> dict[str, FileMatrix]:
 
 
 def _checked(found: FileMatrix) -> FileMatrix:
-    """The matrix with no entries stored that are zero.
+    """The matrix without stored zeros.
 
     **Raises:** `ValueError` unless it is square, not empty, real and finite, with as many labels as rows.
     """

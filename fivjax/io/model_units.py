@@ -1,9 +1,9 @@
-"""The systems of units that finite-element models are made in, and the way from them to SI."""
+"""The systems of units of finite-element models, and the conversion to SI."""
 
 import numpy as np
 from scipy import sparse
 
-# Length in m, mass in kg and time in s of each; the force that goes with them follows.
+# The units of length in m, of mass in kg and of time in s; force and pressure (in the comments) follow.
 SYSTEMS = {
     "SI": (1.0, 1.0, 1.0),  # N
     "mm-t-s": (1e-3, 1e3, 1.0),  # N, MPa
@@ -15,9 +15,9 @@ SYSTEMS = {
 
 
 def in_si(matrices: dict[str, sparse.csr_array], directions: np.ndarray, units: str) -> dict[str, sparse.csr_array]:
-    """Mass, damping and stiffness in kg, N·s/m and N/m: directions 1 to 3 in metres, all others as they are."""
+    """Mass, damping and stiffness in SI units: displacements in directions 1 to 3 in metres, all others unchanged."""
     length, mass, time = SYSTEMS[units]
-    # A quadratic form of displacements is an energy, and a coordinate in metres is so many of the file's units.
+    # A quadratic form of displacements is an energy; a displacement in m is that in the file's units times their length.
     energy = mass * (length / time) ** 2
     scale = sparse.diags_array(np.where((directions >= 1) & (directions <= 3), 1 / length, 1.0))
     powers = {"stiffness": 0, "damping": 1, "mass": 2}

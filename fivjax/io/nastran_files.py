@@ -69,7 +69,7 @@ def _form(here: str, name: str, fields: list[str]) -> int:
 
 def _column(here: str, line: int, fields: list[str]) -> list[tuple]:
     column = _label(here, fields[1], fields[2])
-    # The name and the column's own label fill the first fields; then come four for each row.
+    # The name and the label of the column fill the first fields; then come four for each row.
     rest = fields[4:]
     while rest and not rest[-1]:
         rest.pop()
@@ -85,7 +85,7 @@ def _column(here: str, line: int, fields: list[str]) -> list[tuple]:
 
 
 def _cards(place: str, text: str):
-    """Each DMIG card with its first line and its fields, without the word DMIG and what marks continuations."""
+    """Each DMIG card with its first line and its fields, without the word DMIG and the marks of continuation."""
     card: list[str] = []
     begun = 0
     for number, raw in enumerate(text.splitlines(), 1):
@@ -97,7 +97,7 @@ def _cards(place: str, text: str):
                 yield begun, card
             begun, card = number, _fields(f"{place}, line {number}", line)
         elif card and line[0] in "*+, ":
-            # A continuation goes on with the field after the last of the line before.
+            # A continuation line goes on where the line before ended.
             card += _fields(f"{place}, line {number}", line)
         elif card:
             yield begun, card

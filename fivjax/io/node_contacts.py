@@ -18,10 +18,10 @@ class NodeContact:
         fj.NodeContact(17, tangential="x", normal="-z")
         fj.NodeContact(17, tangential="x", normal="-z", against=903)
 
-    - `node`: the node that touches. Its `normal` displacement is the gap: positive away from what it touches.
+    - `node`: the node in contact. Its displacement along `normal` is the gap, positive away from the belt or from `against`.
     - `tangential`, `normal`: "x", "-z" and so on, a direction 1 to 6, or three numbers along x, y and z (made a unit vector).
-    - `against`: the node it touches where that belongs to the structure, too; the displacements are then those of `node` less
-      those of `against`. Unless given, it touches the belt.
+    - `against`: the other node, where the contact is between two nodes of the structure; displacements are then those of
+      `node` less those of `against`. Unless given, the node touches the belt.
 
     **Example:**
 
@@ -54,7 +54,7 @@ def contact_directions(
 
 
 def load_direction(load: Mapping, order: tuple[Label, ...] | None, size: int) -> np.ndarray:
-    """The share of each coordinate in a positive load."""
+    """Each coordinate's share of a positive load, without unit."""
     found = np.zeros(size)
     for (node, direction), share in load.items():
         arguments.real_number(f"load[{node}, {direction!r}]", share)

@@ -1,4 +1,4 @@
-"""Recordings from files: which formats are read, in which units, and what is refused with its line or variable named."""
+"""Recordings from files: formats and units. Errors name the line or the variable."""
 
 import math
 import re
@@ -48,10 +48,11 @@ def read_recording(
 
     **Arguments:**
 
-    - `regime` and what else is passed on: see `Recording`.
-    - `columns`: which column is which channel; unless given, those are taken whose names say so (`channel`).
-    - `time`: the name of the time base ("t" or "time" unless given); or `rate`, the sampling rate in Hz. WAV has its own.
-    - `units`: by the file's names; they go before the file's own. Without either, SI.
+    - `regime` and any further arguments: see `Recording`.
+    - `columns`: the channel of each column, by the file's names; unless given, all columns whose name is that of a channel
+      ("acceleration 0", "velocity 1", "a0", "v_1", …).
+    - `time`: the name of the time base ("t" or "time" unless given); or `rate`, the sampling rate in Hz. WAV files have theirs.
+    - `units`: by the file's names; they override those in the file. Without either, SI.
 
     **Raises:** `ValueError` naming the file with the line, or the variable, that cannot be used.
 
@@ -132,7 +133,7 @@ def _csv(path: Path):
         if len(entries) != len(names):
             raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {len(entries)} found.")
         for column, entry in enumerate(entries):
-            # A decimal comma is unmistakable where commas do not separate.
+            # A comma can only be a decimal comma where it is not the separator.
             text = entry.strip().replace(",", ".") if separator != "," else entry.strip()
             try:
                 table[row, column] = float(text)
@@ -182,7 +183,7 @@ def _wav(path: Path):
 def _matlab(path: Path):
     import scipy.io
 
-    # The reader of MATLAB files has errors of its own kind beside these.
+    # The reader of MATLAB files also raises errors of its own class.
     unreadable = (ValueError, TypeError, OSError, EOFError, scipy.io.matlab.MatReadError)
     try:
         loaded = scipy.io.loadmat(path, squeeze_me=True)

@@ -1,4 +1,4 @@
-"""Recordings: what was measured, with its time base, its units and what is known of the run it came from.
+"""Recordings: measured signals with their time base, and what is known of the run they came from.
 
 A recording is read from a file (`recording_files`) or made from arrays (`Recording`), and averaged over blocks of samples
 before it is compared with a model (`averaged`). Over a block a mean acceleration is a change of velocity and a mean
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..foundation import arguments
 
 REGIMES = ("sliding", "kick", "limit cycle")
-# Time stamps are written with few digits; steps that differ by more than this share of a step are not rounding.
+# Time stamps are often rounded to few digits; steps that differ by more than this share of a step are uneven.
 UNEVEN = 0.05
 SHORTEST = 16
 
@@ -47,13 +47,12 @@ class Recording(eqx.Module):
       "sliding": a small motion about steady sliding, growing or decaying, whatever set it off.
       "kick": the response to the scene's own load from steady sliding; any contact events.
       "limit cycle": a vibration that keeps its amplitude.
-    - `offset`: for a kick, the instant of the simulation (s after its start) at which the recording's first sample lies,
-      as one number if known, else as the range to look in: (0, 0.5) unless given. A recording that begins before the
-      simulation has a negative offset.
-    - `noise`: standard deviation of one sample, by channel or one number for all. Unless given, it is estimated from where no
-      signal is, as white noise.
-    - `sticking`, `detached`: for a limit cycle, the measured fractions of time in these statuses, as pairs of the value
-      and its standard deviation.
+    - `offset`: for a kick, the time of the simulation (s) at which the recording's first sample lies, as one number if known,
+      else as the range to search: (0, 0.5) unless given. A recording that begins before the simulation has a negative offset.
+    - `noise`: standard deviation of one sample, by channel or one number for all. Unless given, white noise is assumed and
+      estimated from the differences between neighbouring samples or from the quiet part of the spectrum.
+    - `sticking`, `detached`: for a limit cycle, the measured fraction of time in this status, as a pair: the value and its
+      standard deviation.
     - `known`: parameters of the scene that were different in this run, by name: `belt_speed=1.0, force=50.0`.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for signals that are not finite, not evenly sampled, of unequal
@@ -124,12 +123,14 @@ class Recording(eqx.Module):
 
     @property
     def duration(self) -> float:
-        """Time that the samples cover, each its own step, in s."""
+        """The number of samples times the time between them, in s."""
         return len(self.t) / self.rate
 
 
 class Averaged(NamedTuple):
-    """Means over blocks of samples. `edges` are s after the first sample, half a step before each block's first one."""
+    """Means over blocks of samples. `edges`: the ends of the blocks, in s after the first sample; half a step before the first
+    sample of each block.
+    """
 
     edges: Float[np.ndarray, " edge"]
     means: Float[np.ndarray, "B k"]
@@ -137,7 +138,7 @@ class Averaged(NamedTuple):
 
 
 def averaged(recording: Recording, rate: float) -> Averaged:
-    """A recording as means over blocks of as many samples as come closest to `rate` blocks per second, one at least.
+    """A recording as means over blocks of samples, with about `rate` blocks per second and at least one sample in each.
 
     A last block that is not full is left out.
     """
@@ -149,7 +150,7 @@ def averaged(recording: Recording, rate: float) -> Averaged:
 
 
 def channel(name) -> Channel:
-    """The channel that a name means: "acceleration 0", "velocity 1", "a0", "v_1" …
+    """The channel of a name such as "acceleration 0", "velocity 1", "a0" or "v_1".
 
     **Raises:** `ValueError` for any other name.
     """

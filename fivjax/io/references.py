@@ -27,7 +27,7 @@ _PAPER = """@article{{cattai2026energy,
 def citation() -> str:
     """What to cite, as BibTeX: this version of fivjax, and the paper whose model it computes.
 
-    **Returns:** two entries as one text. `CITATION.cff` in the repository has the same.
+    **Returns:** two entries as one text. `CITATION.cff` in the repository has the same content.
 
     **Example:**
 

@@ -15,13 +15,13 @@ from .matrix_files import read_matrices
 from .model_units import SYSTEMS, in_si
 from .node_contacts import NodeContact, contact_directions, load_direction
 
-# What the matrices are called in files of several, in capitals.
+# Common names of the matrices in files that hold several, in capitals.
 NAMES = {
     "stiffness": ("K", "STIFFNESS", "KAA", "KAAX", "KGG", "KXX", "STIF"),
     "mass": ("M", "MASS", "MAA", "MAAX", "MGG", "MXX"),
     "damping": ("C", "D", "DAMPING", "VISCOUS DAMPING", "BAA", "BAAX", "BGG", "BXX"),
 }
-# What Abaqus puts into the names of the files beside `…_STIF1.mtx`.
+# What Abaqus puts into the file names of the other matrices, in place of STIF in `…_STIF1.mtx`.
 BESIDE = {"mass": "MASS", "damping": "DMPV", "structural damping": "DMPS"}
 # Abaqus holds a degree of freedom by 1e36 on the diagonal of the stiffness matrix.
 HELD = 1e35
@@ -45,26 +45,26 @@ def read_structure(
         print(big.checks)
         structure = fj.craig_bampton(big, up_to=3000.0).structure
 
-    Formats: `fj.read_matrices`. Beside an Abaqus `…_STIF1.mtx` the files `…_MASS1.mtx` and `…_DMPV1.mtx` are found by
-    themselves. Degrees of freedom that Abaqus holds (1e36 on the diagonal) are left out.
+    Formats: see `fj.read_matrices`. With an Abaqus `…_STIF1.mtx`, the files `…_MASS1.mtx` and `…_DMPV1.mtx` in the same folder
+    are read, too. Degrees of freedom that Abaqus holds (1e36 on the diagonal) are left out.
 
     **Arguments:**
 
     - `path`: the file with the stiffness matrix, and perhaps the others.
     - `units`: of the files, such as "mm-t-s" (forces in N) or "SI"; files do not say. Translations (directions 1 to 3, and all
       rows without labels) become metres; rotations are in rad already, modal coordinates keep their scale.
-    - `mass`, `damping`: their files, where they are not in the first one. A structure without damping matrix has none.
-    - `names`: what the matrices are called in files of several: `{"stiffness": "KAA", "mass": "MAA"}`.
+    - `mass`, `damping`: their files, where they are not in the first one. Without a damping matrix, damping is zero.
+    - `names`: the names of the matrices in files that hold several: `{"stiffness": "KAA", "mass": "MAA"}`.
     - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, MATLAB, NumPy): pairs, or a
       text file with two columns.
-    - `contacts`: by node and direction.
-    - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`.
+    - `contacts`: see `fj.NodeContact`.
+    - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`, without unit.
     - `rayleigh`: damping that is added as a·M + b·K, a in 1/s and b in s.
 
     **Returns:** a `SparseStructure`. Matrices that are not symmetric or not definite are read and reported by its `checks`.
 
-    **Raises:** `ValueError` as a sentence for files that cannot be used, matrices that do not go together, unknown units,
-    nodes or directions.
+    **Raises:** `ValueError`, as a sentence, for files that cannot be used, matrices that do not fit together, and unknown
+    units, nodes or directions.
 
     **Example:**
 
@@ -111,7 +111,7 @@ def read_structure(
 
 
 def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[str, FileMatrix], list[str]]:
-    """Stiffness, mass and, where there is one, damping, from the files given and those that Abaqus wrote beside them."""
+    """Stiffness, mass and damping (if there is one), from the given files and those that Abaqus wrote in the same folder."""
     files: dict[str, str | Path | None] = {"stiffness": path, "mass": mass, "damping": damping}
     remarks = []
     beside = re.fullmatch(r"(.*)_STIF(\d+)", path.stem, re.IGNORECASE)
@@ -148,7 +148,7 @@ def _chosen(role: str, path: Path, held: dict[str, FileMatrix], name: str | None
         if name not in held:
             raise ValueError(f"File `{path}` has no matrix `{name}`; it has: {', '.join(held)}.")
         return held[name]
-    # A file of one matrix that was given for this purpose holds it, unless its name says otherwise.
+    # The only matrix of a file that was given for this role has this role, unless its name says otherwise.
     if alone and len(held) == 1:
         only = next(iter(held))
         if not any(only.upper() in known for other, known in NAMES.items() if other != role):
