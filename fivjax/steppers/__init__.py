@@ -1,1 +1,1 @@
-"""How a trajectory is stepped: exactly from event to event, in windows, or with the status switched at step ends."""
+"""How a trajectory is stepped: exactly from event to event, the same in batches, or with the status switched at step ends."""

@@ -1,14 +1,14 @@
 """What the diffrax solvers of fivjax have in common.
 
-They integrate the smooth field of the status that a trajectory is in, decide with `contact.transition` what follows
-when it ends, and carry the status in their solver state. They work in a plain `diffrax.diffeqsolve`:
+They integrate the smooth vector field of the present status, find with `contact.transition` what follows when it ends, and
+carry the status in their solver state. They work in a plain `diffrax.diffeqsolve`:
 
     sol = diffrax.diffeqsolve(
         diffrax.ODETerm(fj.vector_field), fj.WhereSwitched(diffrax.Tsit5()), t0, t1, dt0, y0, args=scene,
         stepsize_controller=diffrax.StepTo(ts),
     )
 
-The state `y` is the displacements followed by the velocities, in m and m/s; the scene travels in `args`.
+The state `y` is the displacements followed by the velocities, in m and m/s; `args` is the scene.
 """
 
 import abc
@@ -24,7 +24,8 @@ from ..contact import Contact, Mechanics, State
 from ..model.scene import Scene
 from .section import Rise, rise_between
 
-# Advances within one diffrax step or between two saved instants. One that needs more is failed, not endless (Zeno).
+# The most advances within one diffrax step or between two saved instants. A run that needs more has failed (events without
+# end).
 MOST_ADVANCES = 4096
 
 
@@ -36,7 +37,7 @@ class StepperState(eqx.Module):
 
 
 def vector_field(t: Float[Array, ""], y: State, args: Scene) -> State:
-    """Rates of the state at one instant, in the status that its forces demand; the field for `diffrax.ODETerm`.
+    """Rates of the state at one instant (m/s and m/s²), in the status that its forces demand; for `diffrax.ODETerm`.
 
     **Example:**
 
@@ -49,17 +50,17 @@ def vector_field(t: Float[Array, ""], y: State, args: Scene) -> State:
 
 
 def rates(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> State:
-    """Rates of the state in the given status: its velocities and accelerations."""
+    """Rates of the state in the given status: velocities (m/s) and accelerations (m/s²)."""
     velocity = y[y.shape[0] // 2 :]
     return jnp.concatenate([velocity, physics.acceleration(mechanics, contact, load, y)])
 
 
 class Advance(NamedTuple):
-    """What one advance reached."""
+    """The result of one advance."""
 
     y: State
     contact: Contact
-    h: Float[Array, ""]  # how far it came, s
+    h: Float[Array, ""]  # its duration, s
     rise: Rise
     end: State  # where the mode's own motion ended, before anything that follows from its end
     ended: Bool[Array, "*contacts 2"]  # which of the guards ran out there
@@ -74,21 +75,23 @@ def advance_between(
     h: Float[Array, ""],
     mechanics: Mechanics,
 ) -> Advance:
-    """An advance from one state to another that knows of what lay between only what these two say."""
+    """An advance whose rise of the tangential velocity, if any, is found from its first and last state alone."""
     return Advance(y, contact, h, rise_between(mechanics, before, y), end, ended)
 
 
 class Within(NamedTuple):
-    """The motion inside one advance, in a form to integrate along it: the sum of weight times integrand over the states."""
+    """The motion inside one advance as a quadrature: an integral over time is the sum of weight times integrand at the
+    states.
+    """
 
     states: Float[Array, "k state"]
     weights: Float[Array, " k"]  # s
-    times: Float[Array, " k"]  # s after its start
+    times: Float[Array, " k"]  # s after the start of the advance
     end: State  # where the status's own motion ends, before anything that follows from its end
 
 
 class AbstractStepper(diffrax.AbstractSolver[StepperState]):
-    """A diffrax solver that knows the contact. `simulate` and the maps call its `advance`, diffrax its `step`.
+    """A diffrax solver that handles contact events. `simulate` and the maps call its `advance`, diffrax its `step`.
 
     **Example:**
 
@@ -98,15 +101,15 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
 
     # No advance is longer, in s.
     dt: eqx.AbstractVar[float]
-    # Advances between two looks at whether a trajectory's verdict is known: a few periods of vibration.
+    # Number of advances after which a map checks whether a trajectory's verdict is known: a few periods of vibration.
     round: eqx.AbstractClassVar[int]
-    # Whether it finds out itself how far an advance may reach; if not, `dt` is its step, and decides its error.
+    # Whether it finds the length of its advances itself; if not, `dt` is its step and determines its error.
     chooses_its_steps: ClassVar[bool] = True
     term_structure: ClassVar = diffrax.ODETerm
 
     @abc.abstractmethod
     def prepare(self, mechanics: Mechanics):
-        """What `advance` wants to know of a scene, worked out once: the mechanics themselves, or matrices made of them."""
+        """What `advance` needs of a scene, worked out once: the mechanics themselves, or matrices made from them."""
 
     @abc.abstractmethod
     def advance(
@@ -118,16 +121,16 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
-        """Go on from a state under a load that does not change, by `h` (s) or less.
+        """Go on from a state under a constant load (N), by `h` (s) or less.
 
-        `at_section` asks for the advance to end on the Poincaré section as well (see `section`), if the method can.
+        With `at_section` the advance also ends on the Poincaré section (see `section`), if the method can.
         """
 
     @abc.abstractmethod
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Within:
-        """States inside an advance that came `h` (s) far, and the weights that integrate over it to the method's order."""
+        """States inside an advance of duration `h` (s), and weights that integrate over it to the method's order."""
 
     def init(self, terms, t0, t1, y0: State, args: Scene) -> StepperState:
         mechanics = Mechanics(args)

@@ -1,9 +1,9 @@
-"""The stepping core: a trajectory from one segment to the next, with observers.
+"""The stepping core: a trajectory as a sequence of segments, with observers.
 
-A *segment* is one advance of a stepper: motion in one contact mode under one load, up to where a guard runs out, a trusted
-step ends, or the asked-for time has passed. `follow` strings segments together. Whatever wants to know what happens on the way
-(the energy ledger, derivatives, a Poincaré section, Fourier coefficients) is an observer: a function that adds what one segment
-tells to a total.
+A *segment* is one advance of a stepper: motion in one contact mode under one load, up to where a guard runs out, the series is
+no longer accurate, or the time asked for has passed. `follow` joins segments. The energy ledger, distances to events, Poincaré
+sections and Fourier coefficients are computed on the way by observers: functions that add one segment's contribution to a
+total.
 """
 
 from collections.abc import Callable
@@ -30,17 +30,17 @@ class Segment(NamedTuple):
 
 
 class Followed(eqx.Module, Generic[Total]):
-    """Where `follow` has come to."""
+    """The end of a trajectory that was followed."""
 
     y: State
     contact: Contact
-    left: Float[Array, ""]  # of the asked-for time, s; zero where it was reached
+    left: Float[Array, ""]  # time that is left of the time asked for, s; zero where the end was reached
     total: Total
-    enough: Bool[Array, ""]  # whether the segments allowed were enough
+    enough: Bool[Array, ""]  # whether the number of segments allowed was enough
 
 
 def nothing(total: Total, segment: Segment) -> Total:
-    """The observer that looks away."""
+    """The observer that adds nothing."""
     del segment
     return total
 
@@ -62,15 +62,15 @@ def follow(
 ) -> Followed[Total]:
     """A trajectory under a constant load, segment by segment, for a time `h` (s).
 
-    `observe` adds each segment to `total`; `until` may end the motion early, after the segment that makes it true.
-    `at_section` asks for segments to end on the Poincaré section, too. At most `most` segments are taken. `kind` of loop:
-    "bounded" can be differentiated in both modes; "lax" in forward mode only, and costs less.
+    `observe` adds each segment to `total`; `until` may end the motion early, after the segment that makes it true. With
+    `at_section` segments also end on the Poincaré section. At most `most` segments are taken. `kind` of loop: "bounded" can be
+    differentiated in forward and reverse mode; "lax" only in forward mode, and costs less.
     """
     h = jnp.asarray(h, y.dtype)
 
     def body(carry):
         y, contact, left, total = carry
-        # Equal parts; the allowance keeps rounding from adding one more, vanishingly short.
+        # Equal parts. The 1e-6 keeps rounding from adding another part of vanishing length.
         parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
         after = stepper.advance(mechanics, contact, load, y, left / parts, at_section)
         arrived = (parts == 1) & (after.h >= left)

@@ -1,4 +1,4 @@
-"""A method in words, for the provenance of results."""
+"""A method as text, for the provenance of results."""
 
 from .base import AbstractStepper
 

@@ -1,8 +1,8 @@
 r"""Steps that end exactly on contact events.
 
-Between events the motion is smooth, so its Taylor series at the start of an advance tells all: how far it may be
-trusted, where a guard is used up first, and the state there. The physics of `contact` is linear in the state but for
-friction, so the same functions map Taylor coefficients to Taylor coefficients.
+Between events the motion is smooth, so its Taylor series at the start of an advance gives everything: how far the series is
+accurate, where a guard is used up first, and the state there. Except for friction that depends on slip speed, the physics of
+`contact` is linear in the state, so the same functions map Taylor coefficients to Taylor coefficients.
 """
 
 import math
@@ -30,7 +30,7 @@ from .step_length import LONGEST_STEP, attainable, fastest_rate, time_unit, trus
 Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
 MOST_ROOT_STEPS = 60
-# A step's error in a derivative, relative to that in the motion.
+# How much larger a step's relative error may be in a derivative than in the motion.
 LOOSER = 100
 
 
@@ -42,11 +42,11 @@ class EventExact(AbstractStepper):
     - A guard that starts at zero, because the status has just begun there, does not fire at its own start.
     - After an event the state is put exactly on its constraint, and the next status follows from the forces.
 
-    Event times are differentiable (implicitly: the root is corrected by one Newton step whose derivative is the exact
-    one), forward and reverse.
+    Event times are differentiable in forward and reverse mode: the root is corrected by Newton steps whose derivative is that
+    of the implicit function.
 
-    **Arguments:** `order` of the series; `tolerance`, the size of its last term relative to the motion, which sets how
-    far one advance reaches; `dt`, a longest advance in s (none by default).
+    **Arguments:** `order` of the series; `tolerance`, the size of its last terms relative to the motion, which limits the
+    duration of an advance; `dt`, the longest advance in s (no limit by default).
 
     **Raises:** `ValueError` for an order below 4, or a tolerance or `dt` that is not positive.
 
@@ -79,7 +79,7 @@ class EventExact(AbstractStepper):
 
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
-        # No step straddles a jump, so the load in its middle is the load of the whole step.
+        # Steps end at jumps of the load, so the load at mid-step is that of the whole step.
         load = args.load(0.5 * (t0 + t1))
         after = follow(self, mechanics, contact, load, y0, t1 - t0)
         dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
@@ -98,15 +98,15 @@ class EventExact(AbstractStepper):
         unit = time_unit(mechanics)
         states, guards, mode = _series(mechanics, contact, load, y, self.order_, unit)
         rounding = _rounding(mechanics, contact, load, y, unit, mode)
-        # Of several contacts the two guards of the first come first, then those of the second, …
+        # With several contacts, the two guards of the first, then those of the second, …
         guards, rounding = [guard.ravel() for guard in guards], [row.ravel() for row in rounding]
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
         if at_section:
-            # One more row watches the tangential velocity rise through zero: not an event of the contact.
+            # One more row for the tangential velocity's rise through zero, which is no event of the contact.
             rows = [-section_speed(mechanics, state) for state in states]
             guards = [jnp.append(guard, row) for guard, row in zip(guards, rows, strict=True)]
-            # Of several contacts what is not on the section is before it, however little.
+            # With several contacts, a small distance from the section is no rounding error.
             rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, mechanics.several)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
         power, scaled = jnp.ones_like(reach), []
@@ -120,7 +120,7 @@ class EventExact(AbstractStepper):
             watching = jnp.arange(count + 1) < count + before_section(mechanics, y)
             safe, fires = jnp.where(watching, safe, 1.0), fires & watching
         first = jnp.min(safe)
-        # Guards that run out at the same instant, but for rounding, do so together.
+        # Guards whose roots differ by rounding only run out together.
         together = safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps)
         if mechanics.several:
             together = _together(mechanics, scaled, together & fires, first)
@@ -140,8 +140,8 @@ class EventExact(AbstractStepper):
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Within:
-        # The same series as the advance's own: compiled together, it is computed once. With this many Gauss points, a
-        # product of two series is integrated with an error far below that of the series itself.
+        # The advance uses the same series; compiled together with it, the series is computed once. With this many Gauss points,
+        # a product of two series is integrated with an error far below that of the series itself.
         unit = time_unit(mechanics)
         states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
@@ -166,7 +166,7 @@ class EventExact(AbstractStepper):
         h: Float[Array, ""],
         load: Float[Array, ""] | float = 0.0,
     ) -> State:
-        """The motion in one contact mode for a time `h` (s, of either sign) under a load (N), whatever its guards say."""
+        """The motion in one contact mode for a time `h` (s, of either sign) under a load (N), regardless of its guards."""
         unit = time_unit(mechanics)
         load = jnp.asarray(load, y.dtype)
 
@@ -180,16 +180,16 @@ class EventExact(AbstractStepper):
             reached, _ = value_and_slope(states, part / unit)
             return reached, left - part, ~last
 
-        # At least one step, so that the derivative in a time of zero is there.
+        # At least one step, so that there is a derivative with respect to `h` at zero, too.
         begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
 
 
 def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
-    """The stepper with steps as short as deviations from the motion need.
+    """The stepper with steps short enough for derivatives.
 
-    A series is trusted as far as the *motion* allows. Where a mode rests that is far, too far for a deviation in that mode:
-    the fastest vibration, if it turns by an angle a in a step, leaves a term of a^(order + 1) / (order + 1)!.
+    The length of a step is chosen for the *motion*. Where a fast mode of vibration is at rest, steps are too long for a
+    deviation in that mode: if its phase advances by a (rad) in a step, the error of the series is a^(order + 1) / (order + 1)!.
     """
     if not isinstance(stepper, EventExact):
         return stepper
@@ -202,10 +202,11 @@ def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
 def _series(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
 ) -> tuple[list[State], list[Float[Array, "*contacts 2"]], ModeForces]:
-    """Taylor coefficients in time of the state and of the guards, time in units; and the forces of the mode at the start.
+    """Taylor coefficients of the state and of the guards, in time measured in `unit` (s); and the forces of the mode at the
+    start.
 
-    The physics is linear in the state but for friction, so it maps coefficients to coefficients, the constant parts
-    (load, belt) entering with the first. Only T = σμN multiplies two series.
+    The physics is linear in the state except for T = σμN, so it maps coefficients to coefficients; the constant terms (load,
+    belt speed) enter with the first. T = σμN is the product of two series.
     """
     n = y.shape[0] // 2
     slip = physics.slip_speed(mechanics, contact, y)
@@ -238,7 +239,7 @@ def _rounding(
     unit: Float[Array, ""],
     mode: ModeForces,
 ) -> list[Float[Array, "*contacts 2"]]:
-    """What rounding leaves of the first three coefficients of the guards where they are zero."""
+    """Bounds on the rounding of the first three coefficients of the guards."""
     mechanics, contact, load, y, mode = jax.lax.stop_gradient((mechanics, contact, load, y, mode))
     sizes, found = jnp.abs(y), []
     for k in range(3):
@@ -252,11 +253,11 @@ def _rounding(
 def _together(
     mechanics: Mechanics, scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], first: Float[Array, ""]
 ) -> Bool[Array, " g"]:
-    """Which guards of several contacts end the advance together, of those that do at its end.
+    """Which of the guards of several contacts that run out at the end of the advance are one event.
 
-    Contacts that the mass matrix couples feel each other's events at once, so theirs are one event; also where rounding alone
-    tells their instants apart. Those of others come one after another, with no time in between if need be: each then has its
-    own instant, and its own derivative.
+    An event of one contact acts at once on the contacts that the mass matrix couples with it. So their simultaneous events,
+    even if the instants differ by rounding, are one event. Simultaneous events of other contacts follow one after another,
+    perhaps with no time in between: each then has its own instant, and its own derivative.
     """
     count = 2 * len(mechanics.places)
     chosen = jax.lax.argmax(fires, 0, jnp.int32)
@@ -267,7 +268,7 @@ def _together(
     nearly = (values <= 64 * jnp.finfo(size.dtype).eps * size) & (slopes < 0)
     coupled = jnp.repeat(among, 2) & jnp.any(fires[:count])
     of_contacts = coupled & (fires[:count] | (nearly & ~own))
-    # The row of the section, if there is one, is no contact's.
+    # The row of the section, if there is one, belongs to no contact.
     return jnp.concatenate([of_contacts, fires[count:]])
 
 
@@ -278,13 +279,13 @@ def _march_to_roots(
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
-    March from zero by steps over which a root is impossible: a lower bound on the second derivative gives
+    It marches from zero by steps d in which no root is possible: a lower bound on the second derivative gives
     $g + g' d - B_2 d^2 / 2 > 0$, and where $g$, $g'$ and $g''$ are positive, one on the third gives
-    $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is what gets away from the flat start after a lift-off. On [0, 1] negative
-    coefficients alone make the bounds. So no root is skipped, a dip below zero inside the interval is found at its first
-    crossing, and near a simple root the march converges quadratically. Zeros at the very start are divided out: the
-    root at which the status began; with an `exact` start, little is not nothing. A march that runs out of steps has still
-    shown how far the way is clear.
+    $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is needed at the flat start after a lift-off. On [0, 1] the negative coefficients
+    alone give the bounds. So no root is skipped, a dip below zero inside the interval is found at its first crossing, and near
+    a simple root the march converges quadratically. Roots at zero, where the status began, are divided out; with an `exact`
+    start, a small value there is no rounding error. A march that uses up its steps has still shown that there is no root up to
+    where it came.
     """
     eps = jnp.finfo(c[0].dtype).eps
     size = sum(jnp.abs(ck) for ck in c)
@@ -298,7 +299,7 @@ def _march_to_roots(
     bound_3 = sum(k * (k - 1) * (k - 2) * fk for k, fk in enumerate(falling) if k > 2)
     huge = 1.0 / eps
 
-    # Already used up: as after a jump of the load, or where the last advance ended a rounding short of the root.
+    # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
     spent = c[0] < 0
 
     def open_(x, step):
@@ -313,7 +314,7 @@ def _march_to_roots(
         value, slope, bend = value_slope_and_bend(c, x)
         value = jnp.maximum(value, 0.0)
         root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
-        # Two forms of one root, each free of cancellation where it is used.
+        # Two forms of the same root, each used where it has no cancellation.
         falls = slope < 0
         quadratic = _ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
         cubic = _ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
@@ -333,10 +334,10 @@ def _ratio(above, below, otherwise):
 def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
     """The root with the derivatives of an implicit function.
 
-    A Newton step from a converged root, with the slope taken as given, changes nothing but the derivative, and makes it
-    one order more exact: after the first step derivatives are right, after the second one derivatives of derivatives, too.
+    A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first
+    derivatives are right, after the second one the second derivatives, too.
     """
-    # An index of 64 bits could not be lowered in a program that computes with 32.
+    # An index of 64 bits could not be lowered in a single-precision program.
     chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
     for _ in range(2):
         values, slopes = value_and_slope(scaled, x)
@@ -348,7 +349,7 @@ def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Flo
 
 
 class _Restepped(AbstractLocalInterpolation):
-    """States inside a step, by stepping there anew: as exact as the step, through every event in it."""
+    """States inside a step, by stepping again from its start: as exact as the step, through every event in it."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]

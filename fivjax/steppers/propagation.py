@@ -1,4 +1,4 @@
-"""The matrices that carry a scene's motion through a window of time, in each of its contact modes; constant friction."""
+"""The matrices that give a scene's motion over a window of time, in each contact mode, under constant friction."""
 
 import math
 
@@ -12,24 +12,26 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
 from ..contact.rounding import largest_rounding
 
-# Intervals in a window, a power of two: long windows waste work after an event, short ones pay for their stages more often.
+# Intervals in a window, a power of two. In a long window the work after an event is wasted; short ones have more overhead.
 INTERVALS = 16
-# The fastest vibration turns by this much between two samples, rad: guards look like cubics there.
+# The phase of the fastest vibration advances by this much between two samples, rad: guards are nearly cubic there.
 TURN = 0.6
 # Order of the Taylor series within an interval: TURN^16 / 16! is below rounding.
 ORDER = 15
-# Rows of all matrices of a scene per coordinate, about; for those who have to know how much memory they take.
+# Approximate number of rows of all matrices of a scene, per coordinate: for estimates of memory.
 MATRIX_ROWS = 4 * (INTERVALS + ORDER)
 
 
 class Propagators(eqx.Module):
-    """The matrices of one scene. Their columns are those of `stacked`: the four ways to be in contact, side by side."""
+    """The matrices of one scene. Their columns are those of `stacked`: the four contact modes side by side."""
 
     mechanics: Mechanics
     interval: Float[Array, ""]  # between two samples, s
     window: Float[Array, "r c"]  # see `Window`
     series: Float[Array, "q c"]  # see `Series`
-    sizes: Float[Array, "8 c"]  # rounding of the guards' first three coefficients, and how far they are from cubics
+    sizes: Float[
+        Array, "8 c"
+    ]  # for rounding of the guards' first three coefficients, and for their difference from cubics
 
 
 def propagators(mechanics: Mechanics) -> Propagators:
@@ -60,8 +62,8 @@ def propagators(mechanics: Mechanics) -> Propagators:
 
     sizes, rates = jax.vmap(lambda way: _magnitudes(mechanics, way))(ways)
     terms = jnp.stack([sizes, sizes @ rates * interval, sizes @ rates @ rates * (0.5 * interval**2)])
-    # A cubic with the values and slopes of both ends is off by at most a 384th of the fourth derivative; twice that is
-    # what the derivative may grow to between samples.
+    # The error of a cubic with the values and slopes of both ends is at most 1/384 of the fourth derivative. Twice that, as the
+    # derivative may grow between samples.
     uncubic = jnp.max(jnp.abs(coefficients[4] @ samples), axis=0) * (2 * math.factorial(4) / 384)
     rounding = [largest_rounding(terms), uncubic]
 
@@ -75,7 +77,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
 
 
 def _bernstein(order: int) -> np.ndarray:
-    """From a polynomial's coefficients to its control points on [0, 1]: it lies in their convex hull."""
+    """The matrix from a polynomial's coefficients to its Bernstein control points on [0, 1]: it lies in their convex hull."""
     return np.array([[math.comb(j, k) / math.comb(order, k) for k in range(order + 1)] for j in range(order + 1)])
 
 
@@ -86,7 +88,7 @@ def _ways(dtype) -> Contact:
 
 
 def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
-    """What of (state, load, 1) is not zero: in contact, when there is neither gap nor gap rate, and detached."""
+    """Which entries of (state, load, 1) are not zero: in contact (no gap, no gap rate), and detached."""
     everything = np.arange(2 * n + 2)
     return everything[(everything != normal) & (everything != n + normal)], everything
 
@@ -94,7 +96,7 @@ def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
 def stacked(
     mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "state l"]
 ) -> Float[Array, "c l"]:
-    """(state, load, 1) in the columns of the way the contact is in, zero in the others."""
+    """(state, load, 1) in the columns of the present contact mode, zero in the others."""
     n, normal = y.shape[0] // 2, mechanics.normal
     rest = jnp.stack([load, jnp.ones_like(load)])
     closed = jnp.concatenate([y[:normal], y[normal + 1 : n + normal], y[n + normal + 1 :], rest])
@@ -105,7 +107,7 @@ def stacked(
 
 
 def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"], Float[Array, "2 m"]]:
-    """Rates and guards in one way of contact, as matrices on (state, load, 1)."""
+    """Rates and guards in one contact mode, as matrices on (state, load, 1)."""
     n = mechanics.free_load.shape[0]
 
     def rates_and_guards(v):
@@ -120,7 +122,7 @@ def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"]
 
 
 def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2 m"], Float[Array, "m m"]]:
-    """`contact.magnitudes` as matrices on the sizes of (state, load, 1): of the guards, and of the rates."""
+    """`contact.magnitudes` as matrices on the sizes of (state, load, 1): one for the guards, one for the rates."""
     n = mechanics.free_load.shape[0]
 
     def sizes(v):
@@ -128,14 +130,14 @@ def _magnitudes(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "2
         return jnp.concatenate([guards, rates])
 
     zero = jnp.zeros(2 * n + 1, mechanics.free_load.dtype)
-    # The load is a size like the others: the slope of its own size at zero is one.
+    # The load enters by its size; at one, the derivative of |load| is one.
     matrix = jnp.concatenate([jax.jacfwd(sizes)(zero.at[2 * n].set(1.0)), sizes(zero)[:, None]], axis=1)
     unchanging = jnp.zeros((2, 2 * n + 2), zero.dtype)
     return matrix[:2], jnp.concatenate([matrix[2:], unchanging])
 
 
 def _spectral_radius(matrix: Float[Array, "m m"]) -> Float[Array, ""]:
-    """By Gelfand's formula, the 64th root of the size of the 64th power: a little too large, never too small."""
+    """By Gelfand's formula: the 64th root of the norm of the 64th power. A little too large, never too small."""
 
     def squared(carry, _):
         log_size, matrix = carry

@@ -1,7 +1,7 @@
-"""The Poincaré section: the rises of the tangential velocity through zero, where motions are compared.
+"""The Poincaré section: the tangential velocity rises through zero.
 
-Of several contacts it is a weighted sum of their tangential velocities that rises through zero. Over a period the mean of each
-is zero, and so is that of the sum. The weights are no two alike, so that contacts which move against each other do not cancel.
+With several contacts, a weighted sum of their tangential velocities rises through zero. Over a period the mean of each velocity
+is zero, and so is that of the sum. All weights differ, so that contacts which move against each other do not cancel.
 """
 
 from typing import NamedTuple
@@ -14,24 +14,24 @@ from jaxtyping import Array, Bool, Float
 from ..contact import Mechanics, State
 
 GOLDEN = 0.5 * (5**0.5 - 1)
-# A sum of velocities this much smaller than the motion is zero: the state is on the section.
+# A state is on the section if the sum of velocities is no larger than this share of the motion.
 ON_SECTION = {"float64": 1e-13, "float32": 1e-6}
 
 
 class Rise(NamedTuple):
-    """A rise of the tangential velocity through zero, where motions are compared."""
+    """A rise of the tangential velocity through zero: a point of the Poincaré section."""
 
     happened: Bool[Array, ""]
-    at: State  # the state there; anything if there was none
+    at: State  # the state there; without meaning if there was none
 
 
 def section_weights(contacts: int) -> Float[np.ndarray, " c"]:
-    """What each contact's tangential velocity counts in the section: 1 of one contact."""
+    """The weight of each contact's tangential velocity in the section; 1 for a single contact."""
     return 1.0 + np.mod(GOLDEN * np.arange(contacts), 1.0)
 
 
 def section_speed(mechanics: Mechanics, y: State) -> Float[Array, ""]:
-    """What rises through zero on the section, in m/s; linear in the state."""
+    """The velocity that rises through zero on the section, in m/s; linear in the state."""
     n = y.shape[0] // 2
     if mechanics.several:
         return jnp.dot(jnp.asarray(section_weights(len(mechanics.places)), y.dtype), y[n + mechanics.tangential])
@@ -39,7 +39,9 @@ def section_speed(mechanics: Mechanics, y: State) -> Float[Array, ""]:
 
 
 def before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
-    """Whether the section is still to come: not where a state is on it. A sum of velocities is zero but for rounding there."""
+    """Whether a state lies before the section, and not on it. A sum of velocities is zero on the section only up to
+    rounding.
+    """
     speed = section_speed(mechanics, y)
     if not mechanics.several:
         return speed < 0
@@ -50,7 +52,7 @@ def before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
 
 
 def rise_between(mechanics: Mechanics, before: State, after: State) -> Rise:
-    """The rise between two states close to each other, on a straight line."""
+    """The rise between two states close to each other, by linear interpolation."""
     speed = section_speed(mechanics, before), section_speed(mechanics, after)
     rose = before_section(mechanics, before) & ~before_section(mechanics, after) & jnp.isfinite(speed[1])
     share = speed[0] / jnp.where(rose, speed[0] - speed[1], 1.0)

@@ -1,4 +1,4 @@
-"""How long the steps of a Taylor series may be: as far as it can be trusted, in units of the fastest vibration."""
+"""How long the steps of a Taylor series may be for a given error, in units of the fastest vibration."""
 
 import jax
 import jax.numpy as jnp
@@ -6,13 +6,14 @@ from jaxtyping import Array, Float
 
 from ..contact import Mechanics, State
 
-# No advance is longer, in units of time: a block that rides the belt moves in a straight line, whose series ends at once.
-# Powers of a longer one would be out of range.
+# The longest advance, in units of time. A block that is carried by the belt moves in a straight line, whose series ends at
+# once; powers of a longer time would overflow.
 LONGEST_STEP = 1e6
 
 
 def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
-    """A time in which the fastest vibration turns by about one rad, in s; a power of two, so that no number is rounded.
+    """A time in which the phase of the fastest vibration advances by about one rad, in s; a power of two, so that scaling by it
+    does not round.
 
     In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
     """
@@ -27,12 +28,14 @@ def fastest_rate(mechanics: Mechanics) -> Float[Array, ""]:
 
 
 def attainable(tolerance: float, dtype) -> float:
-    # A term that is lost in the rounding of the first ones cannot be asked to be smaller still.
+    # Terms below the rounding of the first ones need not be smaller still.
     return max(tolerance, 0.25 * float(jnp.finfo(dtype).eps))
 
 
 def trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
-    """How far the series may be trusted: where its last two terms are `tolerance` of its first ones, in its units of time."""
+    """How far the series is accurate, in its units of time: up to where its last two terms are `tolerance` of its first
+    ones.
+    """
     order, n = len(states) - 1, states[0].shape[0] // 2
     tolerance = attainable(tolerance, states[0].dtype)
 
@@ -41,12 +44,12 @@ def trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
 
     tiny = float(jnp.finfo(states[0].dtype).tiny)
     moves = (size(0) > 0) | (size(1) > 0)
-    # At rest, but not for long: a load has just jumped.
+    # At rest, but accelerated: a load has just jumped.
     starts = size(2) > 0
 
     def reach(last):
-        # Where |c_last| h^last = tolerance |c_j| h^j; the larger for j = 0 and 1, either of which may vanish. Slow motion in
-        # a stiff structure may have a last term too small for a number: it may be as large as the smallest one.
+        # Where |c_last| h^last = tolerance |c_j| h^j; the larger h of j = 0 and 1, because either coefficient may vanish. In
+        # slow motion of a stiff structure the last term may underflow; it then counts as the smallest normal number.
         end = jnp.maximum(size(last), tiny)
         steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1, 2)]
         longest = jnp.where(moves, jnp.maximum(steps[0], steps[1]), jnp.where(starts, steps[2], jnp.inf))

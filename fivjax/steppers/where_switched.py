@@ -16,17 +16,17 @@ from .base import AbstractStepper, Advance, StepperState, Within, advance_betwee
 class WhereSwitched(AbstractStepper):
     """Any explicit Runge–Kutta solver of diffrax, with the contact's status decided at the end of each step.
 
-    Within a step the status is fixed, and its own smooth field (selected by `jnp.where`, so that a batch of
-    trajectories in different statuses stays one computation) is integrated to the solver's order. At the end of the
-    step the guards are looked at once. An event is therefore noticed up to one step late: **first order in `dt`**
-    after an event, whatever the solver's order, and a touch shorter than a step goes unseen.
+    Within a step the status is fixed, and its smooth vector field (selected by `jnp.where`, so that a batch of trajectories in
+    different statuses is one computation) is integrated to the solver's order. The guards are checked at the end of the step.
+    So an event is noticed up to one step late: after an event the error is **first order in `dt`**, whatever the solver's
+    order, and a contact shorter than a step is missed.
 
     **Arguments:** `solver`, for instance `diffrax.Tsit5()`; `dt`, the step in s (in a plain `diffeqsolve`, the step
     size controller decides). Steps end on saved instants, so `simulate` takes equal parts of the time between two of them,
     each `dt` at most, and refuses a `dt` that is longer than that time.
 
-    A load's jumps should be step ends; `simulate` and the maps see to that, elsewhere use `diffrax.StepTo` or
-    `diffrax.ClipStepSizeController`.
+    Steps should end at the jumps of the load: `simulate` and the maps see to that; in a plain `diffeqsolve` use
+    `diffrax.StepTo` or `diffrax.ClipStepSizeController`.
 
     **Raises:** `TypeError` for a solver that is not an explicit Runge–Kutta method, `ValueError` for a step that is
     not positive.
@@ -62,7 +62,7 @@ class WhereSwitched(AbstractStepper):
 
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
-        # No step straddles a jump, so the load in its middle is the load of the whole step.
+        # Steps end at jumps of the load, so the load at mid-step is that of the whole step.
         load, h = args.load(0.5 * (t0 + t1)), t1 - t0
         smooth, error = self._smooth_step(mechanics, contact, load, y0, h)
         y1, next_contact, _ = self._switched(mechanics, contact, load, smooth, h)
@@ -83,7 +83,7 @@ class WhereSwitched(AbstractStepper):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
-        del at_section  # its steps end where they end
+        del at_section  # steps are not shortened to end on the section
         smooth, _ = self._smooth_step(mechanics, contact, load, y, h)
         y_next, next_contact, ended = self._switched(mechanics, contact, load, smooth, h)
         return advance_between(y, smooth, ended, y_next, next_contact, h, mechanics)
@@ -91,7 +91,7 @@ class WhereSwitched(AbstractStepper):
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
     ) -> Within:
-        # The stages and weights of the step itself, which is what the method does to an integral carried as one more state.
+        # The stages and weights of the step itself: the same as if the integral were one more state.
         tableau = self.solver.tableau
         states, stages = self._stages(mechanics, contact, load, y, h)
         weights = h * jnp.asarray(tableau.b_sol, y.dtype)
@@ -99,7 +99,7 @@ class WhereSwitched(AbstractStepper):
         return Within(jnp.stack(states), weights, times, y + h * _weighted(tableau.b_sol, stages))
 
     def _smooth_step(self, mechanics, contact, load, y, h) -> tuple[State, State]:
-        """The status's own field integrated over the step, and diffrax's error estimate of it."""
+        """The status's vector field integrated over the step, and diffrax's error estimate."""
         tableau = self.solver.tableau
         _, stages = self._stages(mechanics, contact, load, y, h)
         return y + h * _weighted(tableau.b_sol, stages), h * _weighted(tableau.b_error, stages)
@@ -116,7 +116,8 @@ class WhereSwitched(AbstractStepper):
 
     def _switched(self, mechanics, contact, load, smooth, h) -> tuple[State, Contact, Bool[Array, "*contacts 2"]]:
         ended = physics.guards(mechanics, contact, load, smooth) < 0
-        # An impact noticed up to a step late is that much too fast, which keeps rebounds of up to e/(1 - e) steps alive.
+        # An impact that is noticed up to a step late is too fast by that much, which would keep rebounds of up to e/(1 - e)
+        # steps going for ever.
         e = jnp.max(mechanics.restitution) if mechanics.several else mechanics.restitution
         resolution = h * jnp.clip(2 * e / jnp.maximum(1 - e, 0.01), 2.0, 200.0)
         next_contact, y = physics.transition(mechanics, contact, load, smooth, ended, resolution)

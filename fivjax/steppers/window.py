@@ -1,4 +1,4 @@
-"""A window of the future of trajectories side by side, and the Taylor series within one of its intervals."""
+"""A window of time ahead of many trajectories, and the Taylor series within one of its intervals."""
 
 import math
 
@@ -13,7 +13,7 @@ from .propagation import INTERVALS, ORDER
 
 
 class Window(eqx.Module):
-    """The future of trajectories side by side, at the ends of the intervals and between them."""
+    """A window of time ahead of trajectories (last axis): samples at the ends of intervals, and bounds in between."""
 
     rows: Float[Array, "r l"]
     sizes: Float[Array, "8 l"]
@@ -23,7 +23,7 @@ class Window(eqx.Module):
 
     @property
     def parts(self) -> list[Array]:
-        """First coefficients of the guards at the start; control points of their series there; their control points as
+        """The first coefficients of the guards at the start; the control points of their series there; their control points as
         cubics in each interval; samples of the state.
         """
         return _parts(self.rows, (4, 2), (ORDER, 2), (3, INTERVALS, 2), (INTERVALS + 1, 2 * self.n))
@@ -34,13 +34,13 @@ class Window(eqx.Module):
         return self.parts[-1][:, self.n + self.tangential]
 
     def safe_intervals(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
-        """How many intervals from the start on are certain to hold no event and no end of the step (`steps` intervals
-        off): a polynomial stays positive where its control points are.
+        """The number of intervals from the start that are certain to have no event and not the end of the step (after `steps`
+        intervals): a polynomial is positive where its control points are.
         """
         start, hull, control, _ = self.parts
         limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
         safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, trajectory]
-        # In the first interval a guard may start at zero, because its status has just begun.
+        # In the first interval a guard may start at zero, because the status has just begun.
         zeros, lead = _start(start, limits, self.exact)
         first_safe = (lead > 0) & (least(hull[2:]) > 0)
         first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
@@ -57,7 +57,7 @@ class Window(eqx.Module):
 
     def rise(self, interval: Int[Array, " l"]) -> tuple[Bool[Array, " l"], tuple[Array, Array]]:
         """Whether the tangential velocity rises through zero before the beginning of an interval, and the samples of the
-        state around the last time.
+        state around its last rise.
         """
         samples, speed, index = self.parts[-1], self.speed, jnp.arange(INTERVALS)[:, None]
         rises = (speed[:-1] < 0) & (speed[1:] >= 0) & (index < interval)
@@ -70,25 +70,25 @@ class Window(eqx.Module):
         return least(jnp.where((speed[:-1] < 0) & (speed[1:] >= 0), index, INTERVALS).astype(jnp.int32))
 
     def fastest(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
-        """The sample of the largest tangential speed within so many intervals."""
+        """The sample of the largest tangential speed within the first `steps` intervals."""
         speed, index = jnp.abs(self.speed), jnp.arange(INTERVALS + 1)[:, None]
         speed = jnp.where(index <= steps, speed, -1.0)
         return least(jnp.where(speed == -least(-speed), index, INTERVALS).astype(jnp.int32))
 
 
 class Bracket(eqx.Module):
-    """What is known of the first roots of the guards in [0, 1] from their starts and ends."""
+    """Brackets of the first roots of the guards in [0, 1], from values and derivatives at both ends."""
 
-    guess: Float[Array, "2 l"]  # at the root; at the lowest point of one that perhaps dips; else 1
-    zeros: Int[Array, "2 l"]  # roots at the very start, not meant
-    end: Float[Array, "2 l"]  # where it is no longer positive, if it crosses
+    guess: Float[Array, "2 l"]  # of the root; of the lowest point where the guard perhaps dips; else 1
+    zeros: Int[Array, "2 l"]  # number of roots at the start, which do not count
+    end: Float[Array, "2 l"]  # where the guard is no longer positive, if it crosses
     crosses: Bool[Array, "2 l"]
     spent: Bool[Array, "2 l"]  # negative from the start
-    dips: Bool[Array, "2 l"]  # positive at both ends, perhaps not in between
+    dips: Bool[Array, "2 l"]  # positive at both ends, but perhaps not in between
 
 
 class Series(eqx.Module):
-    """Taylor series of trajectories side by side from the beginning of an interval, in units of the interval."""
+    """Taylor series of trajectories (last axis) from the beginning of an interval; time in units of the interval."""
 
     rows: Float[Array, "q l"]
     sizes: Float[Array, "8 l"]
@@ -97,11 +97,13 @@ class Series(eqx.Module):
 
     @property
     def parts(self) -> list[Array]:
-        """Coefficients of the guards; their values at the end of the interval; coefficients of the displacements."""
+        """Coefficients of the guards; values of the guards at the end of the interval; coefficients of the displacements."""
         return _parts(self.rows, (ORDER + 1, 2), (2,), (ORDER + 2, self.n))
 
     def brackets(self, inside: Bool[Array, " l"]) -> "Bracket":
-        """Of each guard; at the end of the window, not `inside` an interval, there is nothing to look for."""
+        """The brackets of both guards. Where a trajectory is at the end of the window, not `inside` an interval, there are
+        none.
+        """
         c, end, _ = self.parts
         zeros, lead = _start(c, self.sizes[:6].reshape(3, 2, -1), self.exact)
         spent = inside & (lead < 0)
@@ -110,14 +112,14 @@ class Series(eqx.Module):
         bend = end - lead - slope
         guess = parabola_root(lead, slope, bend)
         bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
-        # With allowance for what is not parabolic.
+        # The factors allow for the difference from a parabola.
         dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
         dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
         guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
         return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
 
     def without_zeros(self, zeros: Int[Array, "2 l"]) -> Float[Array, "k 2 l"]:
-        """The guards, their coefficients that are zero but for rounding exactly so."""
+        """The coefficients of the guards; the first `zeros`, which are zero up to rounding, are exactly zero."""
         c = self.parts[0]
         return jnp.where(zeros > jnp.arange(ORDER + 1)[:, None, None], 0.0, c)
 
@@ -131,7 +133,7 @@ class Series(eqx.Module):
 
 
 def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
-    """Rows cut into pieces of these shapes, trajectories last."""
+    """Rows cut into arrays of these shapes, with a last axis over trajectories."""
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     return [
         rows[end - math.prod(shape) : end].reshape(*shape, -1) for shape, end in zip(shapes, ends.tolist(), strict=True)
@@ -139,7 +141,7 @@ def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:
 
 
 def parabola_root(lead: Array, slope: Array, bend: Array) -> Array:
-    """Where lead + slope x + bend x² first falls to zero, if it does; in the form that does not cancel."""
+    """Where lead + slope x + bend x² first falls to zero, if it does; in the form without cancellation."""
     root = jnp.sqrt(jnp.maximum(slope**2 - 4 * bend * lead, 0.0))
     rises = slope > 0
     half = 0.5 * jnp.where(rises, slope + root, root - slope)
@@ -148,7 +150,7 @@ def parabola_root(lead: Array, slope: Array, bend: Array) -> Array:
 
 
 def chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array, "*x l"]:
-    """Of as many rows as a window has intervals the one with this index in each trajectory."""
+    """For each trajectory the row with its index, of as many rows as a window has intervals."""
     size = INTERVALS
     while size > 1:
         size //= 2
@@ -157,7 +159,9 @@ def chosen(rows: Float[Array, "i *x l"], index: Int[Array, " l"]) -> Float[Array
 
 
 def least(rows: Array) -> Array:
-    """The least along the first axis, by halves: XLA turns that, unlike a reduction, into plain arithmetic on trajectories."""
+    """The minimum along the first axis, by halves: unlike a reduction, XLA makes this elementwise arithmetic on
+    trajectories.
+    """
     while rows.shape[0] > 1:
         half = rows.shape[0] // 2
         rest = rows[2 * half :]
@@ -169,7 +173,7 @@ def least(rows: Array) -> Array:
 def _start(
     c: Float[Array, "k g l"], limits: Float[Array, "3 g l"], exact: Bool[Array, "g l"]
 ) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
-    """How many coefficients at the start are zero but for rounding, and the first that is not."""
+    """How many of the first coefficients are zero up to rounding, and the first one that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
     zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
     for k, zero in enumerate(zero_at_start(c, size, limits, exact)):

@@ -1,4 +1,4 @@
-"""The first root of the guards within an interval: bracketed, then polished by Newton's method."""
+"""The first root of the guards within an interval: bracketed, then refined by Newton's method."""
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +10,17 @@ from .propagation import ORDER
 from .window import Bracket, Series
 
 MOST_ROOT_STEPS = 60
-# Of Newton's method in a bracket, for the root of a velocity that changes sign in an interval: bisection has to help seldom.
+# Steps of Newton's method in a bracket, for the root of a velocity that changes sign in an interval; bisection is seldom
+# needed.
 RISE_STEPS = 12
-# Of Newton's method, for a peak from the sample next to it.
+# Steps of Newton's method for a peak, from the sample next to it.
 PEAK_STEPS = 5
-# Terms of the series in the steps of Newton's method that nearly all roots are found with: few while it is still far off.
+# Terms of the series in each of the first steps of Newton's method, which are enough for nearly all roots: few at first.
 ROOT_STEPS = (5, 5, ORDER)
 
 
 def dipped(series: Series, brackets: Bracket) -> Bracket:
-    """The brackets of polynomials that seemed to dip below zero, decided at their lowest points; seldom run at all."""
+    """The brackets, with guards that perhaps dip below zero decided at their lowest points; seldom run."""
 
     def decided(bracket: Bracket) -> Bracket:
         c = series.parts[0]
@@ -28,8 +29,8 @@ def dipped(series: Series, brackets: Bracket) -> Bracket:
             _, slope, bend = value_slope_and_bend(c, x)
             return jnp.clip(x - slope / jnp.where(bend > 0, bend, 1.0), 0.0, 1.0)
 
-        # Newton's method: within an interval a slope is all but a straight line. It sets out from what the loop carries:
-        # what depends on nothing else, XLA takes out of the loop and computes every time.
+        # Newton's method: within an interval the slope is nearly linear. It starts from the value that the outer loop carries;
+        # XLA would move anything that does not depend on it out of the loop and compute it every time.
         lowest = jax.lax.fori_loop(0, 6, nearer, bracket.guess)
         below = bracket.dips & (value_and_slope(c, lowest)[0] <= 0)
         return Bracket(
@@ -47,18 +48,18 @@ def dipped(series: Series, brackets: Bracket) -> Bracket:
 def first_root(
     series: Series, brackets: Bracket, end: Float[Array, " l"]
 ) -> tuple[Float[Array, " l"], Bool[Array, "2 l"]]:
-    """Where in its interval the advance ends, `end` at the latest, as a share of it, and which of the guards end it there."""
+    """Where the advance ends, as a share of its interval, `end` at the latest; and which of the guards end it there."""
     crosses, spent = brackets.crosses, brackets.spent
     c = series.without_zeros(brackets.zeros)
-    # A few steps for all at once cost less than a loop that goes on until the last trajectory is done.
+    # A fixed number of steps for all costs less than a loop that goes on until the last trajectory is done.
     near = computed_once(lambda: _approached(c, brackets), brackets.guess)
     root, _, slope, settled = _newton(c, brackets.zeros, near)
-    # In a bracket, the function falls through its root; a dip ends where it is lowest.
+    # In its bracket the guard falls through its root; the bracket of a dip ends at its lowest point.
     settled = settled & (slope < 0) & (root > 0) & (root <= brackets.end)
     root, slope = _bisected(c, brackets, root, slope, crosses & ~settled)
     root = jnp.where(crosses, root, jnp.inf)
     first = jnp.minimum(root[0], root[1])
-    # Roots that differ by rounding are the same: the two guards of an open gap always are.
+    # Roots that differ by rounding are one event; the two guards of an open gap always are.
     same = 8 * jnp.finfo(end.dtype).eps * sum(jnp.abs(c[k]) for k in range(4))
     fires = crosses & ((root == first) | ((root - first) * jnp.abs(slope) <= same))
     any_spent = spent[0] | spent[1]
@@ -85,7 +86,7 @@ def first_rise(
         low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
         newton = x - value / jnp.where(slope == 0, 1.0, slope)
         inside = (newton >= low) & (newton <= high)
-        # The next error is the square of this one.
+        # Quadratic convergence: the next error is the square of this one.
         settled = inside & (jnp.abs(newton - x) <= 1e-8 * end)
         return low, high, jnp.where(inside, newton, 0.5 * (low + high)), open_ & ~settled, count + 1
 
@@ -99,13 +100,13 @@ def first_rise(
 
 
 def highest(c: Float[Array, "k l"], low: Float[Array, " l"], high: Float[Array, " l"]) -> Float[Array, " l"]:
-    """The largest size of a polynomial near zero, between `low` and `high`, one of which is zero or on either side of it."""
+    """The largest |value| of a polynomial near x = 0, for x between `low` <= 0 and `high` >= 0."""
     x = extremum(c, jnp.zeros_like(high), low, high, PEAK_STEPS)
     return jnp.maximum(jnp.abs(c[0]), jnp.abs(value_and_slope(c, x)[0]))
 
 
 def _approached(c: Float[Array, "k 2 l"], brackets: Bracket) -> Float[Array, "2 l"]:
-    """The first roots in their brackets to half of all digits and more, where Newton's method goes the common way."""
+    """The first roots in their brackets to more than half of all digits, where Newton's method converges as usual."""
     x = jnp.minimum(brackets.guess, brackets.end)
     for order in ROOT_STEPS:
         x = jnp.clip(_newton(c[: order + 1], brackets.zeros, x)[0], 0.0, brackets.end)
@@ -113,20 +114,20 @@ def _approached(c: Float[Array, "k 2 l"], brackets: Bracket) -> Float[Array, "2 
 
 
 def _newton(c: Float[Array, "k *x l"], zeros: Int[Array, "*x l"], x: Float[Array, "*x l"]):
-    """After one step of Newton's method: where, value and slope before it, and whether it was so short that it is the last."""
+    """One step of Newton's method: the new x, value and slope at the old one, and whether no further step is needed."""
     value, slope = value_and_slope(c, x)
-    # Without the roots at zero, which are divided out of value and slope alike.
+    # The slope of the polynomial with its roots at zero divided out, up to the common factor of value and slope.
     slope = slope - zeros * value / jnp.where(x > 0, x, 1.0)
     nearer = x - value / jnp.where(slope == 0, 1.0, slope)
-    # The next error is the square of this one.
+    # Quadratic convergence: the next error is the square of this one.
     return nearer, value, slope, (jnp.abs(nearer - x) <= 1e-7) & (slope != 0)
 
 
 def _bisected(
     c: Float[Array, "k *x l"], brackets: Bracket, root: Float[Array, "*x l"], slope, open_: Bool[Array, "*x l"]
 ) -> tuple[Float[Array, "*x l"], Float[Array, "*x l"]]:
-    """Roots and the slopes there, those of `open_` polynomials found anew: by Newton's method in their brackets, bisecting
-    where it leaves them. Seldom run at all.
+    """Roots and slopes; those of `open_` polynomials are found anew by Newton's method in their brackets, with bisection where
+    it leaves them. Seldom run.
     """
 
     def going(carry):

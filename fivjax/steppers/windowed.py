@@ -1,14 +1,13 @@
 """Exact motion through many contact events, fast in large batches; for constant friction.
 
-Within one status the motion is then linear: states a little later, two littles later, … are matrices times the state
-now. One product of a small matrix with all trajectories that share their mechanics samples a whole *window* of their future,
-and the control points of the guards between the samples. They show the interval in which the status may end, and only
-there its Taylor series, again a matrix times the state, is searched for the instant. What ends a status and what follows
-is read from `contact`, as everywhere.
+Within one status the motion is then linear: the states at equally spaced later times are matrices times the present state. One
+product of a small matrix with all trajectories that share their mechanics gives samples over a *window* of time ahead, and the
+Bernstein control points of the guards between the samples. These show the interval in which the status may end. Only there is
+the Taylor series, again a matrix times the state, searched for the instant. What ends a status and what follows comes from
+`contact`, as everywhere.
 
-Trajectories stand side by side along the last axis: these products are then matrix-matrix products, which is what a
-processor does best, and everything else is plain arithmetic on rows of them. `jax.vmap` over trajectories with common
-mechanics leads here, too.
+Trajectories lie along the last axis, so these products are matrix-matrix products, which processors do fastest, and everything
+else is elementwise arithmetic. `jax.vmap` over trajectories with common mechanics leads here, too.
 """
 
 import functools
@@ -33,10 +32,10 @@ from .window_roots import dipped, first_rise, first_root, highest
 
 
 class Windowed(eqx.Module):
-    """`EventExact` for many trajectories at once: the same motion to rounding, from matrices prepared per scene.
+    """`EventExact` for many trajectories at once: the same motion to rounding, from matrices prepared for each scene.
 
-    It needs constant friction and gives no derivatives. Maps use it in place of `EventExact` where they can, by the same
-    three names as any stepper's: `round`, `prepare` and `advance`.
+    It needs constant friction and gives no derivatives. Maps use it in place of `EventExact` where they can: its `dt`, `round`,
+    `prepare` and `advance` are those of a stepper.
     """
 
     dt: ClassVar = np.inf
@@ -59,14 +58,15 @@ class Windowed(eqx.Module):
     def peak(
         self, prepared: Propagators, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""], end: State
     ) -> Float[Array, ""]:
-        """The largest tangential speed (m/s) within an advance that came `h` (s) far, to its `end`; to rounding."""
+        """The largest tangential speed (m/s) within an advance of duration `h` (s) that ended at `end`; to rounding."""
         return _peak_of_one(prepared, contact, load, y, h, end)
 
 
 def _side_by_side(advance: Callable):
-    """`advance`, which takes trajectories side by side along the last axis, of one of them; its `jax.vmap` is `advance` again.
+    """From `advance`, which takes trajectories along the last axis, the function of one trajectory; its `jax.vmap` is
+    `advance`.
 
-    Where mechanics differ, too, there is nothing to share.
+    Where the mechanics are batched, too, nothing is shared, and the function of one trajectory is mapped.
     """
 
     @jax.custom_batching.custom_vmap
@@ -101,9 +101,9 @@ def _advance(
     h: Float[Array, " l"],
     at_section: bool = False,
 ) -> Advance:
-    """One advance of trajectories side by side: to the next event, the end of the step or that of the window, whichever comes
-    first. With `at_section` to the first rise of the tangential velocity, if that comes before (one that comes and goes between
-    two samples of the window is passed over).
+    """One advance of trajectories along the last axis: to the next event, the end of the step or that of the window, whichever
+    comes first. With `at_section` to the first rise of the tangential velocity, if that comes before; a rise and fall between
+    two samples of the window is missed.
     """
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps = jnp.minimum(h / prepared.interval, INTERVALS)
@@ -144,7 +144,7 @@ def _advance(
         if at_section:
             rise = Rise(rises | jumps, y_next)
         else:
-            # The last rise is the one that counts: in what is left of the interval, after the window's.
+            # The last rise counts: that in the last, partial interval, if there is one there, else that in the window.
             later = (state[velocity] < 0) & (reached[velocity] >= 0)
             before, after = jnp.where(later, state, around[0]), jnp.where(later, reached, around[1])
             at = _rise(before, after, prepared.interval * jnp.where(later, share, 1.0), mechanics.tangential)
@@ -176,7 +176,7 @@ def _peak(
     about = stacked(mechanics, contact, load, window.state_at(sample))
     speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
     near_sample = highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
-    # The end lies between samples, and may be faster than all of them.
+    # The end lies between samples, and the speed there may be larger than at all of them.
     return jnp.maximum(near_sample, jnp.abs(end[n + mechanics.tangential]))
 
 
@@ -188,10 +188,11 @@ _peak_of_one = _side_by_side(_peak)
 def _rise(
     before: Float[Array, "state l"], after: Float[Array, "state l"], h: Float[Array, " l"], tangential: int
 ) -> Float[Array, "state l"]:
-    """Where the tangential velocity rises through zero between two states a time `h` (s) apart, on cubics through both.
+    """The state where the tangential velocity rises through zero between two states a time `h` (s) apart, on cubics through
+    both.
 
-    It is off by some thousandths, and by the same ones whenever the motion is the same: as good a place to compare orbits
-    at as the rise itself, which an advance would have to end at.
+    It is wrong by some thousandths, but always by the same ones in the same motion, so motions can be compared there as well as
+    at the exact rise, at which an advance would have to end.
     """
     n = before.shape[0] // 2
     h = jnp.where(h > 0, h, 1.0)
