@@ -1,6 +1,6 @@
 """Complex eigenvalue analysis of steady sliding: its modes, where it loses stability, and which parameter to change.
 
-Everything that these questions need is at hand here; design by gradient is in `design`.
+This module collects all functions of linear theory under one name; design by gradient is in `design`.
 """
 
 from .charts import chart as chart
@@ -28,5 +28,5 @@ from .spectrum import eigenvalues as eigenvalues
 from .spectrum import growth_rate as growth_rate
 from .spectrum import linearisation as linearisation
 
-# Its former name.
+# A former name of `StabilityOutcome`.
 Outcome = StabilityOutcome

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 POINTS_AT_ONCE = 8192
-# Where LAPACK is called: few enough that two parts of a batch do not wait for each other (see `foundation.linear_solve`).
+# In batches that call LAPACK: small enough that parallel parts of it do not block each other (see `foundation.linear_solve`).
 POINTS_AT_ONCE_BY_LAPACK = 64
 
 
@@ -32,21 +32,21 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
 
         c = fj.cea.chart(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 1000), k1=np.linspace(80e3, 120e3, 1000))
 
-    The roots of the characteristic polynomial are found for all points together (`polynomial_roots`); stability itself
-    is judged by Routh–Hurwitz. Above 4 sliding coordinates both come from the eigenvalues of the Jacobian, point by
-    point.
+    The roots of the characteristic polynomial are found for all points together (`polynomial_roots`); `margin` is from
+    Routh–Hurwitz. Above 4 sliding coordinates the eigenvalues of the state matrix are computed point by point, without
+    `margin`.
 
     **Arguments:**
 
     - `system`: a structure, or a scene where friction depends on speed.
     - `**parameters`: two axes, each one-dimensional and strictly increasing, by name: `mu` or a parameter of the
       structure; for a scene, anything in `scene.parameters`. Single numbers replace the system's own value.
-    - `direction`: for a structure, +1 or -1: the way the belt moves.
+    - `direction`: for a structure, +1 for a belt that moves along the tangential coordinate, -1 against it.
 
     **Returns:** a dataset over the two axes with `growth_rate` (1/s, of the fastest growing mode), `frequency` of
     that mode (Hz), `margin` (the smallest Hurwitz determinant, positive where stable, without unit; up to 4 sliding
-    coordinates) and, for a scene, `normal_force` of steady sliding (N). NaN where there is no steady sliding, or no
-    unique one.
+    coordinates) and, for a scene, `normal_force` of steady sliding (N). NaN where there is no steady sliding, or where it is
+    not unique.
 
     **Raises:** `ValueError` for anything but two axes, unknown names, and values that the structure or scene refuses.
 
@@ -73,7 +73,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
         "margin": (smallest, "smallest Hurwitz determinant, positive where stable", "1"),
     }
     if not expanded:
-        # A determinant with hundreds of rows at every point would take longer than all the rest.
+        # Determinants with hundreds of rows at every point would take longer than everything else.
         del variables["margin"]
     if isinstance(system, Scene):
         variables["normal_force"] = (normal_force, "normal force of steady sliding", "N")
@@ -122,7 +122,7 @@ def _chart(scene, names, columns):
 
 
 def _steady_state(scene: Scene):
-    """Normal force (N) of steady sliding, by sums and products alone, and whether there is such a state."""
+    """Normal force (N) of steady sliding, by sums and products only, and whether there is such a state."""
     structure = scene.structure
     speed = jnp.abs(scene.belt_speed)
     n, keep = structure.normal, sliding_coordinates(structure.size, structure.normal)
@@ -142,6 +142,6 @@ def _steady_state(scene: Scene):
     normal_force = -bordered / stiffness * scene.load.final
     needed = normal_force
     if scene.friction.constant:
-        # The sliding motion is linear then, about whatever state.
+        # With constant friction the sliding motion is linear and the same about any state.
         needed = jnp.where(jnp.isfinite(normal_force), normal_force, 0.0)
     return normal_force, (needed >= 0) & (speed > 0)

@@ -21,10 +21,10 @@ from .system import as_scene, check_direction
 
 
 class StabilityLimit(eqx.Module):
-    """The friction where steady sliding becomes unstable, and how.
+    """The friction at which steady sliding becomes unstable, and how.
 
-    `mu` is infinite where the outcome is "never unstable" and 0 where it is "always unstable"; `frequency` in Hz (of
-    the mode that grows beyond the limit; 0 for divergence) is NaN then.
+    `mu` has no unit; it is infinite if the outcome is "never unstable" and 0 if it is "always unstable". `frequency` (Hz) is
+    that of the mode that grows beyond the limit: 0 for divergence, NaN where there is no limit.
     """
 
     mu: Float[Array, ""]
@@ -43,12 +43,12 @@ class StabilityLimit(eqx.Module):
 
 
 def bare(structure: Structure) -> Structure:
-    """The structure without the memory of how it was made: one compiled program serves every builder."""
+    """The structure as matrices, without the function that made it: one compiled program serves all structures of a size."""
     return Structure(*structure.matrices, contacts=structure.contacts)
 
 
 def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
-    # In coordinates of the contacts, so that one compiled program serves all directions that they may have.
+    # In contact coordinates, so that one compiled program serves contacts of any directions.
     return bare(in_contact_coordinates(structure)), jnp.full(len(structure.contacts), float(direction))
 
 
@@ -69,20 +69,20 @@ _critical_friction_of_several = compiled(with_own_gradient(critical_friction_of_
 def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Array, ""]:
     r"""μ_crit: the smallest constant friction just above which steady sliding is unstable, without unit.
 
-    The smallest $1/L(iω)$ over all frequencies where the friction loop $L$ is real, beyond which an eigenvalue of Eq. 3
-    has a positive real part (see the module's text). For an undamped structure that is where two modes coalesce.
+    The smallest $1/L(iω)$, over all frequencies at which the loop function $L$ of friction (`linear.feedback`) is real, beyond
+    which an eigenvalue of Eq. 3 has a positive real part. For an undamped structure that is where two modes coalesce.
 
-    Differentiable in every entry and parameter of the structure, forward and reverse and more than once, under
-    `jax.jit`, `jax.grad` and `jax.vmap`, also in a process that never turned on double precision. The derivative is
-    implicit and exact through the limit, where that of the eigenvalues would grow without bound. An undamped structure
-    is differentiated among undamped ones (the slightest damping moves the limit by a jump, so there is no derivative in
-    it; its entries are 0). Damping ratios below some 1e-11 drown in rounding and count as none.
+    Differentiable in every entry and parameter of the structure, in forward and reverse mode and more than once, under
+    `jax.jit`, `jax.grad` and `jax.vmap`, also without double precision being turned on. The derivative is that of the implicit
+    function; it is exact at the limit, where the derivative of the eigenvalues may grow without bound. For an undamped
+    structure damping stays zero: the smallest damping changes the limit by a jump, so there is no derivative with respect to
+    it, and its entries are 0. Damping ratios below some 1e-11 are lost in rounding and count as none.
 
-    **Returns:** `inf` where the structure is never unstable, 0 where it is unstable at the slightest friction; the
-    derivative is NaN then. `stability_limit` says the outcome and the mechanism by name.
+    **Returns:** `inf` where the structure is never unstable, 0 where it is unstable at the smallest friction; the
+    derivative is NaN then. `stability_limit` gives the outcome and the mechanism by name.
 
-    Several contacts slide under one μ. Their limit is looked for among 400 coefficients up to 2 and then closed in on: a
-    narrower unstable window may be missed, and "never" means up to 2. Undamped, it has no derivative there.
+    Several contacts slide under one μ. Their limit is sought among 400 coefficients up to 2 and then refined: a narrower
+    interval of instability may be missed, and "never unstable" means up to 2. Without damping there is no derivative.
 
     **Arguments:** `structure`; `direction`, +1 for a belt that moves along the tangential coordinate, -1 against it.
 
@@ -113,7 +113,7 @@ def _stability_limit_of_several(structure, direction):
 
 @returning_numpy
 def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLimit:
-    """Critical friction with its frequency, and by name whether there is one and how stability is lost there.
+    """Critical friction and its frequency; and, by name, whether there is a limit and how stability is lost there.
 
         limit = fj.cea.stability_limit(structure)
         limit.mu, limit.frequency, limit.outcome, limit.mechanism
@@ -151,8 +151,8 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     $N_0\, d\mu/dv$ along the belt: $\det(D_\mu(s) - γ s\, e e^T) = 0$ at $s = iω$, and the slope is $-γ/N_0$. Compare
     with `friction_slope(scene)`. Differentiable.
 
-    **Returns:** `-inf` where no slope makes sliding unstable, and 0 where it is unstable (coupled modes) even without
-    a slope.
+    **Returns:** `-inf` where no slope makes sliding unstable, and 0 where it is unstable even without a slope (by mode
+    coupling).
 
     **Raises:** `ValueError` for a belt at rest.
 

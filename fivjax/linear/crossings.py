@@ -1,16 +1,15 @@
 r"""All gains at which a feedback loop may lose its stability, and the first at which it does.
 
-Sliding can lose stability only where $1/γ = L(iω)$ for some real ω (see `feedback`), that is where $L(iω)$ is real. The
-frequencies where it is are eigenvalues of one small matrix: **all** crossings are found at once, and no narrow window of
-instability is stepped over. Between two crossings stability does not change, so one look at the eigenvalues there settles it.
-An undamped loop is real for all ω; it loses stability where two modes meet, $dL/dω = 0$, and those points come from another
-such matrix.
+Sliding can lose stability only where $1/γ = L(iω)$ for some real ω (see `feedback`), that is where $L(iω)$ is real. These
+frequencies are eigenvalues of one small matrix: **all** crossings are found at once, and no narrow interval of instability is
+missed. Between two crossings stability does not change, so the eigenvalues at one gain in between decide it. An undamped loop
+is real for all ω; it loses stability where two modes meet, $dL/dω = 0$, and those points come from another such matrix.
 
 The crossing is a solution of $L(iω; \text{parameters}) = 1/γ$, so it is differentiable by the implicit function theorem,
-also where the eigenvalues themselves are not.
+even where the eigenvalues are not.
 
-General eigenvalues (`jax.numpy.linalg.eig`) run on the CPU and, in recent versions of JAX, on some GPUs; what needs none is
-in `routh_hurwitz`.
+Eigenvalues of general matrices (`jax.numpy.linalg.eig`) are computed on the CPU and, in recent versions of JAX, on some GPUs;
+`routh_hurwitz` does without them.
 """
 
 from typing import NamedTuple
@@ -34,7 +33,7 @@ class Limit(NamedTuple):
 
 @jax.custom_jvp
 def first_limit(loop: Loop) -> Limit:
-    """The smallest gain above which the loop is unstable, by looking at every crossing."""
+    """The smallest gain just above which the loop is unstable, found by checking every crossing."""
     m = loop.mass.shape[0]
     eye, none = np.eye(m), np.zeros((m, m))
     solved = solve(loop.mass, jnp.concatenate([loop.stiffness, loop.damping, loop.column[:, None]], axis=1))
@@ -44,8 +43,8 @@ def first_limit(loop: Loop) -> Limit:
 
     static, impulsive = loop.limits
 
-    # Crossings: L(s) - L(-s) = 2s c (s² - A²)⁻¹ b with the loop's state matrix A. In units of the damping, so that
-    # light damping costs no digits.
+    # Crossings: L(s) - L(-s) = 2s c (s² - A²)⁻¹ b with the loop's state matrix A. In units of the damping, so that light
+    # damping does not lose digits.
     unit = jnp.max(jnp.abs(damping)) + jnp.max(jnp.abs(row_velocity))
     unit = jnp.where(unit > 0, unit, 1.0)
     squared = jnp.block([[-stiffness, -damping / unit], [unit * damping @ stiffness, damping @ damping - stiffness]])
@@ -69,14 +68,14 @@ def first_limit(loop: Loop) -> Limit:
     typical = 1 / (jnp.abs(impulsive) + jnp.linalg.norm(row) * jnp.linalg.norm(column))
     typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
     usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
-    # A mode that no damper reaches is on the imaginary axis at no gain at all, which is not a crossing.
+    # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
     marginal = jnp.max(jnp.linalg.eigvals(state).real) > -1e-11
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
     gains = jnp.where(usable, 1 / jnp.where(usable, inverse_gain, 1.0), jnp.inf)
     gains, omega, codes = jax.lax.sort((gains, omega, codes), num_keys=1)
 
-    # Between two neighbouring crossings stability is the same everywhere. Any gain in between will do; one of ordinary
-    # size, because the next crossing may be very far off, or be rounding.
+    # Between two neighbouring crossings stability does not change, so any gain in between will do. One of ordinary size is
+    # taken, because the next crossing may be very far off, or may be a rounding error.
     lower = jnp.concatenate([jnp.zeros(1), gains])
     upper = jnp.concatenate([gains, jnp.array([jnp.inf])])
     between = jnp.minimum(0.5 * (lower + upper), jnp.maximum(2 * lower, typical))
@@ -107,9 +106,9 @@ def first_limit(loop: Loop) -> Limit:
 
 @first_limit.defjvp
 def _(primals, tangents):
-    """The implicit function theorem, with dL = (db - y dD) x + y de, x = D⁻¹e, y = D⁻ᵀb, written out.
+    """The implicit function theorem, with dL = (db - y dD) x + y de, x = D⁻¹e, y = D⁻ᵀb.
 
-    Every entry of the change of the loop appears once and linearly, so a gradient in all of them costs one evaluation.
+    It is linear in the change of each entry of the loop, so a gradient in all entries costs one evaluation.
     """
     (loop,), (change,) = primals, tangents
     limit = first_limit(loop)
@@ -120,7 +119,7 @@ def _(primals, tangents):
     row, row_slope = loop.row(s), loop.row_slope(s)
     x, y = solve(matrix, loop.column.astype(complex)), solve(matrix.T, row)
     value_change = change.row(s) @ x - y @ (change.matrix(s) @ x) + y @ change.column
-    # The same along s: x', y', L', L'' and the change of L'.
+    # The derivatives by s: x', y', L', L'', and the change of L'.
     x_slope, y_slope = -solve(matrix, matrix_slope @ x), solve(matrix.T, row_slope - matrix_slope.T @ y)
     slope = row_slope @ x - y @ (matrix_slope @ x)
     bend = 2 * loop.row_mass @ x + row_slope @ x_slope - y_slope @ (matrix_slope @ x)
@@ -135,7 +134,7 @@ def _(primals, tangents):
         jnp.where(coalescence, -slope_change.imag / jnp.where(coalescence, bend.real, 1.0), 0.0),
     )
     inverse_gain_change = value_change.real - slope.imag * omega_change
-    # An impulse instead: s is infinite.
+    # Painlevé's paradox: s is infinite.
     x, y = solve(loop.mass, loop.column), solve(loop.mass.T, loop.row_mass)
     impulsive_change = change.row_mass @ x - y @ (change.mass @ x) + y @ change.column
     inverse_gain_change = jnp.where(limit.code == PAINLEVE, impulsive_change, inverse_gain_change)
@@ -144,9 +143,9 @@ def _(primals, tangents):
 
 
 def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[Array, " n"]) -> Complex[Array, " n"]:
-    """The zeros x of row (x - matrix)⁻¹ column: n - 1 of them or fewer; the others come out infinite."""
-    # Shifted and inverted, the zeros are the eigenvalues of the matrix seen through the projector that leaves out the
-    # column. The shift must not be a zero or an eigenvalue; of three the best is taken.
+    """The zeros x of row (x - matrix)⁻¹ column: at most n - 1; the others come out infinite."""
+    # After shift and inversion, the zeros are eigenvalues of the matrix times the projector that removes the column. The shift
+    # must not be a zero or an eigenvalue; the best of three is taken.
     n = matrix.shape[0]
     shifts = np.array([0.3719, 1.7133, 5.2917])
 
@@ -159,7 +158,7 @@ def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[A
         return projected, jnp.where(jnp.all(jnp.isfinite(projected)), quality, 0.0)
 
     projected, quality = jax.vmap(seen_from)(shifts)
-    # The first of the best. All are useless for a loop that is zero or undamped, and then so is the result.
+    # The first of the best. For a loop that is zero or undamped none is usable, and the result is not finite.
     chosen = (quality > 0) & (quality == jnp.max(quality))
     chosen = chosen & (jnp.cumsum(chosen) == 1)
     best = jnp.sum(jnp.where(chosen[:, None, None], projected, 0.0), axis=0)

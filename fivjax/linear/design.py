@@ -1,6 +1,6 @@
-"""Design by gradient: move the critical friction where it does no harm, within bounds.
+"""Design by gradient: raise the critical friction, or lower growth rates, by changing parameters within bounds.
 
-The search for a critical friction by gradient, `search_critical_friction`, is at hand here too.
+The search for a critical friction by gradient, `search_critical_friction`, can be imported from here, too.
 """
 
 import enum
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class DesignOutcome(enum.StrEnum):
-    """What a design came to."""
+    """The outcome of a design."""
 
     TARGET_REACHED = "target reached"
     TARGET_NOT_REACHED = "target not reached within the bounds"
@@ -38,10 +38,10 @@ class DesignOutcome(enum.StrEnum):
 
 
 class Design(eqx.Module):
-    """The best design that was met: its structure, what changed, and the quantity before and after.
+    """The best design met in the search: its structure, the parameters that changed, and the quantity before and after.
 
     `history` holds the quantity and the parameters over the steps of the search, up to the one that first reached the
-    target; its attribute `chosen_step` says which of them is the design.
+    target; its attribute `chosen_step` says which step is the design.
     """
 
     structure: Structure
@@ -78,18 +78,19 @@ def raise_critical_friction(
         )
         print(design)
 
-    The gradient is the implicit one of `cea.critical_friction`. μ_crit may jump where another window of instability
-    opens, and the search is local: the best design on its way is returned.
+    The gradient is that of `cea.critical_friction`. μ_crit may jump where another interval of instability appears, and the
+    search is local: the best design met is returned.
 
     **Arguments:**
 
-    - `bounds`: lowest and highest value by name of parameter; the search starts from the structure's own.
-    - `target`: the top of the operating range. The search is content when μ_crit is above it, and says whether it is.
+    - `bounds`: lowest and highest value by name of parameter; the search starts from the structure's own values.
+    - `target`: the friction that μ_crit shall reach; the design is the first that does. Unless given, μ_crit is raised as far
+      as the steps go.
     - `tied`: parameters that follow from the others, as functions of the dictionary of all parameters.
-    - `steps`, `rate`: number of steps, and their first size as a share of the bounds.
+    - `steps`, `rate`: number of steps, and the size of the first ones as a share of the bounds.
 
-    **Raises:** `ValueError` for unknown names and bounds that do not hold the structure's own value, and where there is
-    no critical friction to start from.
+    **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
+    critical friction.
     """
     if target is not None:
         arguments.real_number("target", target, above=0)
@@ -120,7 +121,8 @@ def lower_growth_rate(
     steps: int = 200,
     rate: float = 0.03,
 ) -> Design:
-    """Lower the worst growth rate over a range of friction `mu` (an array), as `raise_critical_friction` raises μ_crit.
+    """Lower the largest growth rate over friction coefficients `mu` (a number or an array), as `raise_critical_friction` raises
+    μ_crit.
 
     Growth rates are in 1/s. `target` is the growth rate to stay below; -1 demands a decay of at least 1/s.
 
@@ -167,7 +169,7 @@ def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_b
         def step(carry, _):
             shares, memory = carry
             (value, reached), gradient = jax.value_and_grad(judged, has_aux=True)(shares)
-            # Where there is no derivative the memory of the last ones carries on.
+            # Where there is no derivative, Adam's averages of the last ones continue the search.
             gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
             updates, memory = optimiser.update(gradient, memory)
             following = optax.projections.projection_box(optax.apply_updates(shares, updates), 0.0, 1.0)
@@ -186,7 +188,7 @@ def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_b
         reached = after >= target if larger_is_better else after <= target
         outcome = DesignOutcome.TARGET_REACHED if reached else DesignOutcome.TARGET_NOT_REACHED
     columns = jax.vmap(values)(real(shares))
-    # Content with a target, the search is over where it is first reached; what follows is no part of the design.
+    # With a target, the search is over where it is first reached; later steps are no part of the design.
     taken = best + 1 if outcome is DesignOutcome.TARGET_REACHED else steps + 1
     history = xr.Dataset(
         {name.replace(" ", "_"): ("step", quantities), **{k: ("step", np.asarray(v)) for k, v in columns.items()}},

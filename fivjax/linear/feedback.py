@@ -1,12 +1,12 @@
 r"""Friction as a feedback loop around the sliding structure, and its transfer function.
 
-The normal force moves the structure along the belt, and that motion changes the normal force. One gain γ multiplies the
-whole loop, so with $D(s) = s^2 M + s C + K$ of the sliding coordinates
+The normal force, by friction, moves the structure along the belt, and that motion changes the normal force. One gain γ
+multiplies the whole loop, so with $D(s) = s^2 M + s C + K$ of the sliding coordinates
 
 $$\det(D - γ\, e\, b^T) = \det D\; (1 - γ L(s)), \qquad L(s) = b(s)^T D(s)^{-1} e .$$
 
 For friction γ = μ, $e$ is the tangential unit vector and $b(s)$ the normal row of the structure (times σ): Eq. 3. For a
-falling friction law γ is the damping that its slope takes away and $b = s\, e$.
+friction law that falls with slip speed, γ is the damping that its slope takes away, in N·s/m, and $b = s\, e$.
 """
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from .linearisation import time_scale
 
 
 class Loop(eqx.Module):
-    """A structure in steady sliding, opened at one rank-one feedback $e\\, b(s)^T$."""
+    """A structure in steady sliding without one rank-one feedback $e\\, b(s)^T$: the open loop."""
 
     mass: Float[Array, "m m"]
     damping: Float[Array, "m m"]
@@ -32,7 +32,7 @@ class Loop(eqx.Module):
     row_stiffness: Float[Array, " m"]
 
     def matrix(self, s):
-        """D(s), opened: without the feedback."""
+        """D(s), of the open loop."""
         return self.stiffness + s * self.damping + s**2 * self.mass
 
     def row(self, s):
@@ -48,7 +48,7 @@ class Loop(eqx.Module):
         return self.row_damping + 2 * s * self.row_mass
 
     def __call__(self, s: Complex[Array, ""]) -> Complex[Array, ""]:
-        """L(s), the loop's transfer function at gain one."""
+        """L(s), the transfer function of the loop at gain one."""
         return self.row(s) @ solve(self.matrix(s), self.column.astype(complex))
 
     def slope(self, s: Complex[Array, ""]) -> Complex[Array, ""]:
@@ -57,7 +57,7 @@ class Loop(eqx.Module):
 
     @property
     def limits(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """L(0), the answer to a static push, and L(∞), that to an impulse."""
+        """L(0), the static response, and L(∞), the response to an impulse."""
         static = self.row_stiffness @ solve(self.stiffness, self.column)
         return static, self.row_mass @ solve(self.mass, self.column)
 
@@ -87,7 +87,7 @@ def _tangential(structure: Structure):
 
 
 def _scaled(loop: Loop, scale) -> tuple[Loop, Float[Array, ""]]:
-    # Unit masses and frequencies of order one, so that the tolerances below mean something. L keeps its value.
+    # Unit masses and frequencies of order one, so that fixed tolerances make sense. L keeps its value.
     size = 1 / jnp.sqrt(jnp.abs(jnp.diagonal(loop.mass)))
     both = jnp.outer(size, size)
     return Loop(

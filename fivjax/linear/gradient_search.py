@@ -1,8 +1,8 @@
-"""The critical friction found by gradient from any start, kept inside a bracket.
+"""The critical friction by Newton's method from any start, kept inside a bracket.
 
-The search follows the derivative of the largest real part through the eigenvalues. That derivative is worthless just
-where it matters: below the coalescence of two modes it is almost zero, at it infinite. So each step is checked
-against a bracket of one stable and one unstable friction, and halves it where the derivative leads astray.
+The search follows the derivative of the largest real part of the eigenvalues. That derivative is of no use close to the
+coalescence of two modes: it is almost zero below it and infinite at it. So each step is checked against a bracket of one stable
+and one unstable friction, which is halved where the derivative misleads.
 """
 
 from collections.abc import Callable
@@ -26,20 +26,20 @@ from .system import as_scene, check_direction
 
 
 class _Bracket(eqx.Module):
-    lower: Float[Array, ""]  # where the function was last seen negative
-    upper: Float[Array, ""]  # and positive; infinite until it was
+    lower: Float[Array, ""]  # where the function was last found negative
+    upper: Float[Array, ""]  # where it was last found positive; infinite before that
     step: Float[Array, ""]
     settled: Bool[Array, ""]
-    exhausted: Bool[Array, ""]  # arrived at the end of the range, and nothing positive on the way
+    exhausted: Bool[Array, ""]  # the end of the range was reached without a positive value
 
 
 class BracketedNewton(optx.AbstractRootFinder):
     """Newton's method on a scalar function that is negative at `lower`, kept inside a bracket.
 
-    A Newton step is taken where the slope is not beyond `steepest` (at a coalescence it is infinite, or anything), the
-    step stays inside the bracket and at least halves the one before; else the bracket is halved, or, as long as no
-    positive value has been seen, the argument is doubled, up to `highest`.
-    For `optimistix.root_find`; the solution's state says whether the range was exhausted.
+    A Newton step is taken if the slope is at most `steepest` (at a coalescence it is infinite or meaningless), if the step
+    stays inside the bracket, and if it is at most half the one before. Else the bracket is halved, or, as long as no positive
+    value has been found, the argument is doubled, up to `highest`. For `optimistix.root_find`; the solution's state says
+    whether the range was exhausted.
     """
 
     rtol: float = 1e-13
@@ -84,9 +84,9 @@ def _value_and_slope(fn, y, args):
 
 
 class Search(eqx.Module):
-    """What a search for the critical friction came to.
+    """The result of a search for the critical friction.
 
-    `mu` is NaN unless the outcome is "found". `steps` counts evaluations.
+    `mu` (without unit) is NaN unless the outcome is "found". `steps` counts evaluations.
     """
 
     mu: float
@@ -106,15 +106,16 @@ def search_critical_friction(
     direction: int = 1,
     max_steps: int = 200,
 ) -> Search:
-    """The critical friction by gradient, from a friction to start at: a safeguarded Newton search (`BracketedNewton`).
+    """The critical friction by gradient, from a given first guess: a safeguarded Newton search (`BracketedNewton`).
 
     - `route="eigenvalues"`: on the largest real part of the eigenvalues, differentiated through them.
     - `route="routh-hurwitz"`: on the smallest Hurwitz determinant, smooth also where modes coalesce (`cea.margin`).
 
-    Each finds a crossing from stable to unstable; with several it need not be the first. `cea.critical_friction`
-    looks at all of them, by a third way.
+    Both find a crossing from stable to unstable, which need not be the first if there are several. `cea.critical_friction`
+    checks all of them, by a third method.
 
-    **Arguments:** `start`, above 0; `highest`, where the search gives up; `direction` as in `cea.critical_friction`.
+    **Arguments:** `start`, above 0; `highest`, the friction at which the search gives up; `direction` as in
+    `cea.critical_friction`.
 
     **Returns:** a `Search`; its outcome is "found", "never unstable" (nothing up to `highest`), "always unstable" or
     "undecided" (out of steps).
@@ -150,7 +151,7 @@ def search_critical_friction(
     return Search(mu if found else np.nan, outcome, steps, float(start), route)
 
 
-# Not `compiling.compiled`: at the root the sign is rounding, and how that falls decides between ten steps and fifty.
+# Not `compiling.compiled`: at the root the sign is a matter of rounding, which decides between ten steps and fifty.
 @eqx.filter_jit
 def _searched(structure, start, route, highest, direction, max_steps):
     def instability(mu, structure):
@@ -165,7 +166,7 @@ def _searched(structure, start, route, highest, direction, max_steps):
 
 
 def _in_natural_units(structure, mu, direction):
-    """The state matrix for displacements in units of velocity and time in units of 1/ω₀."""
+    """The state matrix for time in units of 1/ω₀ and displacements times ω₀."""
     scale = time_scale(structure)
     matrix = linear_sliding(as_scene(structure, mu, direction)).matrix
     half = matrix.shape[0] // 2

@@ -1,4 +1,4 @@
-"""Derivatives that eigenvalues and single precision would spoil, formed with care."""
+"""Growth rates and derivatives that are safe from rounding at double eigenvalues and from single precision."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from ..foundation.precision import in_double_precision
 
 
 def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """The largest real part of the eigenvalues, less what rounding may have put there: an undamped mode does not grow.
+    """The largest real part of the eigenvalues, less its possible rounding error: an undamped mode must not seem to grow.
 
     The matrix is in units where displacements, velocities and frequencies are of order one. Differentiable.
     """
@@ -19,10 +19,10 @@ def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     _, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(matrix), compute_left_eigenvectors=True)
     left = left.conj().T
     left = left / jnp.sum(left * right.T, axis=1, keepdims=True)
-    # The derivative of an eigenvalue is that of left A right with its vectors held fixed.
+    # The derivative of an eigenvalue is that of left A right with constant eigenvectors.
     real_parts = jnp.sum(left * (matrix @ right).T, axis=1).real
-    # An error of the matrix moves an eigenvalue by its size times the eigenvalue's condition number, which is large
-    # at a double eigenvalue that is none (an undamped mode met by another, but not coupled to it).
+    # An error of the matrix changes an eigenvalue by the size of the error times the eigenvalue's condition number, which is
+    # large at a double eigenvalue.
     condition = jnp.linalg.norm(left, axis=1) * jnp.linalg.norm(right, axis=0)
     error = 3e-15 * jax.lax.stop_gradient(jnp.linalg.norm(matrix)) * condition
     growth = jnp.max(jnp.where(jnp.isfinite(error), real_parts - error, -1e-12))
@@ -30,12 +30,12 @@ def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 def with_own_gradient(function: Callable, exists: Callable = jnp.isfinite) -> Callable:
-    """A scalar function whose derivative is formed at once, in double precision, and only applied later.
+    """A scalar function whose gradient is computed together with its value, in double precision.
 
-    The derivative is NaN where `exists` says of the value that there is none.
+    The derivative is NaN where `exists(value)` is false.
 
-    In a process that has not turned on double precision JAX carries out the backward pass after the public function has
-    returned, in single precision, and stumbles. Here the backward pass is left with a sum of products.
+    Without double precision turned on, JAX runs the backward pass after the public function has returned, in single precision,
+    and fails. Here only a sum of products with the gradient is left to the backward pass.
     """
     own = jax.custom_jvp(function)
 

@@ -1,4 +1,4 @@
-r"""How complex modes move: derivatives of eigenvalues by left and right eigenvectors, and a basis that they share.
+r"""Derivatives of eigenvalues by left and right eigenvectors, and a common basis for the modes of several operating points.
 
 $\frac{dλ}{dp} = -\frac{y^H (λ^2 M' + λ C' + K')\, x}{y^H (2λ M + C)\, x}$ with $P(λ)x = 0$ and $y^H P(λ) = 0$, for any real
 matrices, at the cost of one sparse factorisation for each mode.
@@ -12,14 +12,15 @@ from ..foundation import arguments
 from .mode_search import ComplexModes
 from .pencil import Pencil
 
-# How far from the eigenvalue the matrix is factorised: close enough to settle in two steps, and far enough not to be singular.
+# The matrix is factorised at this relative distance from the eigenvalue: near enough for convergence in two steps, far enough
+# not to be singular.
 APART = 1e-8
-# Left and right eigenvectors that are this close to right angles belong to equal eigenvalues, up to rounding.
+# Left and right eigenvectors that are this nearly orthogonal belong to equal eigenvalues, up to rounding.
 RIGHT_ANGLE = 1e-6
 
 
 def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], which=None) -> dict[str, np.ndarray]:
-    """dλ/dp of modes by each parameter, from how it changes the matrices.
+    """dλ/dp of modes by each parameter, from the derivatives of the matrices.
 
         change = {"speed": fj.cea.Pencil(0 * M, dC, dK)}
         slopes = fj.cea.eigenvalue_derivatives(modes, change, which=modes.unstable)
@@ -27,15 +28,15 @@ def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], w
 
     **Arguments:**
 
-    - `modes`: of a pencil.
-    - `changes`: by parameter, the derivatives of M, C and K as a `Pencil`; `friction_derivative` gives that of the friction of
-      a structure whose contacts slide.
-    - `which`: places of the modes; all unless given.
+    - `modes`: from `complex_modes`.
+    - `changes`: by parameter, the derivatives of M, C and K as a `Pencil`; `friction_derivative` gives it for the friction of a
+      structure whose contacts slide.
+    - `which`: indices of the modes; all unless given.
 
-    **Returns:** by parameter, complex, one for each mode. NaN for modes with equal eigenvalues, which have no derivative of
-    their own.
+    **Returns:** by parameter, an array with one complex number for each mode, in 1/s per unit of the parameter. NaN for modes
+    with equal eigenvalues, which have no derivative of their own.
 
-    **Raises:** `ValueError` for changes of another size.
+    **Raises:** `ValueError` for changes of another size than the pencil's.
     """
     arguments.instance("modes", modes, ComplexModes, "ComplexModes, as fj.cea.complex_modes gives them")
     for name, change in changes.items():
@@ -73,7 +74,7 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
 
 
 def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> np.ndarray:
-    """A real basis of few columns that holds the shapes of the modes of several working points, for `pencil.projected`.
+    """A real basis of few columns that contains the mode shapes of several operating points, for `pencil.projected`.
 
         points = [fj.cea.complex_modes(brake(speed), up_to=3000.0) for speed in (6.0, 20.0, 60.0)]
         basis = fj.cea.shape_basis(brake(6.0), *points)
@@ -81,7 +82,8 @@ def shape_basis(pencil: Pencil, *modes: ComplexModes, coordinates: int = 60) -> 
 
     The leading left singular vectors of all real and imaginary parts, with equal kinetic energy for each mode.
 
-    **Arguments:** `pencil`, whose mass weighs; `modes`, of pencils of the same coordinates; `coordinates`, the most columns.
+    **Arguments:** `pencil`, whose mass matrix gives the kinetic energy; `modes`, of pencils with the same coordinates;
+    `coordinates`, the largest number of columns.
 
     **Returns:** `(n, m)`, with m at most `coordinates`.
     """

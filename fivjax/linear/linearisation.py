@@ -1,4 +1,4 @@
-"""The sliding motion linearised about its equilibrium: its state matrix, and the signals that end it."""
+"""The sliding motion linearised about its equilibrium: its state matrix, and the two quantities that end it."""
 
 import equinox as eqx
 import jax
@@ -13,37 +13,38 @@ from ..model.scene import Scene, steady_sliding
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
 from ..model.structure import Structure
 
-# The proof for speed-dependent friction speaks of slip speeds above this share of the belt's.
+# The proof for friction that depends on slip speed holds for slip speeds above this share of the belt speed.
 LOWEST_SLIP = 0.5
 
 
 class LinearSliding(eqx.Module):
-    """The sliding motion linearised about its equilibrium, with the two signals that end it.
+    """The sliding motion linearised about its equilibrium, with the two quantities that end it where they reach zero.
 
-    `m` is twice the number of coordinates that sliding leaves free: the structure's without the normal one. Of several
-    contacts everything about a contact has an axis over them, and the pressing signals are the normal forces in N.
+    These are the pressing acceleration and the slip speed. `m` is twice the number of coordinates that sliding leaves free: all
+    but the normal one. With several contacts, everything about a contact has an axis over the contacts, and normal forces (N)
+    take the place of pressing accelerations.
     """
 
-    equilibrium: Float[Array, " state"]  # the state about which the deviation z is measured
+    equilibrium: Float[Array, " state"]  # the state from which the deviation z is measured
     matrix: Float[Array, "m m"]
     frictionless: Float[Array, "m m"]  # the same without friction
-    pressing: Float[Array, "*contacts m"]  # row: how z changes the pressing acceleration, the free one towards the belt
+    pressing: Float[Array, "*contacts m"]  # derivative by z of the pressing acceleration, the free one towards the belt
     pressing_margin: Float[Array, "*contacts"]  # its size at equilibrium, m/s²
-    slip: Float[Array, "*contacts m"]  # row: how z changes the slip speed
+    slip: Float[Array, "*contacts m"]  # derivative by z of the slip speed
     slip_margin: Float[Array, "*contacts"]  # its size at equilibrium, m/s
     remainder: Float[Array, "*contacts m"]  # direction in which the remainder of the friction law acts
     remainder_slope: Float[Array, "*contacts"]  # bounds on that remainder, see `decays_nonlinearly`
     remainder_curvature: Float[Array, "*contacts"]
     direction: Float[Array, "*contacts"]  # of the friction force
-    exists: Bool[Array, ""]  # steady sliding exists and presses
-    solvable: Bool[Array, ""]  # the contact problem has one solution in either direction of slip
+    exists: Bool[Array, ""]  # whether there is steady sliding, with normal forces that are not negative
+    solvable: Bool[Array, ""]  # whether the contact problem has a unique solution in both directions of slip
 
 
 def linear_sliding(scene: Scene) -> LinearSliding:
-    """The sliding motion's state matrix, and the two signals that end it.
+    """The state matrix of the sliding motion, and the two quantities that end it.
 
-    The matrix is that of Eq. 3 (`model.sliding`), with the damping that friction which varies with speed adds. The signals
-    are derivatives of `contact`, by automatic differentiation.
+    The matrix is that of Eq. 3 (`model.sliding`), with the damping added by friction that varies with slip speed. The
+    derivatives of the two quantities come from `contact`, by automatic differentiation.
     """
     mechanics = Mechanics(scene)
     if mechanics.several:
@@ -76,7 +77,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     return LinearSliding(
         equilibrium=equilibrium,
         matrix=state_matrix(mass, damping, stiffness),
-        # Whatever sustains a vibration, this damps it.
+        # The motion without friction, which takes no energy from the belt.
         frictionless=state_matrix(*sliding_matrices(scene.structure, jnp.zeros_like(friction))),
         pressing=jax.grad(pressing)(rest),
         pressing_margin=pressing(rest),
@@ -94,11 +95,11 @@ def linear_sliding(scene: Scene) -> LinearSliding:
 def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     r"""`linear_sliding` of several contacts.
 
-    With $D = \mathrm{diag}(σ_i μ_i)$, the coefficients at equilibrium in $D_0$, $A_0 = G_{nn} + G_{nt} D_0$ and the forces
-    $N_0(z) = -A_0^{-1} a_n(z)$ under those, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$, and
-    friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
-    `remainder` has the columns of $M^{-1} P$. What linearisation leaves out of column i is at most `remainder_slope` plus half
-    `remainder_curvature`, times the square of a size by which all signals stay within their margins (`decays_nonlinearly`).
+    With $D = \mathrm{diag}(σ_i μ_i)$, its value $D_0$ at equilibrium, $A_0 = G_{nn} + G_{nt} D_0$ and the forces
+    $N_0(z) = -A_0^{-1} a_n(z)$ under $D_0$, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$.
+    Friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
+    `remainder` has the columns of $M^{-1} P$. The remainder of the linearisation in column i is at most `remainder_slope` plus
+    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`decays_nonlinearly`).
     """
     n, load, law = scene.structure.size, scene.load.final, mechanics.friction
     q, normal_force = steady_sliding(scene, load)
@@ -159,10 +160,10 @@ def state_matrix(
 
 
 def slope_damping(scene: Scene, normal_force: Float[Array, ""]) -> Float[Array, ""]:
-    """What friction that varies with slip speed adds to damping along the belt, N dμ/dv in N·s/m: negative where it falls."""
+    """The damping along the belt by friction that varies with slip speed, N dμ/dv in N·s/m: negative where friction falls."""
     speed = jnp.abs(scene.belt_speed)
     if scene.friction.constant:
-        # The sliding motion is linear then, about whatever state.
+        # With constant friction the sliding motion is linear and the same about any state.
         return jnp.zeros_like(speed)
     return normal_force * jax.grad(lambda v: scene.friction(v))(speed)
 

@@ -1,4 +1,4 @@
-"""Where two modes of steady sliding meet: the coalescence that mode coupling starts from."""
+"""Where two modes of steady sliding meet: their coalescence, beyond which mode coupling makes one of them grow."""
 
 import equinox as eqx
 import jax
@@ -19,8 +19,8 @@ from .system import check_direction
 class Coalescence(eqx.Module):
     """Where two modes of steady sliding meet.
 
-    With damping they meet exactly only at a complex friction $\\mu + i\\mu'$: on the real axis they pass each other
-    closest at `mu`, and `imperfection` is $|\\mu'|$. Without damping it is 0.
+    With damping they meet exactly only at a complex friction $\\mu + i\\mu'$. For real friction they come closest to each other
+    at `mu`; `imperfection` is $|\\mu'|$, which is 0 without damping.
     """
 
     mu: float
@@ -31,7 +31,7 @@ class Coalescence(eqx.Module):
     outcome: StabilityOutcome = eqx.field(static=True)
 
 
-# Damping is brought in by this many steps, with as many Newton iterations at each.
+# Damping is increased from zero in this many steps, with this many Newton iterations at each.
 HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
 
 
@@ -61,14 +61,14 @@ def _coalescence(structure, direction):
 def coalescence(structure: Structure, *, damped: bool = False, direction: int = 1) -> Coalescence:
     r"""Where the two modes that become unstable together meet.
 
-    - `damped=False`: with the dampers left out (two frequencies become one, $dL/dω = 0$). This is what is usually
-      called coalescence, and what the paper's 0.22 is.
-    - `damped=True`: with them. The eigenvalues then meet exactly only at a complex friction: $L'(s) = 0$ for complex
-      $s$, $\mu + i\mu' = 1/L(s)$, followed from the undamped point as the damping is brought in. On the real axis they
-      pass closest at `mu` (to second order in `imperfection`).
+    - `damped=False`: without the dampers (two frequencies become one, $dL/dω = 0$). This is what is usually called coalescence;
+      the paper's value is 0.22.
+    - `damped=True`: with the dampers. The eigenvalues then meet exactly only at a complex friction: $L'(s) = 0$ for complex
+      $s$, $\mu + i\mu' = 1/L(s)$. This point is followed from the undamped one while the damping is increased. For real
+      friction the eigenvalues come closest at `mu` (to second order in `imperfection`).
 
-    **Returns:** a `Coalescence`. Where no two undamped modes meet its outcome is "never unstable" and its numbers are
-    NaN; where the damped point is lost on the way (heavy damping) it is "undecided".
+    **Returns:** a `Coalescence`. Where no two undamped modes meet, its outcome is "never unstable" and its numbers are
+    NaN; where the damped point cannot be followed (heavy damping), it is "undecided".
 
     **Example:**
 

@@ -20,25 +20,24 @@ if TYPE_CHECKING:
 
 @in_double_precision
 def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr.Dataset":
-    r"""The modes of steady sliding along one parameter, each followed along the axis.
+    r"""The modes of steady sliding over one parameter, each followed along the axis.
 
         fj.cea.modes(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 501))
         fj.cea.modes(scene, belt_speed=np.linspace(0.1, 3, 200))
 
-    A mode is a conjugate pair of eigenvalues, or two real ones where it is overdamped. Modes are numbered by frequency
-    at the start of the axis and followed by continuity: an interval in which an eigenvalue moves as far as to its
-    neighbour is halved until none does. Modes that cross without coupling are told apart by their shapes. Where two
-    modes truly meet (undamped coalescence) nothing tells which is which beyond; there the one of higher frequency goes
-    on as the one that grows.
+    A mode is a conjugate pair of eigenvalues, or two real ones where it is overdamped. Modes are numbered by frequency at the
+    start of the axis and followed by continuity: an interval in which an eigenvalue moves nearly as far as to its neighbour is
+    halved until none does. Modes that cross without coupling are told apart by their shapes. Where two modes meet (undamped
+    coalescence), nothing distinguishes them beyond; the one of higher frequency continues as the one that grows.
 
     **Arguments:** `system`; one axis by name, as in `chart`; single numbers replace the system's own value.
 
     **Returns:** a dataset over the axis and `mode` with `frequency` (Hz, damped), `growth_rate` (1/s), `damping_ratio`
-    (-Re λ/|λ|), `eigenvalue` (that of the pair with positive imaginary part, or the larger of two real ones; 1/s),
-    `partner` (the other one) and `shape` (complex displacements over `coordinate`, normal one included, the largest
-    scaled to 1; of contacts given by vectors those of `fj.in_contact_coordinates`). NaN where there is no steady
-    sliding. Along `mu`, and with constant friction, also the numbers of `stability_limit` and `coalescence`: `mu_crit`,
-    `frequency_crit` (Hz) and `mu_coalescence` (undamped).
+    (-Re λ/|λ|), `eigenvalue` (the one of the pair with positive imaginary part, or the larger of two real ones; 1/s),
+    `partner` (the other one) and `shape` (complex displacements over `coordinate`, including the normal one, the largest
+    scaled to 1; for contacts given by vectors, those of `fj.in_contact_coordinates`). NaN where there is no steady
+    sliding. Over `mu`, with constant friction, also `mu_crit`, `frequency_crit` (Hz) and `mu_coalescence` (undamped), from
+    `stability_limit` and `coalescence`.
 
     **Example:**
 

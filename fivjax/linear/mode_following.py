@@ -1,4 +1,4 @@
-"""The modes of steady sliding at points of an axis, and which of them is which from one point to the next, in NumPy."""
+"""The modes of steady sliding at points of an axis, and which mode at one point continues which at the next, in NumPy."""
 
 import equinox as eqx
 import jax
@@ -11,8 +11,8 @@ from ..model.scene import Scene
 from .several_contacts import sliding_motion
 from .spectrum import POINTS_AT_ONCE
 
-# How often an interval of an axis is halved to tell two modes apart; beyond, they have met. Modes that are one and the
-# same all along the axis would be halved everywhere, so the looks taken at one interval are counted too.
+# How often an interval of an axis is halved to tell two modes apart; if that is not enough, they have met. Modes that coincide
+# all along the axis would cause halving everywhere, so the points computed in one interval are limited, too.
 HALVINGS = 30
 LOOKS = 4 * HALVINGS
 
@@ -23,7 +23,7 @@ class Modes(eqx.Module):
     eigenvalue: np.ndarray  # (m,)
     partner: np.ndarray  # (m,)
     shape: np.ndarray  # (m, m), one row per mode
-    left: np.ndarray  # (m, 2m), what projects a state onto the mode
+    left: np.ndarray  # (m, 2m), projects a state onto the mode
     right: np.ndarray  # (m, 2m), the mode's state
 
     def taken(self, order) -> "Modes":
@@ -42,7 +42,7 @@ class Sampler:
         return [_modes_of(matrix) if exists else None for matrix, exists in zip(matrices, exist, strict=True)]
 
     def between(self, low: float, high: float) -> tuple[float, Modes | None]:
-        """The middle of an interval and the modes there; none once the looks are used up."""
+        """The middle of an interval and the modes there; None once the number of points is used up."""
         middle = 0.5 * (low + high)
         if self.looks <= 0 or not low < middle < high:
             return middle, None
@@ -55,7 +55,7 @@ def _matrices(scene, name, values):
     def at(value):
         point = scene.replace(**{name: value})
         matrix, normal_forces = sliding_motion(point)
-        # An unloaded structure presses with nothing, and its equilibrium need not exist: its linear motion does.
+        # Without load the normal forces are zero, and there need be no equilibrium; there is a linear motion all the same.
         exists = jnp.all(jnp.isfinite(matrix)) & ~jnp.any(normal_forces < 0)
         return matrix, exists
 
@@ -66,7 +66,7 @@ def _modes_of(matrix: np.ndarray) -> Modes:
     m = matrix.shape[0] // 2
     found, vectors = np.linalg.eig(matrix)
     upper = np.flatnonzero(np.imag(found) > 0)
-    # Real eigenvalues make modes of two neighbours each; conjugate ones come in pairs already.
+    # Two neighbouring real eigenvalues make one mode; complex ones come in conjugate pairs already.
     single = np.flatnonzero(np.imag(found) == 0)
     single = single[np.argsort(-np.real(found[single]), kind="stable")]
     first = np.concatenate([single[0::2], upper])
@@ -77,7 +77,7 @@ def _modes_of(matrix: np.ndarray) -> Modes:
     left = np.linalg.pinv(vectors)
     shape = vectors[:m, first].T
     largest = shape[np.arange(m), np.argmax(np.abs(shape), axis=1)]
-    # A mode of a free coordinate at constant speed has displacements all the same; only an empty one would divide by 0.
+    # Only a mode without displacements would divide by 0.
     shape = shape / np.where(largest == 0, 1.0, largest)[:, None]
     return Modes(
         eigenvalue=found[first].astype(complex),
@@ -89,15 +89,15 @@ def _modes_of(matrix: np.ndarray) -> Modes:
 
 
 def _assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pairs that together cost least."""
-    # Imported when wanted: it takes as long to load as much of the rest.
+    """Rows and columns of the pairs with the least total cost."""
+    # Imported here, because it takes long to load.
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(cost)
 
 
 def matched(at: Sampler, x0: float, a: Modes, x1: float, b: Modes, halvings: int) -> np.ndarray:
-    """For each mode of `a` the index of the same mode in `b`."""
+    """For each mode of `a`, at x0, the index of the same mode in `b`, at x1."""
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
     rows, order = _assigned(distance)
     moved = distance[rows, order]
@@ -119,14 +119,14 @@ def _gaps(eigenvalues: np.ndarray) -> np.ndarray:
 
 
 def _met(a: Modes, b: Modes) -> np.ndarray:
-    """The same as `_matched` where two modes of `a` have come together at one point."""
-    # Modes that merely cross keep their shapes: what projects onto one before finds one only afterwards.
+    """The same as `matched` where two modes have met between `a` and `b`."""
+    # Modes that cross without coupling keep their shapes: each left eigenvector of `a` finds only one right one of `b`.
     share = np.abs(a.left @ b.right.T)
     rows, order = _assigned(-share)
     rest = np.where(np.arange(len(order))[None, :] == order[:, None], 0.0, share)
     if np.all(share[rows, order] > 0.9) and np.all(rest.max(axis=1, initial=0.0) < 0.5):
         return order
-    # They truly met: by frequency before and by growth rate after, or the other way round; the rest by distance.
+    # They met: matched by frequency on one side and by growth rate on the other; all other modes by distance.
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
     _, order = _assigned(distance)
     close = np.flatnonzero(_gaps(a.eigenvalue) <= 10 * distance.max(axis=1))

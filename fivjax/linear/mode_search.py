@@ -1,7 +1,7 @@
 r"""Complex modes of small and large systems: dense, or by shift and invert in a band of frequencies.
 
-$(λ^2 M + λ C + K)\, x = 0$ as a linear problem in $(x, λx/ω)$. Near a shift $s$ its eigenvalues are the large ones of an
-operator that costs one sparse factorisation of $s^2 M + s C + K$, of the size of the structure. Shifts along the imaginary
+$(λ^2 M + λ C + K)\, x = 0$ is a linear problem in $(x, λx/ω)$. Its eigenvalues near a shift $s$ are the largest ones of an
+operator that needs one sparse factorisation of $s^2 M + s C + K$, of the size of the structure. Shifts along the imaginary
 axis are added until the discs in which all eigenvalues were found cover the band.
 """
 
@@ -18,12 +18,12 @@ from .pencil import Pencil, sliding_motions, sliding_pencil
 if TYPE_CHECKING:
     import xarray as xr
 
-# Up to here all eigenvalues come at once, from a dense matrix of twice the size.
+# Up to this number of coordinates all eigenvalues are computed at once, from dense matrices of twice the size.
 DENSE = 300
-# Eigenvalues for each shift: beyond some two dozen the basis costs more than another factorisation.
+# Number of eigenvalues per shift: for more than some two dozen the basis costs more than another factorisation.
 AT_ONCE = 24
 MOST_SHIFTS = 40
-# The strip of growth rates that is searched has this share of a disc's radius for half its width.
+# Half the width of the strip of growth rates that is searched, as a share of a disc's radius.
 STRIP = 0.5
 
 
@@ -33,9 +33,10 @@ class ComplexModes:
 
     - `eigenvalues`: `(k,)`, in 1/s.
     - `shapes`: `(n, k)`, displacements of the structure, the largest entry 1.
-    - `residuals`: `(k,)`, how well each satisfies its equation: the error relative to the size of the terms.
-    - `strip`: all modes of the band with growth rates between minus this and this, in 1/s, are there; infinite for dense ones.
-    - `pencil`: what they are modes of.
+    - `residuals`: `(k,)`, the error with which each satisfies its equation, relative to the size of the terms.
+    - `strip`: in 1/s. All modes of the band with growth rates between minus this and this are there; infinite where all modes
+      were computed.
+    - `pencil`: the pencil that they are modes of.
     """
 
     eigenvalues: np.ndarray
@@ -61,7 +62,7 @@ class ComplexModes:
 
     @property
     def unstable(self) -> np.ndarray:
-        """Places of the unstable modes, the fastest growing one first."""
+        """Indices of the unstable modes, the fastest growing one first."""
         growing = np.flatnonzero(self.eigenvalues.real > 1e-9 * np.abs(self.eigenvalues))
         return growing[np.argsort(-self.eigenvalues.real[growing])]
 
@@ -96,8 +97,8 @@ def complex_modes(
         fj.cea.complex_modes(fj.cea.Pencil(M, C, K), up_to=3000.0)
         fj.cea.complex_modes(structure, mu=0.4, up_to=3000.0).unstable
 
-    Up to 300 coordinates all modes are computed and those up to `up_to` returned; larger systems are searched by shift and
-    invert. There, what is far from the imaginary axis (`strip`) may be missing.
+    Up to 300 coordinates all modes are computed, and those up to `up_to` are returned. Larger systems are searched by shift and
+    invert; modes far from the imaginary axis (beyond `strip`) may then be missing.
 
     **Arguments:**
 
@@ -148,13 +149,13 @@ def _all(pencil: Pencil, band: float):
     mass, damping, stiffness = (matrix.toarray() for matrix in (pencil.mass, pencil.damping, pencil.stiffness))
     n, eye = pencil.size, np.eye(pencil.size)
     unit = _unit(mass, stiffness)
-    # In units of a typical frequency, so that both halves of a state are of one size.
+    # In units of a typical frequency, so that both halves of a state are of similar size.
     state = np.block([[np.zeros((n, n)), eye], [-stiffness / unit**2, -damping / unit]])
     inertia = np.block([[eye, np.zeros((n, n))], [np.zeros((n, n)), mass]])
     (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)  # pyright: ignore[reportAssignmentType]
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
     values, shapes = unit * top[finite] / bottom[finite], vectors[:n, finite]
-    # Rounding may leave a real eigenvalue an imaginary part of either sign; its conjugate is itself.
+    # Rounding may give a real eigenvalue a small imaginary part of either sign.
     values = np.where(np.abs(values.imag) < 1e-12 * np.abs(values), values.real, values)
     chosen = np.flatnonzero((values.imag >= 0) & (values.imag <= band))
     chosen = chosen[np.lexsort((values.real[chosen], values.imag[chosen]))]
@@ -177,7 +178,7 @@ def _in_band(pencil: Pencil, band: float):
                 f"structure by `craig_bampton`."
             )
         middle, half = (low + high) / 2, (high - low) / 2
-        # Off the axis, where an undamped mode may lie, and to the side of the unstable ones.
+        # Not on the imaginary axis, where an undamped mode may lie, but on the side of the unstable modes.
         shift = complex(0.01 * half, middle)
         values, shapes = near(pencil, shift, AT_ONCE)
         radius = np.max(np.abs(values - shift)) if values.size < 2 * pencil.size else np.inf
@@ -186,7 +187,7 @@ def _in_band(pencil: Pencil, band: float):
         if reach < half:
             gaps += [(low, middle - reach), (middle + reach, high)]
             low, high = middle - reach, middle + reach
-        # A little beyond both ends: what rounding puts on the wrong side of a border is found twice, not missed.
+        # A little beyond both ends: a mode that rounding puts on the wrong side of a border is found twice, not missed.
         margin = 1e-6 * band
         inside = (values.imag >= max(low - margin, 0.0)) & (values.imag <= high + margin)
         found += [(value, shape, shifts) for value, shape in zip(values[inside], shapes[:, inside].T, strict=True)]
@@ -198,7 +199,7 @@ def _in_band(pencil: Pencil, band: float):
 
 
 def _same(a, b) -> bool:
-    """Whether two finds, from different shifts, are one mode."""
+    """Whether two modes found from different shifts are the same."""
     (value, shape, shift), (other, other_shape, other_shift) = a, b
     if shift == other_shift or abs(value - other) > 1e-6 * abs(value):
         return False
@@ -211,7 +212,7 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
     from scipy.sparse.linalg import LinearOperator, eigs, splu
 
     n, unit = pencil.size, abs(shift)
-    # An order made for M + C + K and their transpose: a third less fill than one for columns alone.
+    # An ordering for the matrix plus its transpose: a third less fill-in than one for columns alone.
     factors = splu(pencil.at(shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
     relative, mass, damping = shift / unit, unit**2 * pencil.mass, unit * pencil.damping
 

@@ -1,10 +1,10 @@
-"""What the search for a stability limit comes to, by name."""
+"""Outcomes of the search for a stability limit, by name."""
 
 import enum
 
 
 class StabilityOutcome(enum.StrEnum):
-    """What came of the search for a stability limit."""
+    """The outcome of a search for a stability limit."""
 
     FOUND = "found"
     NEVER_UNSTABLE = "never unstable"
@@ -22,7 +22,7 @@ class Mechanism(enum.StrEnum):
     PAINLEVE = "Painlevé's paradox"  # an eigenvalue passes through infinity: no unique contact force
 
 
-# What the compiled search returns: an index into this table.
+# The compiled search returns an index into this table.
 CODES = [
     (StabilityOutcome.NEVER_UNSTABLE, Mechanism.NONE),
     (StabilityOutcome.ALWAYS_UNSTABLE, Mechanism.NONE),

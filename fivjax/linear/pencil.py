@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class Pencil:
     r"""Small motions $M \ddot q + C \dot q + K q = 0$ whose matrices need not be symmetric.
 
-    For what is not a `Structure`: gyroscopic terms in C, circulatory ones in K, friction that a finite-element code has put in.
+    For systems that are no `Structure`: gyroscopic terms in C, circulatory ones in K, friction terms of a finite-element code.
 
         pencil = fj.cea.Pencil(mass, damping, stiffness)
         modes = fj.cea.complex_modes(pencil, up_to=3000.0)
@@ -62,11 +62,11 @@ class Pencil:
         return (value**2 * self.mass + value * self.damping + self.stiffness).tocsc()
 
     def slope(self, value: complex) -> "sparse.csc_array":
-        """Its derivative by λ, 2λM + C."""
+        """The derivative by λ, 2λM + C."""
         return (2 * value * self.mass + self.damping).tocsc()
 
     def projected(self, right: np.ndarray, left: np.ndarray | None = None) -> "Pencil":
-        """The pencil of motions q = right @ z, its rows taken along the columns of `left` (of `right` unless given)."""
+        """The pencil of motions q = right @ z, projected onto the columns of `left` (of `right` unless given)."""
         left = right if left is None else left
         return Pencil(*(left.T @ (matrix @ right) for matrix in (self.mass, self.damping, self.stiffness)))
 
@@ -78,13 +78,14 @@ def sliding_pencil(system: Structure | SparseStructure, mu, *, direction=1) -> P
     r"""The pencil of steady sliding with all contacts closed and slipping, under constant friction.
 
     With $N$ and $T = σμN$ of all contacts, $M \ddot q + C \dot q + K q = B N$, $B = W_n + W_t \,\mathrm{diag}(σμ)$, and
-    $W_n^T q = 0$. Motions are $q = Z x$ with $W_n^T Z = 0$, and rows are taken along $Y$ with $B^T Y = 0$, so that the forces
-    drop out: $Y^T (λ^2 M + λ C + K) Z$. For one contact that is Eq. 3 of the paper.
+    $W_n^T q = 0$. Motions are $q = Z x$ with $W_n^T Z = 0$, and the equations are projected onto $Y$ with $B^T Y = 0$, so that
+    the contact forces vanish: $Y^T (λ^2 M + λ C + K) Z$. For one contact that is Eq. 3 of the paper.
 
     **Arguments:** `mu` and `direction` (+1 for a belt that moves along the tangential direction, -1 against it): one number,
     or one for each contact.
 
-    **Raises:** `ValueError` for negative or infinite friction, or as many numbers as there are not contacts.
+    **Raises:** `ValueError` for negative or infinite friction, or a number of values that is neither one nor that of the
+    contacts.
     """
     right, left, friction_part = _bases(system)
     friction = signed_friction(system, mu, direction)
@@ -93,7 +94,7 @@ def sliding_pencil(system: Structure | SparseStructure, mu, *, direction=1) -> P
 
 
 def friction_derivative(system: Structure | SparseStructure, mu, *, direction=1) -> Pencil:
-    """How the sliding pencil changes with a friction coefficient that all contacts share."""
+    """The derivative of the sliding pencil by a friction coefficient that all contacts share."""
     right, _, friction_part = _bases(system)
     change = friction_part(signed_friction(system, np.ones_like(np.asarray(mu, float)), direction))
     return Pencil(*(-change.T @ (matrix @ right) for matrix in _sparse_matrices(system)))
@@ -132,14 +133,14 @@ def _sparse_matrices(system):
 
 
 def _bases(system: Structure | SparseStructure):
-    """Z, Y without friction, and what friction takes from Y, as a function of σμ."""
+    """Z, Y without friction, and the part that friction takes from Y, as a function of σμ."""
     from scipy import sparse
     from scipy.linalg import null_space
 
     normal, tangential = system.normal_directions, system.tangential_directions
     if not normal.shape[1]:
         raise ValueError("The structure has no contacts. Give `contacts` to `read_structure`, or use `cea.Pencil`.")
-    # Only the coordinates that the normal directions touch are replaced; all others stay, and with them the zeros.
+    # Only coordinates in which a normal direction has an entry are replaced; all others stay, so the matrices stay sparse.
     touched = np.flatnonzero(np.any(normal != 0, axis=1))
     others = np.setdiff1d(np.arange(system.size), touched)
     kernel = null_space(normal[touched].T)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-# Each iteration at least triples the precision of a double root; simple ones need some fifteen.
+# Simple roots need some fifteen iterations; at a double root each iteration at least triples the precision.
 ITERATIONS = 60
 
 
@@ -58,12 +58,13 @@ def characteristic_polynomial(mass, damping, stiffness, scale) -> list[Float[Arr
 def polynomial_roots(coefficients) -> Complex[Array, "n ..."]:
     """All roots of polynomials with leading coefficient 1 and coefficients of order one, by Ehrlich–Aberth iteration.
 
-    `coefficients` is a list of real arrays of one shape, highest power first. Everything is elementwise over that shape
-    and in real arithmetic, which is what makes a million polynomials quick. NaN where the iteration has not settled.
+    `coefficients` is a list of real arrays of one shape, highest power first. All operations are elementwise over that shape
+    and in real arithmetic, so a million polynomials take little time. NaN where the iteration has not converged.
     """
     degree = len(coefficients) - 1
     coefficients = [jnp.broadcast_to(c, coefficients[-1].shape) for c in coefficients]
-    # On the unit circle, and not symmetric about the real axis: from a symmetric start no pair of real roots is found.
+    # First guesses on the unit circle, not symmetric about the real axis: from symmetric ones, pairs of real roots are not
+    # found.
     angles = 2 * np.pi * (np.arange(degree) + 0.35) / degree
     start = [
         (jnp.full_like(coefficients[-1], np.cos(angle)), jnp.full_like(coefficients[-1], np.sin(angle)))

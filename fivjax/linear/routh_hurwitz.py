@@ -1,10 +1,10 @@
 r"""Stability of steady sliding without eigenvalues: the characteristic polynomial and Routh–Hurwitz.
 
-Sliding keeps the rows of the structure but the normal one, the tangential row less $\sigma\mu$ times the normal row
-(Eq. 3). The signs of the Hurwitz determinants of $p(s) = \det(s^2 M + s C + K)$ say whether it is stable. Eigenvalues
-are not smooth where two of them meet; these determinants are polynomials in the matrices, smooth everywhere, and made
-of nothing but sums and products. So a batch of them fuses into one loop over points, on any device, where general
-eigenvalues go through LAPACK point by point (and are not to be had on every accelerator).
+The sliding motion has the rows of the structure without the normal one, with $\sigma\mu$ times the normal row subtracted from
+the tangential row (Eq. 3). The signs of the Hurwitz determinants of $p(s) = \det(s^2 M + s C + K)$ say whether it is stable.
+Eigenvalues are not smooth where two of them meet; these determinants are polynomials in the entries of the matrices, smooth
+everywhere, and need only sums and products. So a batch of them fuses into one loop over points, on any device, whereas general
+eigenvalues go through LAPACK point by point (and are not available on every accelerator).
 
 Time is measured in $1/ω_0$, $ω_0$ a mean of the structure's own frequencies, so that the coefficients are of order one.
 """
@@ -23,7 +23,7 @@ from .linearisation import state_matrix, time_scale
 from .polynomials import characteristic_polynomial, determinant
 from .system import check_direction
 
-# Up to here the determinant is expanded by hand (2ᵐ minors); beyond, matrix routines take over.
+# Up to this number of coordinates the determinant is expanded (2ᵐ minors); larger ones are left to matrix routines.
 LARGEST_EXPANDED = 4
 # The bialternate sum has N(N-1)/2 rows for N eigenvalues.
 LARGEST_SIZE = 32
@@ -32,7 +32,7 @@ LARGEST_SIZE = 32
 def hurwitz_determinants(coefficients) -> list[Float[Array, ""]]:
     """The Routh–Hurwitz conditions of a polynomial with leading coefficient 1: its roots decay if all are positive.
 
-    The Hurwitz determinants but the last; in place of that, its one new factor, the last coefficient.
+    All Hurwitz determinants but the last; in its place the last coefficient, its only new factor.
     """
     degree = len(coefficients) - 1
     zero = jnp.zeros_like(coefficients[-1])
@@ -51,12 +51,12 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
 
     The smallest of the Routh–Hurwitz determinants of the characteristic polynomial, in units of $ω_0$. At the first
     limit it is $\prod_{i<j} -(λ_i + λ_j)$ (a pair of eigenvalues crosses: flutter) or $\prod λ_i$ (a real one
-    crosses: divergence), and smooth there and at a coalescence of modes. Above 4 sliding coordinates these two
-    products are formed directly, as determinants of the bialternate sum of the state matrix with itself and of the
-    state matrix, each relative to its value without friction; the sign is then a test up to the first limit and not
-    beyond it. An undamped structure is on the limit at any friction: 0, or NaN above 4 sliding coordinates.
+    crosses: divergence); it is smooth there and at a coalescence of modes. Above 4 sliding coordinates these two
+    products are computed as determinants of the bialternate sum of the state matrix with itself and of the state matrix, each
+    relative to its value without friction; the sign is then valid up to the first limit, not beyond it. An undamped structure
+    is at the limit for any friction: 0, or NaN above 4 sliding coordinates.
 
-    Only sign and zeros have a meaning. Differentiable; works on any device; batches with `jax.vmap`.
+    Only its sign and its zeros have a meaning. Differentiable; runs on any device and in batches (`jax.vmap`).
 
     **Arguments:** `structure`; `mu`, the friction coefficient, without unit; `direction`, +1 for a belt that moves
     along the tangential coordinate, -1 against it.
@@ -99,7 +99,7 @@ def _margin(structure, mu, direction):
 
 
 def _relative_determinant(matrix, reference):
-    # In logarithms: a determinant of hundreds of rows is rarely a number that fits.
+    # In logarithms, because a determinant with hundreds of rows would often overflow or underflow.
     sign, size = jnp.linalg.slogdet(matrix)
     reference_sign, reference_size = jnp.linalg.slogdet(reference)
     return sign * reference_sign * jnp.exp(size - jax.lax.stop_gradient(reference_size))

@@ -1,4 +1,4 @@
-"""How the critical friction moves with each parameter of the structure."""
+"""How the critical friction changes with each parameter of the structure."""
 
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
@@ -23,12 +23,12 @@ UNITS = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m"}
 
 
 class Sensitivity(Mapping):
-    r"""How μ_crit moves with each parameter: `result["k1"]` is dμ_crit/dk1, a float in SI units.
+    r"""How μ_crit changes with each parameter: `result["k1"]` is dμ_crit/dk1, a float in SI units.
 
-    - `mu_crit`: the critical friction itself.
-    - `plain`, `normalised`: dictionaries by name; dμ_crit/dp, and (p/μ_crit) dμ_crit/dp, the percent that μ_crit moves
-      per percent of p. NaN where there is no derivative.
-    - `dataset`: all of it with units, for plots and files.
+    - `mu_crit`: the critical friction.
+    - `plain`, `normalised`: dictionaries by name: dμ_crit/dp, and (p/μ_crit) dμ_crit/dp, the change of μ_crit in percent per
+      percent of p. NaN where there is no derivative.
+    - `dataset`: both, with units, for plots and files.
     """
 
     def __init__(self, dataset: "xr.Dataset"):
@@ -59,7 +59,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     The parameters are those of the function that built the structure (seven for `belt_oscillator`). A structure given
     as matrices has its entries instead, `stiffness[0,1]` and so on, the two of a symmetric pair moved together.
 
-    The derivative is implicit (see `critical_friction`). Of an undamped structure there is none with respect to
+    The derivative is implicit (see `critical_friction`). For an undamped structure there is none with respect to
     damping: NaN.
 
     **Raises:** `ValueError` for a structure that is never or always unstable: there is nothing to differentiate.

@@ -1,11 +1,12 @@
 r"""Steady sliding of several contacts at once: its state matrix, and the friction at which it becomes unstable.
 
-All contacts slide under one coefficient, or one each. With contacts at coordinates the normal rows and columns go and each
-tangential row loses σμ times its own normal row, as in Eq. 3; friction that falls with speed adds a damper at each contact.
+All contacts slide, under one coefficient or with one each. With contacts at coordinates, the normal rows and columns are left
+out, and σμ times its normal row is subtracted from each tangential row, as in Eq. 3; friction that varies with slip speed adds
+a damper at each contact.
 
-The feedback of one contact is of rank one, and all its limits are found at once (`crossings`). That of several is not: here
-the growth rate is looked at for many coefficients, and the first limit is closed in on. An unstable window narrower than the
-distance between two of them can be missed.
+The feedback of one contact is of rank one, and all its limits are found at once (`crossings`). That of several contacts is not:
+here the growth rate is computed for many coefficients, and the first limit is then refined. An interval of instability narrower
+than the distance between two coefficients can be missed.
 """
 
 import jax
@@ -21,19 +22,19 @@ from .gradients import significant_growth
 from .linearisation import linear_sliding, state_matrix
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
 
-# Coefficients that are looked at for a limit, without unit: beyond 2 no surfaces in use are.
+# The largest coefficient that is tried, larger than those of any common surfaces, and the number of coefficients tried.
 LARGEST, LOOKS = 2.0, 400
-# Halvings of the distance between two looks: to the last digit.
+# Halvings of the distance between two coefficients: to the last digit.
 HALVINGS = 50
 
 
 def one_contact(structure: Structure) -> bool:
-    """Whether it has one contact at two coordinates, of which more is known than of several."""
+    """Whether there is one contact, at two coordinates, for which there are better methods than for several."""
     return len(structure.contacts) == 1 and structure.contacts_at_coordinates
 
 
 def free_coordinates(structure: Structure) -> np.ndarray:
-    """The coordinates that closed contacts leave free: of `in_contact_coordinates`."""
+    """The coordinates, of `in_contact_coordinates`, that closed contacts leave free."""
     structure = in_contact_coordinates(structure)
     return sliding_coordinates(structure.size, contact_coordinates(structure)[1])
 
@@ -70,7 +71,7 @@ def sliding_state(
 ) -> Float[Array, "m m"]:
     """A of ż = A z with z = (x, ẋ), x the coordinates that closed contacts leave free.
 
-    `friction` is σμ of each contact, `slopes` what friction that varies with speed adds to its damping, N dμ/dv in N·s/m.
+    `friction` is σμ of each contact, `slopes` the damping by friction that varies with slip speed, N dμ/dv in N·s/m.
     """
     structure = in_contact_coordinates(structure)
     tangential, _ = contact_coordinates(structure)
@@ -80,7 +81,7 @@ def sliding_state(
 
 
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
-    # In units of the structure's own frequencies, as `significant_growth` wants them.
+    # In units of the structure's own frequencies, as `significant_growth` needs it.
     matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
     scale = _time_scale(structure)
     half = matrix.shape[0] // 2
@@ -125,7 +126,7 @@ def _nearly_at_zero(structure: Structure, direction):
 
 @jax.custom_jvp
 def critical_friction_of_several(structure: Structure, direction: Float[Array, " c"]) -> Float[Array, ""]:
-    """The friction at the first limit; its derivative is implicit, that of the growth rate by left and right eigenvectors."""
+    """The friction at the first limit. Its derivative is that of the implicit function, growth rate = 0."""
     return first_limit_of_several(structure, direction)[0]
 
 
@@ -133,7 +134,7 @@ def critical_friction_of_several(structure: Structure, direction: Float[Array, "
 def _(primals, tangents):
     structure, direction = primals
     mu = critical_friction_of_several(structure, direction)
-    # Undamped modes meet at the limit, and the growth rate leaves it like a square root.
+    # Undamped modes meet at the limit, beyond which the growth rate rises like a square root: no derivative.
     usable = jnp.isfinite(mu) & (mu > 0) & jnp.any(structure.damping != 0)
     at = jnp.where(usable, mu, 0.1)
 
@@ -143,5 +144,5 @@ def _(primals, tangents):
 
     _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))
     _, along_mu = jax.jvp(lambda m: growth(structure, m), (at,), (jnp.ones_like(at),))
-    # As a factor, so that a gradient is not a number either: of a branch not taken it would be zero.
+    # NaN as a factor, because in reverse mode the branch of a `where` that is not taken would give zero instead of NaN.
     return mu, jnp.where(usable, 1.0, jnp.nan) * -along_structure / along_mu

@@ -1,7 +1,7 @@
 r"""Eigenvalues of steady sliding, point by point.
 
-The linearised motion has eigenvalues $λ$ with a frequency $|\mathrm{Im}\,λ|/2π$ and a growth rate $\mathrm{Re}\,λ$. Friction
-that falls with speed enters as a damper of negative rate (`linearisation`).
+The linearised motion has eigenvalues $λ$ with frequency $|\mathrm{Im}\,λ|/2π$ and growth rate $\mathrm{Re}\,λ$. Friction that
+falls with slip speed acts as a negative damper (`linearisation`).
 """
 
 import jax
@@ -18,16 +18,17 @@ from .gradients import with_own_gradient
 from .several_contacts import one_contact, sliding_motion
 from .system import as_scene, check_direction
 
-# Few enough that LAPACK calls on two parts of a batch do not wait for each other (see `foundation.linear_solve`).
+# Small enough that LAPACK calls in parallel parts of a batch do not block each other (see `foundation.linear_solve`).
 POINTS_AT_ONCE = 256
 
 
 @returning_numpy
 def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> Float[Array, "m m"]:
-    """State matrix A of small motions about steady sliding, ż = A z: the Jacobian of `contact`, by autodiff.
+    """State matrix A of small motions about steady sliding, ż = A z (Eq. 3), with the damping by friction that varies with
+    speed.
 
     z holds the deviations of the displacements (m) without the normal coordinate, then their velocities (m/s);
-    m = 2(n - 1). Of several contacts all normal coordinates are left out, and displacements are those of
+    m = 2(n - 1). With several contacts all normal coordinates are left out, and displacements are those of
     `fj.in_contact_coordinates`.
 
     **Arguments:** `system`, a scene, or a structure with constant friction `mu`; `direction`, for a structure, +1 for a
@@ -74,13 +75,13 @@ _forces = compiled(lambda scene: sliding_motion(scene)[1])
 def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Complex[Array, "... m"]:
     """The 2(n - 1) eigenvalues of steady sliding, in 1/s, sorted by frequency; 2(n - c) where c contacts slide.
 
-    Order: by |Im λ|, then by Re λ, then Im λ; so the two of a conjugate pair are neighbours, the one with negative
+    Order: by |Im λ|, then by Re λ, then by Im λ; so the two of a conjugate pair are neighbours, the one with negative
     imaginary part first.
 
     **Arguments:** as in `linearisation`; for a structure `mu` may also be an array, whose shape then comes first in the
-    result. Differentiable where the eigenvalues are distinct; near a coalescence the derivative grows without bound. In
-    a process without double precision, differentiate `growth_rate` instead (JAX cannot carry complex double precision
-    through its backward pass there).
+    result. Differentiable where the eigenvalues are distinct; near a coalescence the derivative grows without bound. Without
+    double precision turned on, differentiate `growth_rate` instead (JAX's backward pass cannot carry complex double precision
+    there).
 
     **Example:**
 
@@ -122,8 +123,8 @@ _growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigva
 def growth_rate(system: Structure | Scene, mu=None, *, direction: int = 1) -> Float[Array, ""]:
     """The largest real part of the eigenvalues of steady sliding, in 1/s: positive where it is unstable.
 
-    Arguments as in `linearisation`. Differentiable in everything (through the eigenvalues, so the derivative grows
-    without bound towards a coalescence), in any process; see `margin` for a measure that is smooth there.
+    Arguments as in `linearisation`. Differentiable in every parameter, with or without double precision turned on. The
+    derivative is that of eigenvalues, which grows without bound towards a coalescence; `margin` is smooth there.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""The system that an analysis is asked about: a scene, or a structure under constant friction, and its axes."""
+"""The system of a linear analysis: a scene, or a structure under constant friction; and the axes of its parameters."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ from ..model.structure import Structure
 
 
 def check_direction(direction) -> None:
-    """Refuse anything but the two ways a belt can move."""
+    """Refuse any direction of the belt but +1 and -1."""
     if direction not in (1, -1):
         raise ValueError(f"Argument `direction` must be 1 or -1, but is {direction!r}.")
 
 
 def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
-    """The scene whose sliding state is asked for: a given one, or a structure under constant friction.
+    """The scene to analyse: the given one, or a structure under constant friction.
 
-    A structure is not loaded: its linear motion with constant friction is the same under any load.
+    A structure gets no load: its linear motion with constant friction is the same under any load.
     """
     arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
     check_direction(direction)
@@ -39,7 +39,7 @@ def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
 def with_axes(
     system: Structure | Scene, direction: int, parameters: dict, *, count: int
 ) -> tuple[Scene, dict[str, np.ndarray]]:
-    """The scene with the single numbers put in, and the checked axes, as many as `count`."""
+    """The scene with the single numbers set, and the checked axes, `count` of them."""
     arguments.instance("system", system, (Structure, Scene), "a Structure or a Scene")
     if isinstance(system, Structure):
         if "mu" not in parameters:
@@ -58,7 +58,7 @@ def with_axes(
         given = ", ".join(axes) or "none"
         raise ValueError(f"Give exactly {wanted}, as arrays; here the axes are: {given}.")
     scene = scene.replace(**{name: value for name, value in parameters.items() if name not in axes})
-    # Every rule on a parameter is a bound, or an order between two, so the ends of the axes stand for all of them.
+    # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the ends of the axes.
     for end in (0, -1):
         scene.replace(**{name: values[end] for name, values in axes.items()})
     return scene, axes
