@@ -1,15 +1,10 @@
-r"""Derivatives of what a scene does, with word of whether they exist.
+r"""Derivatives of a functional of a trajectory, and whether they exist.
 
-Through contact they are exact: event times are differentiated implicitly and the state jumps as it should (`EventExact`).
-They do not exist everywhere, though. Where the contact only just touches, lifts or slips, a parameter's next digit means
-another sequence of events; there the state has no derivative, or one that holds on one side alone. So `derivatives` also
-follows the trajectory's guards and says how close it comes to that.
-
-At an event a guard $g$ crosses zero with slope $\dot g$; it would turn back at a depth of $\dot g^2 / (2 |\ddot g|)$ (to
-second order). Between events it may come down to a smallest value and recover. Both, relative to the largest size of that
-guard on the trajectory, say how far the event is from vanishing, or a new one from appearing. Two events at one instant,
-or one on a jump of the load or at the very end, would swap their order; a friction cone that an impact or a contact at
-rest just touches would be left. How far these are is looked at likewise.
+Derivatives through contact events are exact: event times are differentiated implicitly, and the derivative of the state jumps
+at events as it must (`EventExact`). But they do not exist everywhere. Where a contact only just touches, lifts off or slips,
+the smallest change of a parameter changes the sequence of events; there the state has no derivative, or only a one-sided one.
+So `derivatives` also follows the guards of the trajectory and says how close it comes to that (`event_distance` has the
+measures).
 """
 
 from collections.abc import Callable, Iterable
@@ -31,13 +26,13 @@ from .trajectory import Trajectory, simulate
 
 
 class Derivatives(eqx.Module):
-    """A functional of a trajectory, its derivatives, and how far they are from not existing."""
+    """The value of a functional of a trajectory, its derivatives, and how far they are from not existing."""
 
     value: Array
     by_name: dict[str, Array]  # of the functional's shape, per unit of the parameter
     events: int  # contact events on the trajectory
-    closest: float  # smallest distance from another sequence of events, relative; infinite without any
-    closest_at: float  # when, s
+    closest: float  # smallest relative distance from another sequence of events; infinite without any
+    closest_at: float  # its time, s
     closest_event: str = eqx.field(static=True)
     exist: bool = eqx.field(static=True)
 
@@ -82,17 +77,17 @@ def derivatives(
 
     **Arguments:**
 
-    - `functional`: a smooth function of a `Trajectory`, in `jax.numpy`. A peak, an energy or a line of the spectrum will do.
+    - `functional`: a smooth function of a `Trajectory`, written with `jax.numpy`: a peak, an energy, a line of the spectrum.
       Sums of *accelerations* over saved instants have no derivative where these jump; use differences of velocities.
-    - `wrt`: names of parameters, any of `scene.parameters`. `start` at 0 has a derivative to later times only.
+    - `wrt`: names of parameters, any of `scene.parameters`. For `start` = 0 the derivative is that towards later times.
     - `t1`, `dt_save`, `y0`, `method`: as in `simulate`. With `WhereSwitched` the derivatives are those of its steps, which
       are wrong after contact events.
-    - `mode`: "forward" (best up to some ten parameters) or "reverse" (memory for the saved states only).
-    - `margin`: the smallest relative distance from another sequence of events at which a derivative is said to exist.
+    - `mode`: "forward" (faster up to some ten parameters) or "reverse" (keeps only the saved states in memory).
+    - `margin`: the relative distance from another sequence of events below which derivatives are said not to exist.
 
     **Returns:** `Derivatives`.
 
-    **Raises:** `ValueError` or `TypeError`, as a sentence, for an unknown name, and whatever `simulate` refuses.
+    **Raises:** `ValueError` or `TypeError`, as a sentence, for an unknown name, and for anything that `simulate` refuses.
 
     **Example:**
 
@@ -121,14 +116,15 @@ def derivatives(
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     refuse_painleve(scene)
     begin = start_state(scene, y0)
-    # An equilibrium moves with the parameters. As an array, a start is not compiled anew for other numbers.
+    # The equilibrium depends on the parameters, a given start does not. As an array, a start with other numbers is not compiled
+    # anew.
     given = None if y0 is None else begin
     value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
     calls = closest_call(scene, method, begin, float(t1))
     value = jax.tree.map(known_to_numpy, value)
     return Derivatives(
         value=value,
-        # What was not reached does not depend on anything, as JAX sees it; that is no derivative of zero.
+        # Rows that were not reached depend on nothing for JAX; their derivative is not zero but undefined.
         by_name={
             name: jax.tree.map(lambda slope, of: np.where(np.isfinite(of), known_to_numpy(slope), np.nan), found, value)
             for name, found in by_name.items()
@@ -149,7 +145,7 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
 
     jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
     found, value = jacobian(of, has_aux=True)({name: scene.parameters[name] for name in names})
-    # A functional of several numbers has the parameters innermost.
+    # For a functional of several numbers, the parameters are the last axis.
     return value, {name: _of_parameter(found, name) for name in names}
 
 

@@ -20,7 +20,7 @@ class Ending(enum.IntEnum):
     STEP_FAILURE = -8
 
 
-# Motion this much larger than its start, the belt's motion and what the load can cause has no bound.
+# A motion this much larger than its start, the belt's motion and the effect of the load counts as unbounded.
 GROWTH = 1e9
 
 ENDING = {

@@ -15,26 +15,26 @@ Signs, for all of fivjax: **contact and load power are positive into the structu
 |---|---|---|
 | `stick` | $T v_{belt}$ | Eq. 9: from the belt that carries the structure along |
 | `slide` | $T \dot q_t$ | Eq. 10: from the belt that slides under it; zero while detached |
-| `damping` | $\dot q^T C \dot q$ | never negative; `dampers` has it apart by damper |
+| `damping` | $\dot q^T C \dot q$ | never negative; `dampers` has the part of each damper |
 | `load` | $F f \cdot \dot q$ | $-F \dot y_1$ in the paper's model: Eq. 12 has the other sign, which does not close |
 | `interface` | $-T v_{rel}$ | Eq. 8: dissipated between belt and structure, never negative |
 | `kick` | $(F - F_{final}) f \cdot \dot q$ | the part of `load` that the kick puts in |
 
-The belt's drive pays for what the interface dissipates, so that is no part of $\dot E_m$.
-Eq. 13 has no term for impacts. A re-contact changes energy at one instant, which is a line of its own (`impact`): it takes
-energy, or where the moving belt drags the landing structure along, may give some. What is left after all lines is the
-`residual`: the error of the computation, and a meter for it.
+The energy that the interface dissipates comes from the drive of the belt, so it is no part of $\dot E_m$.
+Eq. 13 has no term for impacts. A re-contact changes the energy at one instant, which is a line of its own (`impact`): it takes
+energy, or may give some where the moving belt drags the landing structure along. The part of the balance that no line explains
+is the `residual`: it measures the error of the computation.
 
-The residual speaks of the vibration. A small one under a high load moves far less energy than the springs store at rest, and
-in a balance of totals it would be lost in the rounding of what is stored. With displacements $z = q - q_0$ measured from
-a sliding equilibrium (`contact.Rest`) the forces that hold it do no net work on the vibration, and the same balance reads
+A small vibration under a high load exchanges far less energy than the springs store at rest, and in a balance of totals it
+would be lost in the rounding of the stored energy. With displacements $z = q - q_0$ measured from a sliding equilibrium
+(`contact.Rest`) the forces at rest cancel, and the same balance reads
 
 $$\tfrac12 \dot z^T M \dot z + \tfrac12 z^T K z = \int (T - T_0)\, \dot z_t + (N - N_0)\, \dot z_n + (F - F_0) f \cdot \dot z
   - \dot z^T C \dot z \; dt - \text{impacts}$$
 
-in which nothing large cancels. The lines of the table are its terms with the work of $T_0$ and $F_0$ added. Maps keep
-their books so; states of `simulate` are totals ($q_0 = 0$), with which both balances are the same. Either way a line that
-is wrong by some joules shows in the residual with as many.
+without cancellation of large terms. The lines of the table are its terms with the work of $T_0$ and $F_0$ added. Maps keep
+their ledger so; states of `simulate` are totals ($q_0 = 0$), for which both balances are the same. In both cases a line that
+is wrong by some joules changes the residual by as much.
 
 Work is integrated along each advance with the method's own states and to its own order: Gauss quadrature of the Taylor
 series for `EventExact`, the stages and weights of the Runge–Kutta step for `WhereSwitched`.
@@ -60,7 +60,7 @@ from .energy_lines import exchanged as exchanged
 
 
 class Books(eqx.Module):
-    """What a scene's ledger needs of it, worked out once."""
+    """The data of a scene that its ledger needs, worked out once."""
 
     structure: Structure
     springs: Springs
@@ -68,7 +68,7 @@ class Books(eqx.Module):
     final_load: Float[Array, ""]
 
     def __init__(self, scene: Scene):
-        # Read in every step: worked out once.
+        # As matrices, because they are read in every step.
         self.structure = scene.structure.as_matrices()
         self.springs = Springs(self.structure.stiffness)
         self.dampers = scene.structure.damping_parts
@@ -92,10 +92,10 @@ def mechanical_energy(structure: Structure, y: State) -> Float[Array, ""]:
 
 @returning_numpy
 def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: State) -> Float[Array, ""]:
-    """Kinetic energy, and elastic energy of the displacement from an equilibrium, in J: zero where nothing vibrates.
+    """Kinetic energy plus elastic energy of the displacement from an equilibrium, in J: zero without vibration.
 
-    What a kick has done is to be read off this one. The load's own share of it, `kick`, is small and may be negative:
-    at the paper's parameters nearly all of the vibration is fed by the contact while the kick lasts.
+    It measures the effect of a kick. The work of the load, `kick`, is only a small part of it and may be negative: with the
+    paper's parameters nearly all of the energy of the vibration comes from the contact while the kick lasts.
     """
     y = jnp.asarray(y)
     displaced = jnp.concatenate([y[: structure.size] - equilibrium, y[structure.size :]])
@@ -103,7 +103,9 @@ def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: S
 
 
 def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Flows:
-    """The flows at one instant, in W; where `mechanics` has a rest, of the forces beyond it, but for all of `interface`."""
+    """The flows at one instant, in W. If `mechanics` has a rest, only of forces beyond those at rest, except for
+    `interface`.
+    """
     structure, rest = books.structure, mechanics.rest
     velocity = y[structure.size :]
     force, _ = physics.added_forces(mechanics, contact, load, y)
@@ -129,14 +131,14 @@ def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Arr
 
 
 def _sum(mechanics: Mechanics, each: Float[Array, "*contacts"]) -> Float[Array, ""]:
-    """Over the contacts, if there are several."""
+    """The sum over the contacts, if there are several."""
     return jnp.sum(each) if mechanics.several else each
 
 
 def _work(
     books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], within: Within
 ) -> tuple[Flows, Float[Array, ""]]:
-    """The flows of one advance, cumulated, and what all forces together did beyond those at rest, in J."""
+    """The work of one advance by line, and the work of all forces beyond those at rest, in J."""
     rest = mechanics.rest
     along = jax.vmap(lambda y: powers(books, mechanics, contact, load, y))(within.states)
     weights = within.weights
@@ -163,14 +165,14 @@ def _work(
             by_contact,
         ),
     )
-    # Of an open contact the forces at rest are missing, which no line of the table says.
+    # While a contact is open, the forces at rest are missing, which is in no line of the table.
     missing = at_rest + rest.normal_force * moved[mechanics.normal]
     missing = _sum(mechanics, jnp.where(contact.status == Status.DETACH, missing, 0.0))
     return total, beyond.mechanical - missing
 
 
 def open_ledger(books: Books, y: State) -> Ledger:
-    """A ledger in which nothing has been entered yet."""
+    """An empty ledger."""
     none, no = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
     count = len(books.structure.places)
     each, several = jnp.zeros(count, y.dtype), count > 1
@@ -193,14 +195,14 @@ def open_ledger(books: Books, y: State) -> Ledger:
 def residual(books: Books, ledger: Ledger, y: State) -> Float[Array, ""]:
     """Growth of mechanical energy that no line accounts for, in J: the error of the computation.
 
-    `y` is the state as the mechanics measure it with which the ledger was entered: a total, or a deviation from rest.
+    `y` is a total state or a deviation from rest, as in the mechanics with which the ledger was kept.
     """
     grown = _stored(books, y) - ledger.start
     return grown - (ledger.beyond_rest - ledger.impact)
 
 
 def _stored(books: Books, y: State) -> Float[Array, ""]:
-    """Mechanical energy, free of cancellation where the structure has moved far as a whole."""
+    """Mechanical energy in J, without cancellation after a large rigid motion."""
     return kinetic_energy(books.structure, y) + books.springs.energy(y[: books.structure.size])
 
 
@@ -211,19 +213,19 @@ def enter(
     ledger: Ledger,
     segment: Segment,
 ) -> Ledger:
-    """The ledger with one segment entered.
+    """The ledger with one more segment.
 
-    The scene's "reset" impact law is no impulse of the contact; there, `impact_dissipated` is only the loss with the work that
-    the belt would do if it were.
+    The "reset" impact law is no impulse of the contact; with it, `impact_dissipated` is the loss plus the work that the belt
+    would do if it were one.
 
-    What a transition merely tidies up (a gap put at zero, slip that has run out) is no line: it goes into the residual.
+    Corrections by rounding in a transition (a gap or a slip speed set to zero) have no line: they are in the residual.
     """
     structure = books.structure
     n, tangential, normal = structure.size, mechanics.tangential, mechanics.normal
     contact, load, y, after = segment.contact, segment.load, segment.y, segment.after
     within = method.within(mechanics, contact, load, y, after.h)
     work, beyond_rest = _work(books, mechanics, contact, load, within)
-    # While detached, velocities jump at re-contact and at nothing else. The difference of squares, free of cancellation.
+    # While detached, velocities jump only at re-contact. The difference of squares is written without cancellation.
     before, behind = within.end[n:], after.y[n:]
     impulses = jnp.sum(structure.mass * (behind - before), axis=-1)
     loss = -0.5 * jnp.sum(impulses * (before + behind))
@@ -240,7 +242,7 @@ def enter(
     section = mechanics.places[0][0]
     by_contact = {}
     if mechanics.several:
-        # Impulses act at the contacts alone, so each has its own part of the loss, wherever the energy was.
+        # Impulses act only at the contacts, so each contact has its own part of the loss.
         own = impulses * (before + behind)
         own = jnp.where(jnp.any(landed), -0.5 * (own[tangential] + own[normal]), 0.0)
         entries = {
@@ -278,7 +280,7 @@ def along_rows(
     ys: Float[Array, "T state"],
     rows: Ledger,
 ) -> Energy:
-    """The ledger of a trajectory from its rows and what had been entered up to each of them."""
+    """The ledger of a trajectory, from its rows and the ledger at each of them."""
     structure = books.structure
     return Energy(
         kinetic=jax.vmap(lambda y: kinetic_energy(structure, y))(ys),

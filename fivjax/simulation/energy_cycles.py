@@ -1,8 +1,8 @@
-"""The ledger of a trajectory by cycle and by contact event, exact however far apart its rows are.
+"""The ledger of a trajectory by cycle and by contact event, exact for any distance of its rows.
 
-A cycle runs from one instant where the tangential velocity rises through zero to the next; there the structure is at its
-turning point. From the row before such an instant the trajectory is stepped on to it with `EventExact`, so times,
-energies and durations are those of the instant itself. The same is done for contact events.
+A cycle lasts from one instant at which the tangential velocity rises through zero to the next; these are turning points of the
+motion. From the row before such an instant the trajectory is stepped again up to it, so times, energies and durations are those
+of the instant itself. The same is done for contact events.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class _Instant(NamedTuple):
-    """Where a trajectory stands, and what its ledger says there."""
+    """A state of a trajectory, with its ledger."""
 
     t: Float[Array, ""]
     y: State
@@ -40,16 +40,16 @@ class _Instant(NamedTuple):
 
 @in_double_precision
 def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
-    """The ledger of each whole cycle of a trajectory: what Figs. 13, 15 and 16 draw in black.
+    """The ledger of each whole cycle of a trajectory: the black curves of Figs. 13, 15 and 16.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
 
-    **Returns:** a dataset over `cycle`, empty where there is no whole one. Energies in J, over the cycle: `contact_work`
-    (of it `stick_work` and `slide_work`), `interface_work`, `damping_work` (apart by damper where the structure names
-    them), `load_work`, `impact_loss`, `impact_dissipated`, and `energy_gain`, by which mechanical energy grew. Durations in s:
-    `stick_time`, `slide_time`, `detach_time`. At the cycle's start: `mechanical_energy` and the tangential
+    **Returns:** a dataset over `cycle`, empty if there is no whole one. Energies in J, over the cycle: `contact_work`
+    (the sum of `stick_work` and `slide_work`), `interface_work`, `damping_work` (also by damper where the structure names
+    them), `load_work`, `impact_loss`, `impact_dissipated`, and `energy_gain`, the growth of mechanical energy. Durations in s:
+    `stick_time`, `slide_time`, `detach_time`. At the start of the cycle: `mechanical_energy`, and the tangential displacement
     `turning_point` in m. Coordinates `cycle_start` and `cycle_end` in s. Exact for `EventExact`; for other methods,
-    cycle ends are found to within their own error.
+    the ends of cycles have the error of the method.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
 
@@ -90,14 +90,14 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
 
 @in_double_precision
 def energy_per_event(run: Trajectory) -> "xr.Dataset":
-    """The ledger of each contact event of a trajectory: when, from which status to which, and what an impact cost.
+    """The ledger of each contact event of a trajectory: its time, the status before and after, and the loss in an impact.
 
     **Arguments:** `run`, from `simulate(..., energy=True)`.
 
     **Returns:** a dataset over `event`: `event_time` in s; `status_before` and `status_after` (equal for a rebound, and where
-    slip goes straight from one direction to the other); `impact_loss` and `impact_dissipated` in J, zero but for
-    re-contacts; and `mechanical_energy` just after, in J. Exact for `EventExact`; for other methods, times are found to
-    within their own error.
+    slip reverses without sticking); `impact_loss` and `impact_dissipated` in J, zero except for re-contacts; and
+    `mechanical_energy` just after the event, in J. Exact for `EventExact`; for other methods, times have the error of the
+    method.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
 
@@ -122,7 +122,7 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     return labelled(xr.Dataset({name: ("event", x) for name, x in variables.items()}, coords), run.scene)
 
 
-# Functions with a name, so that what is compiled for one of them is found again.
+# Named functions, so that programs compiled for them are found again.
 def _crossings(ledger: Ledger) -> Array:
     return ledger.crossings
 
@@ -145,14 +145,15 @@ def _check(run) -> None:
 
 
 def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant, np.ndarray]:
-    """Every instant at which a count of the ledger went up, one per row; and the status that ended there."""
+    """All instants at which a count of the ledger rises, one per row; and the status that ended there."""
     scene = run.scene
     rows = jax.tree.map(np.asarray, _row_instants(run))
     counted = np.asarray(count(rows.ledger))
     finite = np.isfinite(rows.y).all(axis=1)
     rising = np.diff(counted) * finite[1:]
     chosen = np.flatnonzero(rising)
-    # One of few shapes, so that not every trajectory compiles anew; surplus rows repeat the first row and are dropped.
+    # Padded to one of few shapes, so that not every trajectory compiles anew; surplus rows repeat the first row and are
+    # dropped.
     most = power_of_4(max(int(rising.max(initial=1)), 4))
     padded_rows = power_of_4(max(len(chosen), 4096 // most, 64))
     padded = np.concatenate([chosen, np.zeros(padded_rows - len(chosen), int)])
@@ -165,12 +166,12 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
 
 @compiled
 def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Callable, most: int):
-    """The first `most` instants after each start at which the count goes up, not beyond each end."""
+    """The first `most` instants after each start, and before each end, at which the count rises."""
     mechanics, books, method = Mechanics(scene), Books(scene), EventExact()
 
     def to_next(start: _Instant, end):
         def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
-            """On to the next such instant, the next jump of the load or the end, whichever comes first."""
+            """The motion to the next such instant, the next jump of the load or the end, whichever comes first."""
             jumps = jnp.where(scene.load.jumps > now.t, scene.load.jumps, jnp.inf)
             stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
 
@@ -187,7 +188,7 @@ def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Calla
                 total=(now.ledger, now.contact.status),
                 observe=enter,
                 until=lambda total: count(total[0]) != count(start.ledger),
-                # Cycles end where the tangential velocity rises through zero: inside a segment unless asked for.
+                # Cycles end where the tangential velocity rises through zero, so segments have to end there.
                 at_section=True,
                 kind="lax",
             )
@@ -213,7 +214,7 @@ def _row_instants(run: Trajectory) -> _Instant:
     energy = run.energy
     assert isinstance(energy, Energy)
     slip, force = np.asarray(run.slip_velocity), np.asarray(run.friction_force)
-    # Friction points against the slip; where there is none yet, its own sign says where it points.
+    # Friction acts against the slip; where there is no slip yet, the sign of the friction force is its direction.
     direction = np.where(slip != 0, -np.sign(slip), np.where(force != 0, np.sign(force), 1.0))
     return _Instant(
         t=run.t,

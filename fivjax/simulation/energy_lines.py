@@ -1,4 +1,4 @@
-"""The lines of an energy ledger: flows, what is added up along a trajectory, and the ledger of a whole one.
+"""The lines of an energy ledger: flows, their sums along a trajectory, and the ledger of a whole trajectory.
 
 Signs and equations are those of `energy`.
 """
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 
 class Flows(eqx.Module):
-    """Energy flows, as powers in W or cumulated in J; signs as in the module's table. Scalars, or one row per instant."""
+    """Energy flows, as powers in W or as work in J; signs as in the table of `energy`. Scalars, or one row per instant."""
 
     stick: Float[Array, "..."]
     slide: Float[Array, "..."]
@@ -17,21 +17,21 @@ class Flows(eqx.Module):
     dampers: dict[str, Float[Array, "..."]]  # the parts of `damping`, by damper; empty where the structure names none
     load: Float[Array, "..."]
     kick: Float[Array, "..."]  # the part of `load` above the load's final value
-    # `stick`, `slide` and `interface` of several contacts, with a last axis over them; none of one.
+    # `stick`, `slide` and `interface` by contact, with a last axis over several contacts; empty with one contact.
     by_contact: dict[str, Float[Array, "... contacts"]] = eqx.field(default_factory=dict)
 
     @property
     def contact(self) -> Float[Array, "..."]:
-        """What the belt gives to the structure, $P_c$ of Eq. 11."""
+        """The power or work of the belt on the structure, $P_c$ of Eq. 11."""
         return self.stick + self.slide
 
     @property
     def mechanical(self) -> Float[Array, "..."]:
-        """What mechanical energy grows by between impacts: the right-hand side of Eq. 13."""
+        """The growth of mechanical energy between impacts: the right-hand side of Eq. 13."""
         return self.contact - self.damping + self.load
 
     def lines(self, kind: str) -> dict[str, Float[Array, "..."]]:
-        """The flows under the names that they have in a dataset, ending in `kind` ("power" or "work")."""
+        """The flows by their names in a dataset, which end in `kind` ("power" or "work")."""
         return {
             f"stick_{kind}": self.stick,
             f"slide_{kind}": self.slide,
@@ -45,41 +45,41 @@ class Flows(eqx.Module):
 
 
 def _by_contact(name: str, lines: dict[str, Array]) -> dict[str, Array]:
-    """Lines of several contacts, each contact's under a name that ends in its number."""
+    """Lines of several contacts; the name of each contact's line ends in its number."""
     return {
         f"{name.format(line)}_{i}": values[..., i] for line, values in lines.items() for i in range(values.shape[-1])
     }
 
 
 class Ledger(eqx.Module):
-    """What is added up along one trajectory; scalars, or one row per instant."""
+    """The sums along one trajectory; scalars, or one row per instant."""
 
     work: Flows  # J
     impact: Float[
         Array, "..."
-    ]  # mechanical energy lost in re-contacts, J; negative where the belt gave more than was lost
-    impact_dissipated: Float[Array, "..."]  # the same with what the belt gave: dissipated between the two, J
-    stick_time: Float[Array, "..."]  # time spent sticking, s; of several contacts, with all of them
-    detach_time: Float[Array, "..."]  # time spent detached, s; the same
+    ]  # mechanical energy lost in re-contacts, J; negative if the belt gave more than was lost
+    impact_dissipated: Float[Array, "..."]  # the same plus the work of the belt: dissipated between the two, J
+    stick_time: Float[Array, "..."]  # time spent sticking, s; with several contacts, while all of them do
+    detach_time: Float[Array, "..."]  # time spent detached, s; with several contacts, while all of them are
     events: Int[Array, "..."]  # status changes, rebounds and reversals of slip
     crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity
-    beyond_rest: Float[Array, "..."]  # work of all forces but impacts beyond those at rest, J; see the module's text
+    beyond_rest: Float[Array, "..."]  # work of all forces but impacts beyond those at rest, J; see `energy`
     start: Float[Array, "..."]  # mechanical energy at the start, of displacements from rest, J
     worst: Float[Array, "..."]  # largest size of the residual so far, J
-    # `impact`, `stick_time` and `detach_time` of several contacts, with a last axis over them; none of one.
+    # `impact`, `stick_time` and `detach_time` by contact, with a last axis over several contacts; empty with one contact.
     by_contact: dict[str, Float[Array, "... contacts"]] = eqx.field(default_factory=dict)
 
 
 class Energy(eqx.Module):
     """The ledger of a trajectory; arrays over its `T` instants, powers in W, everything else in J or s.
 
-    Cumulated lines start from zero at t = 0 and hold up to their row exactly, however far apart rows are.
+    Work starts from zero at t = 0 and is exact at each row, for any distance of the rows.
     """
 
     kinetic: Float[Array, " T"]  # J
     elastic: Float[Array, " T"]  # J
     power: Flows  # W, at the row's instant and in its status
-    ledger: Ledger  # what had been entered by then
+    ledger: Ledger  # the sums up to the row
     residual: Float[Array, " T"]  # growth of mechanical energy that no line accounts for, J
 
     @property
@@ -89,7 +89,7 @@ class Energy(eqx.Module):
 
     @property
     def work(self) -> Flows:
-        """The flows cumulated since t = 0, in J."""
+        """The work since t = 0 by line, in J."""
         return self.ledger.work
 
     @property
@@ -99,11 +99,11 @@ class Energy(eqx.Module):
 
     @property
     def exchanged(self) -> Float[Array, " T"]:
-        """How much the lines of the balance hold together, in J: what a residual is to be measured against."""
+        """The sum of the sizes of the lines of the balance, in J: the measure for a residual."""
         return exchanged(self.ledger)
 
     def variables(self) -> dict[str, Float[Array, " T"]]:
-        """The ledger's lines under the names that they have in a dataset."""
+        """The lines of the ledger by their names in a dataset."""
         return {
             "kinetic_energy": self.kinetic,
             "elastic_energy": self.elastic,
@@ -120,9 +120,9 @@ class Energy(eqx.Module):
 
 
 def exchanged(ledger: Ledger) -> Float[Array, "..."]:
-    """How much the lines of the balance hold together, in J: what a residual is to be measured against.
+    """The sum of the sizes of the lines of the balance, in J: the measure for a residual.
 
-    Each line counts net, so what a vibration takes up and gives back within a cycle does not.
+    Each line counts net, so energy that a vibration takes up and gives back within a cycle does not count.
     """
     work = ledger.work
     return abs(work.stick) + abs(work.slide) + work.damping + abs(work.load) + abs(ledger.impact)

@@ -1,14 +1,15 @@
 r"""How close a trajectory comes to another sequence of contact events.
 
-At an event a guard $g$ crosses zero with slope $\dot g$; it would turn back at a depth of $\dot g^2 / (2 |\ddot g|)$ (to
-second order). Between events it may come down to a smallest value and recover. Both, relative to the largest size of that
-guard on the trajectory, say how far the event is from vanishing, or a new one from appearing. Two events at one instant,
-or one on a jump of the load or at the very end, would swap their order; a friction cone that an impact or a contact at
-rest just touches would be left. How far these are is looked at likewise.
+At an event a guard $g$ crosses zero with slope $\dot g$; without the event it would turn back at a depth of
+$\dot g^2 / (2 |\ddot g|)$ (to second order). Between events a guard may fall to a smallest positive value and rise again. Both
+values, relative to the largest size of that guard on the trajectory, say how far the event is from vanishing, or a new one from
+appearing. Two events close to each other, or one close to a jump of the load or to the end, may swap their order; and at an
+impact, or where a contact comes to rest, the force or impulse may be close to the edge of the friction cone. These distances
+are measured, too.
 
-Of several contacts, those that the mass matrix couples feel each other's events at once: there the order of two events matters,
-and an event of one may leave next to nothing of another's guard. Events of contacts that only springs and dampers couple may
-fall together: in either order the motion after them is the same to first order.
+With several contacts, an event of one acts at once on those that the mass matrix couples with it: their order matters, and an
+event of one may leave another's guard close to zero. Events of contacts that only springs and dampers couple may coincide: in
+either order the motion after them is the same to first order.
 """
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from ..foundation.compiling import compiled
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper, rates
 
-# Looks at the guards within one advance; between two of them a guard is told from its derivatives.
+# Instants within one advance at which the guards are evaluated; between two of them, derivatives tell a guard's course.
 LOOKS = 32
 GUARDS = {
     (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
@@ -32,13 +33,13 @@ GUARDS = {
     (Status.SLIDE, 1): "the slip running out",
     (Status.DETACH, 0): "the gap closing",
 }
-# What an event decides beside itself, and what a decision by a hair says.
+# The decisions that follow an event, and how to describe one that is nearly a tie.
 DECISIONS = (
     "an impact at the edge of the friction cone, where it either ends slip or does not",
     "the slip running out at the edge of the friction cone, where the contact either sticks or slips back",
     "sliding that begins without a normal force",
 )
-# The first two of several contacts, which are decided together.
+# The first two for several contacts, which are decided together.
 DECISIONS_OF_SEVERAL = (
     "impulses of several contacts at the edge of a friction cone, or of none",
     "an event of one contact that decides by a hair what another does",
@@ -47,7 +48,7 @@ DECISIONS_OF_SEVERAL = (
 
 
 class ClosestCall(eqx.Module):
-    """The closest call of a trajectory."""
+    """The smallest distance of a trajectory from another sequence of events."""
 
     events: int
     closest: float  # relative; infinite without any
@@ -56,7 +57,7 @@ class ClosestCall(eqx.Module):
 
 
 def closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> ClosestCall:
-    """Follow the trajectory advance by advance and look at the guards of each."""
+    """The smallest distance, found by following the trajectory advance by advance."""
     mechanics = Mechanics(scene)
     jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
     ends = [*jumps, t1]
@@ -78,25 +79,25 @@ def closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> Closes
 
 
 class _Look(eqx.Module):
-    """One advance, and the guards of each contact at even instants of it."""
+    """One advance, with the guards of each contact at equally spaced instants."""
 
     y: Float[Array, " state"]
     contact: Contact
     h: Float[Array, ""]
-    turned: Bool[Array, " c"]  # whether it slides the other way now
-    ended: Bool[Array, " c"]  # whether one of its own guards ran out
+    turned: Bool[Array, " c"]  # whether the contact has reversed its slip
+    ended: Bool[Array, " c"]  # whether one of the contact's guards ran out
     guards: Float[Array, "l c 2"]
-    turns: Bool[Array, "l c 2"]  # whether the guard has its smallest value about this look, and recovers
+    turns: Bool[Array, "l c 2"]  # whether the guard has a minimum close to this instant
     lowest: Float[Array, "l c 2"]  # that value
     slope: Float[Array, "c 2"]  # of the guards at the end, per s, and per s²
     bend: Float[Array, "c 2"]
     size: Float[Array, "c 2"]  # of the terms that the guards are sums of
-    # How clearly what follows was decided at the end, relative; infinite if it was not asked.
+    # Relative margins of the decisions at the end; infinite for those that were not needed.
     decisions: Float[Array, "3"]
 
 
 class _Seen:
-    """What was seen of a trajectory so far."""
+    """The distances found on a trajectory so far."""
 
     def __init__(self, mechanics: Mechanics):
         self.mechanics, self.several = mechanics, mechanics.several
@@ -106,34 +107,34 @@ class _Seen:
             self.coupled = np.asarray(
                 jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(count, dtype=jnp.int32))
             )
-        # Of each guard, by contact, status and number.
+        # The largest size of each guard, by contact, status and number.
         self.largest: dict[tuple[int, int, int], float] = {}
         # Distances by guard, in its own unit, and decisions, which are relative already.
         self.calls: list[tuple[tuple[int, int, int], float, float]] = []
         self.decisions: list[tuple[float, float, str]] = []
         self.events = 0
-        # Contacts that have just felt an event of another in the same status, and their guards before it.
+        # Contacts on which another's event has just acted while their own status lasted, and their guards before it.
         self.struck = np.zeros(count, bool)
         self.before = np.zeros((count, 2))
 
     def add(self, status: np.ndarray, look: _Look, t: float, after_jump: bool, arrives: bool) -> bool:
-        """Add an advance; whether it ended in an event."""
+        """Add an advance. Returns whether it ended in an event."""
         after = np.atleast_1d(look.contact.status)
         at = t + float(look.h)
         relevant = [self._of_contact(i, int(s), look, t, after_jump) for i, s in enumerate(status)]
         fired = [i for i in range(len(status)) if relevant[i] and self._fires(i, int(status[i]), int(after[i]), look)]
         for i in fired:
             key = (i, int(status[i]))
-            # What ran out is the guard that is nearest to zero at the end, in units of its size.
+            # The guard that ran out is the one nearest to zero at the end, in units of its size.
             which = min(
                 relevant[i], key=lambda k, i=i, key=key: abs(look.guards[-1, i, k]) / max(self.largest[*key, k], 1e-300)
             )
-            # One that a jump of the load used up was passed by far, not turned round.
+            # After a jump of the load a guard may be far below zero.
             passed = abs(float(look.guards[0, i, which])) if look.h == 0 else 0.0
             depth = float(look.slope[i, which] ** 2 / (2 * max(abs(look.bend[i, which]), 1e-300)))
             self.calls.append(((*key, which), max(depth, passed), at))
-            # The others at that instant: were one of them zero as well, either might be the first. One of another contact that
-            # rises has been zero when its status began, and that event has been looked at.
+            # The other guards at that instant: if one of them is zero as well, either may be the first. A guard of another
+            # contact that rises was zero when its status began, an event that has been counted already.
             for j in np.flatnonzero(self.coupled[i]):
                 others = [k for k in relevant[j] if (j, k) != (i, which) and (j == i or look.slope[j, k] < 0)]
                 self.calls += [((int(j), int(status[j]), k), abs(float(look.guards[-1, j, k])), at) for k in others]
@@ -142,7 +143,7 @@ class _Seen:
             self.decisions += [(float(m), at, name) for m, name in zip(look.decisions, names, strict=True)]
             self.events += 1
         elif arrives:
-            # An event on the jump of the load, or at the end, has it on either side of it.
+            # An event at a jump of the load, or at the end, may come before or after it.
             for i, own in enumerate(relevant):
                 self.calls += [((i, int(status[i]), k), abs(float(look.guards[-1, i, k])), at) for k in own]
         felt = np.any(self.coupled[fired], axis=0)
@@ -151,8 +152,8 @@ class _Seen:
         return bool(fired)
 
     def _of_contact(self, i: int, status: int, look: _Look, t: float, after_jump: bool) -> list[int]:
-        """Adds what the guards of one contact do inside an advance; which of them are any."""
-        # A guard that is zero but for rounding of what it is a sum of is none: friction without a coefficient.
+        """Add the distances of the guards of one contact inside an advance. Returns the guards that count."""
+        # A guard that is a rounding error all the time does not count: with zero friction the friction cone has no width.
         relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
         relevant = relevant[:1] if status == Status.DETACH else relevant
         for which in relevant:
@@ -160,8 +161,7 @@ class _Seen:
             self.largest[key] = max(self.largest.get(key, 0.0), float(np.abs(guard).max()))
             turns = np.flatnonzero(look.turns[:, i, which])
             self.calls += [(key, float(look.lowest[at, i, which]), t + float(look.h) * at / LOOKS) for at in turns]
-            # What a jump of the load leaves of a guard, or another contact's event: next to nothing, and it might as well be
-            # less than that.
+            # A jump of the load, or another contact's event, may leave a guard close to zero, on either side.
             jumped = abs(float(guard[0]) - self.before[i, which]) > 1e-6 * self.largest[key]
             if after_jump or (self.struck[i] and jumped):
                 self.calls.append((key, abs(float(guard[0])), t))
@@ -171,12 +171,12 @@ class _Seen:
         """Whether an event of this contact ended the advance."""
         if self.several:
             return bool(look.ended[i])
-        # Detached before and after, but put on the belt in between: a rebound.
+        # Detached before and after, but with zero gap in between: a rebound.
         bounced = status == Status.DETACH == after and look.y[self.mechanics.normal] == 0
         return bool(status != after or look.turned[i] or bounced)
 
     def closest(self) -> ClosestCall:
-        """The closest of all calls."""
+        """The smallest of all distances."""
 
         def name(contact: int, status: int, which: int) -> str:
             event = GUARDS[Status(status), which]
@@ -189,7 +189,7 @@ class _Seen:
 @compiled
 def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     after = method.advance(mechanics, contact, load, y, h)
-    # Just short of the end the status is still the same.
+    # Just before the end, where the status is still the same.
     shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
     inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
     states = jnp.concatenate([y[None], inside])
@@ -197,18 +197,18 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     def along(function):
         return lambda state: jax.jvp(function, (state,), (rates(mechanics, contact, load, state),))[1]
 
-    # With an axis over the contacts, also where there is one.
+    # With an axis over the contacts, even if there is only one.
     orders = [lambda state: physics.guards(mechanics, contact, load, state).reshape(-1, 2)]
     for _ in range(3):
         orders.append(along(orders[-1]))
     value, slope, bend, third = (jax.vmap(order)(states) for order in orders)
-    # Where the slope comes to zero, by the parabola; half a look to either side, but not beyond the ends.
+    # Where the slope is zero, by a parabola; at most half an interval to either side, and not beyond the ends.
     to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
     spacing = after.h / LOOKS
     near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
     look = jnp.arange(LOOKS + 1)[:, None, None]
     near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
-    # A guard that begins at zero, because the status has just begun there, does not turn at its own start.
+    # A guard that starts at zero, because the status has just begun, has no minimum at its start.
     begins = jnp.abs(value[0]) <= 1e-9 * jnp.max(jnp.abs(value), axis=0)
     near = near & ~(begins & (look <= 1))
     lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
@@ -237,11 +237,11 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
 
 
 def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: Contact, after) -> Float[Array, "3"]:
-    """Margins of the questions that an event asks, in the order of `DECISIONS`: the friction cone at an impact, the
-    friction cone at rest on the belt, and the pressing force where it goes on to slide."""
+    """Relative margins of the decisions after an event, in the order of `DECISIONS`: the friction cone at an impact, the
+    friction cone where a contact comes to rest on the belt, and the normal force where it goes on to slide."""
     n = before.shape[0] // 2
     landed = (contact.status == Status.DETACH) & (following.status != Status.DETACH)
-    # An impulse takes the place of a force, and changes of velocity that of accelerations.
+    # In an impact, impulses take the place of forces, and changes of velocity that of accelerations.
     demanded = jnp.zeros(n).at[mechanics.tangential].set(physics.relative_velocity(mechanics, before))
     demanded = demanded.at[mechanics.normal].set((1 + mechanics.restitution) * before[n + mechanics.normal])
     dragged = mechanics.friction(jnp.abs(physics.relative_velocity(mechanics, before)))
@@ -263,9 +263,7 @@ def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: 
 
 
 def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -> Float[Array, "3"]:
-    """The same of several contacts: how clearly the states that they are found in are admissible, of the contacts that feel
-    the event.
-    """
+    """The same for several contacts: margins by which the states of the contacts affected by the event are admissible."""
     own = jnp.any(after.ended, axis=-1)
     rows = jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(len(own), dtype=jnp.int32))
     feels = jnp.any(rows & own[:, None], axis=0)
@@ -274,7 +272,7 @@ def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -
     at_impact = physics.clearness_of_impact(mechanics, physics.stopped(mechanics, contact, after.end, after.ended))
     following = after.contact
     at_rest = physics.clearness_of_modes(mechanics, load, after.y, following)
-    # What sticking ends in, and sliding without a force, begins at the edge.
+    # A mode that follows sticking, or sliding that lost its normal force, begins with zero margin.
     lifted = (contact.status == Status.SLIDE) & after.ended[:, 0]
     asked = feels & ~(own & ((contact.status == Status.STICK) | lifted))
     begins = own & (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
@@ -290,6 +288,6 @@ def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -
 
 
 def _margin(mu, tangential, normal) -> Float[Array, ""]:
-    """How far a force is from the edge of the friction cone, relative; infinite without friction and without force."""
+    """The relative distance of a force from the edge of the friction cone; infinite without friction or without force."""
     held, need = mu * jnp.abs(normal), jnp.abs(tangential)
     return jnp.where(held + need > 0, jnp.abs(held - need) / jnp.where(held + need > 0, held + need, 1.0), jnp.inf)

@@ -11,10 +11,10 @@ from ..model.sliding import contact_coordinates
 
 
 def start_state(scene: Scene, y0) -> State:
-    """The state that a run starts from: `y0` once it is checked, else the sliding equilibrium at rest."""
+    """The state that a run starts from: `y0`, checked, or else the sliding equilibrium at rest."""
     n = scene.structure.size
     if y0 is None:
-        # The first refuses where there is none, which nobody can tell inside a compiled function.
+        # The first function refuses a scene without equilibrium; inside a compiled function that is not possible.
         known = is_known(scene.belt_speed)
         q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
         return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
@@ -35,7 +35,7 @@ def start_state(scene: Scene, y0) -> State:
 
 
 def checked_start(n: int, y0) -> State:
-    """Displacements and velocities given as a pair or as one array, once their shapes are checked."""
+    """Displacements and velocities, given as a pair or as one array, with their shapes checked."""
     is_pair = isinstance(y0, tuple | list) and len(y0) == 2
     parts = tuple(y0) if is_pair else (y0,)
     for part in parts:
@@ -55,7 +55,7 @@ def checked_start(n: int, y0) -> State:
 
 
 def snapped_to_belt(scene: Scene, y: State) -> State:
-    """A state whose gaps and slip are exactly zero where they are zero but for the rounding of a change of coordinates."""
+    """The state with gaps and slip set to exactly zero where only the rounding of a change of coordinates made them nonzero."""
     tangential, normal = contact_coordinates(scene.structure)
     n = scene.structure.size
     size = 64 * np.finfo(np.float64).eps * jnp.repeat(jnp.max(jnp.abs(y.reshape(2, n)), axis=1), n)

@@ -1,12 +1,13 @@
 r"""From one saved instant to the next, and the derivative of that.
 
-A stretch is as many advances as it takes; how many is known only when they are made. Forward derivatives run along with
-them. For reverse ones there are two ways:
+A stretch takes as many advances as it needs; the number is known only afterwards. Forward-mode derivatives are carried along.
+For reverse mode there are two ways:
 
-- JAX's own, through a loop of bounded length, which works in both modes and pays for every advance that might have been;
-- "reverse": a stretch maps a few dozen numbers (state, mechanics, load, time) to a few. Its whole Jacobian is found in
-  forward mode when the backward pass comes to it. That costs about as much however many parameters a scene has, keeps
-  nothing but the stretch's start, and repeats the forward derivatives to the last digits.
+- JAX's own, through a loop of bounded length; it works in both modes, and its cost is that of the bound, not of the advances
+  that were made;
+- "reverse": a stretch maps a few dozen numbers (state, mechanics, load, time) to a few. Its whole Jacobian is computed in
+  forward mode when the backward pass comes to it. The cost hardly depends on the number of parameters of the scene, only the
+  start of the stretch is kept in memory, and the result is that of forward mode to the last digits.
 """
 
 import equinox as eqx
@@ -26,7 +27,7 @@ MODES = ("both", "forward", "reverse", "none")
 
 
 class Begin(eqx.Module):
-    """All that a stretch depends on."""
+    """Everything that a stretch depends on."""
 
     mechanics: Mechanics
     contact: Contact
@@ -41,7 +42,7 @@ End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
 
 
 def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
-    """State, contact and ledger after `begin.h`; last, whether `most` advances were enough."""
+    """State, contact and ledger after the time `begin.h`; and whether `most` advances were enough."""
     if derivatives != "reverse":
         return _advances(begin, method, most, derivatives)
     return _reversible(begin, method, most)
@@ -50,7 +51,7 @@ def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | N
 def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
     mechanics, load, books = begin.mechanics, begin.load, begin.books
     if derivatives is not None:
-        # For each stretch anew: its reverse derivative may use nothing that was computed outside of it.
+        # Anew in each stretch, because its reverse derivative may use nothing computed outside of it.
         method = for_derivatives(method, mechanics)
 
     def enter(ledger, segment: Segment):
@@ -72,7 +73,7 @@ def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str
 
 
 def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
-    # The method, too: its step may be an array.
+    # The method belongs to the numbers, too: its step may be an array.
     numbers, rest = eqx.partition((begin, method), eqx.is_inexact_array)
     counts, names = eqx.partition(rest, eqx.is_array)
 
@@ -87,7 +88,7 @@ def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
         def flat_end(flat):
             return jax.flatten_util.ravel_pytree(eqx.filter(end(unravel(flat), counts), eqx.is_inexact_array))[0]
 
-        # Nothing depends on what is counted.
+        # Counts have no derivative.
         cotangent = jax.tree.map(lambda ct: None if ct.dtype == jax.dtypes.float0 else ct, cotangent)
         cotangent = jax.flatten_util.ravel_pytree(cotangent)[0]
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, jax.dtypes.float0), counts)

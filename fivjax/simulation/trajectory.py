@@ -1,4 +1,4 @@
-"""One trajectory, with everything that can be read off it."""
+"""One trajectory: `simulate` and its result."""
 
 import dataclasses
 import json
@@ -40,12 +40,12 @@ from .stretches import MODES, Begin, go_on
 if TYPE_CHECKING:
     import xarray as xr
 
-# Rows that a trajectory may have: some 20 GB of them.
+# The most rows that a trajectory may have: some 20 GB.
 MOST_ROWS = 10**8
 
 
 class Trajectory(eqx.Module):
-    """A response in time. Rows are instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size.
+    """A response in time. Rows are saved instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size.
 
     **Example:**
 
@@ -59,14 +59,14 @@ class Trajectory(eqx.Module):
     displacement: Float[Returned, "T n"]  # m
     velocity: Float[Returned, "T n"]  # m/s
     acceleration: Float[Returned, "T n"]  # m/s²
-    status: Int[Returned, "T *contacts"]  # 0 stick, 1 slide, 2 detach; of several contacts, one column for each
+    status: Int[Returned, "T *contacts"]  # 0 stick, 1 slide, 2 detach; with several contacts, one column for each
     normal_force: Float[Returned, "T *contacts"]  # N
     friction_force: Float[Returned, "T *contacts"]  # N
     load: Float[Returned, " T"]  # N
     scene: Scene
-    energy: Energy | None = None  # the ledger, when asked for
+    energy: Energy | None = None  # the ledger, if asked for
     outcome: Int[Returned | np.generic, ""] = eqx.field(default_factory=lambda: np.int8(Ending.FINISHED))  # an `Ending`
-    # How it was computed, as pairs of a name and a value: method, dt, dt_save, t1, start.
+    # How it was computed, as pairs of name and value: method, dt, dt_save, t1, start.
     settings: tuple[tuple[str, str | float], ...] = eqx.field(static=True, default=())
 
     @property
@@ -87,7 +87,7 @@ class Trajectory(eqx.Module):
 
     @classmethod
     def from_dataset(cls, dataset: "xr.Dataset") -> "Trajectory":
-        """A trajectory from its dataset, such as `fj.open("run.nc")`; its energy ledger stays behind.
+        """A trajectory from its dataset, such as `fj.open("run.nc")`; without its energy ledger.
 
         **Raises:** `ValueError` for a dataset without a scene in its attributes.
         """
@@ -140,24 +140,24 @@ def simulate(
 
     - `scene`: what is simulated.
     - `t1`: the end, in s.
-    - `dt_save`: distance of the saved instants, in s; the steps in between are the method's.
+    - `dt_save`: time between saved instants, in s; the steps in between are chosen by the method.
     - `method`: how to step, `EventExact()` unless given.
     - `y0`: displacements and velocities at t = 0, as a pair of `(n,)` arrays or one of `(2n,)`, in m and m/s; the sliding
       equilibrium at rest unless given.
-    - `energy`: whether to keep the energy ledger, `run.energy`, an `energy.Energy`. Without it nothing is spent on it.
-    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward", "reverse" or "none". In one mode
-      alone it is faster, `jax.grad` about ten times; in none, for `jit` and `vmap` alone, up to twice as fast again, because
-      derivatives want shorter steps. It matters only inside a transformation.
+    - `energy`: whether to keep the energy ledger, `run.energy` (an `energy.Energy`). It costs time only if asked for.
+    - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward", "reverse" or "none". One mode is
+      faster than both (`jax.grad` about ten times). "none", for runs that are only compiled or batched, is up to twice as fast
+      again, because derivatives need shorter steps. It has an effect only inside a JAX transformation.
 
-    **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion stops
-    being finite, grows without bound, or contact events come without end, the rows from there on are NaN; `run.outcome`
+    **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion is no longer
+    finite, grows without bound, or has contact events without end, the rows from there on are NaN; `run.outcome`
     (an `Ending`) and `run.meaning` (a sentence) say which.
 
-    Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` also where double precision is off; `jax.grad` needs it on.
+    Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` even if double precision is off; `jax.grad` needs it on.
 
-    **Raises:** `ValueError` for times that are not positive, a `dt_save` below the step of a method that takes the step it
-    is told (`WhereSwitched`), a start below the belt or of the wrong shape, no sliding equilibrium to start from, or
-    friction beyond Painlevé's limit; `TypeError` under reverse derivatives without double precision.
+    **Raises:** `ValueError` for times that are not positive, a `dt_save` below the fixed step of `WhereSwitched`, a start below
+    the belt or of the wrong shape, a scene without sliding equilibrium to start from, or friction beyond Painlevé's limit;
+    `TypeError` under reverse-mode derivatives without double precision.
 
     **Example:**
 
@@ -188,19 +188,19 @@ def simulate(
         )
     start = "sliding equilibrium" if y0 is None else "given by y0"
     y0 = start_state(scene, y0)
-    # Events cut advances short, so there may be more of them than it takes to span the interval.
+    # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     modes, count = None if derivatives == "none" else derivatives, rows + 1
-    # What is known has no derivatives. Its last row is repeated, so that few numbers of rows are ever compiled, and of steps.
+    # Runs with known values are not differentiated. Rows are padded by repeating the last one, so that few sizes are compiled.
     if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
         modes, count = None, compiled_rows(rows + 1)
         steps = compiled_steps(steps)
     most = steps + MOST_ADVANCES
-    # With NumPy, and not one small compiled program for each operation.
+    # By NumPy, because JAX would compile a small program for each operation.
     instants = np.arange(count)
     saved = real(np.where(instants < rows, np.minimum(float(dt_save) * instants, float(t1)), float(t1)))
     found = _simulate(scene, with_step_as_array(method), y0, saved, most, bool(energy), modes)
-    # Cut as NumPy arrays: JAX would compile a cut for each number of rows.
+    # Cut as NumPy arrays, because JAX would compile a slice for each number of rows.
     found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
     grown = found.pop("grown")
     settings = (
@@ -214,7 +214,7 @@ def simulate(
 
 
 def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
-    """`simulate` of a structure whose contacts' directions are vectors: in coordinates that hold them, and back again."""
+    """`simulate` for a structure with contacts given by vectors: in contact coordinates, and transformed back."""
     structure = scene.structure
     inner = Scene(
         in_contact_coordinates(structure),
@@ -234,9 +234,9 @@ def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
 
 
 def _at_contacts(rows: Float[Returned, "T n"], directions: np.ndarray) -> Float[Returned, "T *contacts"]:
-    """A motion along the contacts' directions; of one contact without an axis for it."""
+    """A motion along the contacts' directions; with one contact, without an axis over contacts."""
     unit = np.count_nonzero(directions, axis=0) == 1
-    # A column is picked, and not multiplied by zeros, which would spoil it where another is not finite.
+    # A column is selected, not multiplied by zeros, because another column may not be finite.
     along = (
         rows[:, np.argmax(directions, axis=0)]
         if np.all(unit & (np.max(directions, axis=0) == 1))
@@ -246,7 +246,7 @@ def _at_contacts(rows: Float[Returned, "T n"], directions: np.ndarray) -> Float[
 
 
 def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int) -> Array | np.int8:
-    """How the rows end: an `Ending`. Under a transformation, where no one can look, other failures are not finite."""
+    """How the rows end: an `Ending`. Under a transformation, where values are unknown, other failures count as not finite."""
     if not is_known(rows["velocity"]):
         finite = jnp.all(jnp.isfinite(rows["velocity"]), axis=-1)
         failure = jnp.where(jnp.any(grown), Ending.UNBOUNDED, Ending.NOT_FINITE)
@@ -275,7 +275,7 @@ def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: 
     def body(_, carry):
         y, contact, events = carry
         after = method.advance(mechanics, contact, scene.load(t), y, jnp.asarray(method.dt, y.dtype))
-        # A rebound keeps its status; it ends on the belt all the same.
+        # A rebound keeps its status but has touched the belt.
         landed = (contact.status == Status.DETACH) & (physics.gap(mechanics, after.y) == 0)
         return after.y, after.contact, events + jnp.any(landed | (after.contact.status != contact.status))
 
@@ -298,11 +298,11 @@ def _simulate(
     books = Books(scene) if energy else None
     y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, modes)
     load = jax.vmap(scene.load)(saved)
-    # What follows a number that was not reached is none either, also where the contact would hold it at zero.
+    # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
     finite = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
     grown = finite & (jnp.cumsum(_grown(scene, saved, load, y)) > 0)
     y = jnp.where((finite & ~grown)[:, None], y, jnp.nan)
-    # A row on a jump of the load shows what follows from it, as its load does.
+    # A row at a jump of the load shows the load and the contact just after it.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
     contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
     n = scene.structure.size
@@ -326,19 +326,19 @@ def _simulate(
 def _grown(
     scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T state"]
 ) -> Bool[Array, " T"]:
-    """Which states are a billionfold beyond what the start, the belt and the load can explain."""
+    """Which states are `GROWTH` times larger than the start, the belt's motion and the effect of the load."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
     tangential, _ = contact_coordinates(structure)
     belt = jnp.max(weights[n + tangential] * jnp.abs(scene.belt_speed))
-    # A load that nothing holds back accelerates a free structure for as long as it lasts.
+    # A free structure is accelerated by a load for as long as it lasts.
     pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * jnp.max(jnp.abs(load)) * t
     expected = jnp.max(jnp.abs(weights * y[0])) + belt + pushed
     return jnp.max(jnp.abs(weights * y), axis=-1) > GROWTH * expected
 
 
 def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
-    """The contact after a jump of the load, if there is one `now`."""
+    """The contact mode after a jump of the load, if there is a jump `now`."""
     ended = now & (physics.guards(mechanics, contact, load, y) < 0)
     after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
     return after
@@ -353,18 +353,18 @@ def states_at(
     books: Books | None = None,
     derivatives: str | None = None,
 ) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
-    """States, contacts and, with `books`, ledgers at instants that do not fall, the first of them the start; NaN from
-    where `most` advances between two of them were not enough.
+    """States, contacts and, with `books`, ledgers at given instants (s, in non-decreasing order, the first is the start); NaN
+    from where `most` advances between two of them were not enough.
 
-    Differentiable, in the instants and in the load's jumps too, in "both" modes, or faster in "forward" or "reverse" mode
-    alone; unless asked for, not at all. In reverse mode only the states at the instants are kept; what lies between is
-    computed again.
+    `derivatives`: differentiable (also by the instants and the load's jumps) in "both" modes, or faster in only "forward" or
+    "reverse" mode; None, not at all. In "reverse" mode only the states at the instants are kept; the rest is computed again.
     """
     mechanics = Mechanics(scene)
-    # Steps end on the load's jumps as well as on the instants.
+    # Steps end at the load's jumps as well as at the instants.
     jumps = scene.load.jumps
     inside = (jumps >= instants[0]) & (jumps <= instants[-1])
-    # A jump outside has no share in the derivative, one exactly on an end has its full one, which `clip` would halve.
+    # A jump outside does not contribute to the derivative; one exactly at an end contributes fully, where `clip` would halve
+    # it.
     jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
     ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
 
@@ -372,13 +372,13 @@ def states_at(
         t, y, contact, ledger = carry
         h = end - t
         load = scene.load(0.5 * (t + end))
-        # A jump that falls on an instant leaves no time between them, but either may move: what happens in between is
-        # the motion under the load just before the jump.
+        # If a jump coincides with an instant, the time between them is zero but has a derivative: the motion in that time is
+        # under the load just before the jump.
         before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
         drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
         begin = Begin(mechanics, contact, load, y, h, ledger, books)
         moved, following, ledger, reached = go_on(begin, method, most, derivatives)
-        # A number that was not reached is no number; counts stay what they are.
+        # States that were not reached are NaN; counts are kept.
         moved, ledger = jax.tree.map(
             lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
         )
@@ -387,7 +387,7 @@ def states_at(
 
     contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
     ledger0 = None if books is None else accounts.open_ledger(books, y0)
-    # Inside a scan nothing can be merged across the checkpoint anyway.
+    # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
     _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
     rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
