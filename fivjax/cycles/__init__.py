@@ -1,1 +1,1 @@
-"""Limit cycles: found, closed by Newton's method, with their Floquet multipliers; the unstable cycle on the boundary; tori."""
+"""Limit cycles, computed by Newton's method, with Floquet multipliers; saddle cycles, tori, branches, critical kicks."""

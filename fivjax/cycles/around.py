@@ -1,4 +1,4 @@
-"""Once around a closed cycle: its segments, its word of contact modes, its peak, its harmonics, its monodromy matrix."""
+"""One period of a cycle: its segments, its sequence of contact modes, its peak speed, harmonics and monodromy matrix."""
 
 import functools
 import math
@@ -19,16 +19,16 @@ from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from .section_map import Point, flow_with_jacobian, mechanics_about_sliding, to_crossing
 
-# Places in a segment where the tangential speed is looked at; about its largest, Newton's method finds the peak.
+# Samples of the tangential speed in a segment; Newton's method finds the peak from the largest.
 SAMPLES = 24
 PEAK_STEPS = 6
 HARMONICS = 16
 
 
 class Phase(NamedTuple):
-    """One letter of a cycle's word: a contact mode and how long it lasts."""
+    """One phase of a cycle: a contact mode and its duration."""
 
-    status: Status | tuple[Status, ...]  # of several contacts, of each
+    status: Status | tuple[Status, ...]  # with several contacts, one for each
     duration: float  # s
 
 
@@ -36,8 +36,8 @@ class Round(NamedTuple):
     """The segments of one period; rows beyond `count` are empty."""
 
     t: Float[Array, " s"]  # when each begins, s
-    h: Float[Array, " s"]  # how long it lasts, s; zero where empty
-    y: Float[Array, "s state"]  # where it begins
+    h: Float[Array, " s"]  # its duration, s; zero where empty
+    y: Float[Array, "s state"]  # the state where it begins
     contact: Contact
     ended: Bool[Array, "s *contacts 2"]  # which guard ended it
     count: Int[Array, ""]
@@ -68,7 +68,7 @@ def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period:
 
 
 def peak_speed(stepper: EventExact, mechanics: Mechanics, segments: Round) -> Float[Array, ""]:
-    """The largest tangential speed in any of the segments, of any contact, in m/s, to rounding."""
+    """The largest tangential speed of any contact in all segments, in m/s, to rounding."""
 
     def of_segment(y, contact, h):
         return _peak_within(stepper, mechanics, y, contact, h)
@@ -86,7 +86,7 @@ def peak_speed_along(
 ) -> Float[Array, ""]:
     """The largest tangential speed in m/s, to rounding, of a motion from a point to its `crossings`-th crossing of the section.
 
-    Not a number where that takes more than the time `longest` (s), or more than `most` segments; none of them is kept.
+    NaN if that takes longer than `longest` (s), or more than `most` segments. The segments are not kept.
     """
 
     def observe(peak, segment: Segment):
@@ -110,7 +110,7 @@ def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: C
 def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
     samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
     values, _ = value_and_slope(speeds, samples)
-    # Where the peak is does not matter to the first order.
+    # To first order the value at the peak does not depend on the instant of the peak.
     largest = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
     x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, end, PEAK_STEPS))
     refined, _ = value_and_slope(speeds, x)
@@ -121,7 +121,7 @@ def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Fl
 def harmonics(
     stepper: EventExact, mechanics: Mechanics, segments: Round, period: Float[Array, ""]
 ) -> Complex[Array, "count n"]:
-    r"""Lines of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, by integrals over exactly one period; m/s."""
+    r"""Fourier coefficients of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, over exactly one period; m/s."""
     n = segments.y.shape[1] // 2
     zero = jnp.zeros((), segments.y.dtype)
 
@@ -137,7 +137,7 @@ def harmonics(
 
 
 class Seen(NamedTuple):
-    """What is read off one period."""
+    """Segments, peak speed and harmonics of one period."""
 
     segments: Round
     amplitude: Float[Array, ""]  # m/s
@@ -157,7 +157,7 @@ def read_period(scene: Scene, stepper: EventExact, point: Point, period: Float[A
 
 
 def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, segments: int) -> Seen:
-    """`read_period` as NumPy arrays; compiled for few numbers of segments."""
+    """`read_period` as NumPy arrays; compiled for few different numbers of segments."""
     most = power_of_4(max(segments + 4, 64))
     seen = read_period(scene, stepper, point, jnp.asarray(period), most)
     return jax.tree.map(known_to_numpy, seen)
@@ -166,7 +166,7 @@ def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, 
 def word(segments: Round) -> tuple[Phase, ...]:
     """The contact modes of a cycle in order, with their durations; a mode that the section cuts in two counts once.
 
-    Sliding that reverses its direction is two phases. Of several contacts a phase lasts until the mode of one of them ends.
+    Sliding that reverses its direction is two phases. With several contacts, a phase lasts until the mode of one of them ends.
     """
     if segments.contact.status.ndim > 1:
         return word_of_several(segments)
@@ -188,7 +188,7 @@ def word(segments: Round) -> tuple[Phase, ...]:
 
 
 def word_of_several(segments: Round) -> tuple[Phase, ...]:
-    """`word` of several contacts."""
+    """`word` for several contacts."""
     letters: list[tuple[tuple, float]] = []
     for k in range(int(segments.count)):
         status, duration = np.asarray(segments.contact.status[k]), float(segments.h[k])
@@ -208,8 +208,8 @@ def word_of_several(segments: Round) -> tuple[Phase, ...]:
 def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
-    It is taken in the middle of the longest segment that does not stick, on what that segment's contact mode leaves free:
-    sticking holds more, and would hide multipliers that are 0.
+    The matrix is computed from the middle of the longest segment that does not stick, in the coordinates that the contact mode
+    leaves free: sticking leaves fewer free, so that multipliers of 0 would be missing.
     """
     stuck = segments.contact.status == Status.STICK
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
@@ -224,7 +224,7 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
 
 
 def free_coordinates(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:
-    """Places in the state that a contact mode leaves free."""
+    """Indices in the state that a contact mode leaves free."""
     n, held = scene.structure.size, []
     places = contact_coordinates(scene.structure)
     for tangential, normal, one in zip(*map(np.atleast_1d, (*places, status)), strict=True):

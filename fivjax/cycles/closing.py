@@ -1,4 +1,4 @@
-"""Closing a cycle: Newton's method on the Poincaré section, with the exact derivative of the return map."""
+"""Periodic motions by Newton's method on the Poincaré section, with the exact derivative of the return map."""
 
 from typing import NamedTuple
 
@@ -13,30 +13,30 @@ from ..steppers.event_exact import EventExact
 from .section_map import Point, Return, return_with_jacobian
 
 MOST_ITERATIONS = 30
-# A cycle is closed when it misses itself by less than this share of its size.
+# A cycle is closed if the return map misses its start by less than this share of its size.
 CLOSED = 1e-10
-# Newton's method is done when it no longer gets closer, or is this close.
+# Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
 HALVINGS = 5
 
 
 class Closed(NamedTuple):
-    """A state of the section that the return map leads back to itself."""
+    """A fixed point of the return map."""
 
     point: Point
     crossings: int  # of the section, in one period
     period: float  # s
     jacobian: Float[np.ndarray, "state state"]  # of the return map there
-    residual: float  # how far it is from closing, relative to its size
+    residual: float  # distance of the return from the start, relative to the cycle's size
     segments: int  # of motion, in one period
     events: int  # contact events in one period
 
 
 def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Closed | None:
-    """The periodic motion near a guess that crosses the section `crossings` times a period; none if there is none near.
+    """The periodic motion near a guess that crosses the section `crossings` times a period; None if none is found.
 
-    The unknown is the whole state on the section. What the contact mode or the section holds at zero comes back as zero
-    whatever it was, so those equations solve themselves, and one program serves all modes.
+    The unknown is the whole state on the section. Entries that the contact mode or the section sets to zero return as zero
+    from any value, so Newton's method sets them to zero at once, and one program serves all modes.
     """
     weights = np.asarray(scene.structure.weights)
     best: tuple[float, Point, Return, np.ndarray] | None = None
@@ -47,7 +47,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
         gap = np.asarray(found.point.y) - y
         usable = np.isfinite(closure) and np.all(np.isfinite(jacobian))
         if usable and not _same_mode(found.point, point):
-            # The guess lies on the other side of an event; where it leads is on this side.
+            # The guess has another contact mode than its image; go on from the image.
             point, step = found.point, None
             since += 1
             if since > HALVINGS:
@@ -56,7 +56,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
         if best is not None and not (usable and closure < best[0]):
             if best[0] <= CLOSED or step is None or since >= HALVINGS:
                 break
-            # Too far: half the way.
+            # The step was too long: half of it.
             step, since = 0.5 * step, since + 1
             point = Point(jnp.asarray(np.asarray(best[1].y) + step), best[1].contact)
             continue
@@ -72,7 +72,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
     if best is None or not best[0] <= CLOSED:
         return None
     _, point, found, jacobian = best
-    # Once around may be less than what was asked for.
+    # The period may be a fraction of the time that was asked for.
     for fewer in (count for count in range(1, crossings) if crossings % count == 0):
         sooner, derived = _returned(scene, stepper, point, fewer)
         missed = missed_by(point, sooner, weights)
@@ -83,14 +83,14 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
 
 
 def missed_by(point: Point, found: Return, weights: Float[np.ndarray, " state"]) -> float:
-    """How far a return ends from the point it began at, relative to its size."""
+    """The distance of a return from the point it began at, relative to the point's size."""
     y = np.asarray(point.y)
     size = np.linalg.norm(weights * y)
     return float(np.linalg.norm(weights * (np.asarray(found.point.y) - y)) / size) if size > 0 else np.inf
 
 
 def closed_as(point: Point, crossings: int, found: Return, jacobian, weights: Float[np.ndarray, " state"]) -> Closed:
-    """A cycle from its return."""
+    """The cycle with this return."""
     residual = missed_by(point, found, weights)
     return Closed(point, crossings, float(found.time), jacobian, residual, int(found.segments), int(found.events))
 
@@ -108,7 +108,7 @@ def _same_mode(a: Point, b: Point) -> bool:
 
 def _newton_step(jacobian: np.ndarray, gap: np.ndarray, contacts: int) -> np.ndarray | None:
     if contacts > 1:
-        # Oscillators that do not feel each other may be shifted against each other in time: of all steps, the shortest.
+        # Uncoupled oscillators may be shifted against each other in time, so the step is not unique: the shortest is taken.
         return np.linalg.lstsq(np.eye(len(gap)) - jacobian, gap, rcond=1e-9)[0]
     try:
         return np.linalg.solve(np.eye(len(gap)) - jacobian, gap)

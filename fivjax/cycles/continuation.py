@@ -1,9 +1,9 @@
 r"""Branches of limit cycles over a parameter, by pseudo-arclength continuation, stable and unstable ones alike.
 
-On a branch the motion passes folds, where the parameter turns round, and changes of its contact modes: a guard grazes zero, and
-beyond there is one more stick, lift-off or impact. Each sequence of modes has a smooth curve of cycles of its own
-(`multiple_shooting`); where it stops being the real motion, the point is computed as a root of its own (`grazing`), and the
-branch goes on along the curve of the sequence that the real motion has from there on.
+A branch passes folds, where the parameter turns back, and changes of the contact modes: a guard grazes zero, and beyond there
+is one more phase of sticking or detachment, or one more impact. Each sequence of modes has a smooth curve of cycles
+(`multiple_shooting`). The point where this curve no longer is the real motion is computed as a root (`grazing`); the branch
+continues along the curve for the sequence of modes that the real motion has beyond.
 """
 
 from typing import TYPE_CHECKING
@@ -46,7 +46,7 @@ def continue_cycle(
     points: int = 400,
     derivatives: bool = False,
 ) -> "xr.Dataset":
-    """The branch of limit cycles that one of them lies on, over a parameter of the scene.
+    """The branch of limit cycles, stable and unstable, that contains a given one, over a parameter of the scene.
 
         branch = fj.continue_cycle(scene, "mu", (0.02, 0.3))
         unstable = fj.continue_cycle(scene, "mu", (0.02, 0.3), start=fj.saddle_cycle(scene))
@@ -55,28 +55,28 @@ def continue_cycle(
 
     **Arguments:**
 
-    - `scene`; `parameter`, the name of any scalar parameter of it under its final load, such as "mu" or "belt_speed".
-    - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own lies between.
-    - `start`: as in `limit_cycle`; a `LimitCycle` may be an unstable one. Without it, the scene's limit cycle, or its saddle
-      cycle where that is a torus.
-    - `points`: the most cycles that are computed each way.
-    - `derivatives`: whether special points are differentiated in all parameters.
+    - `scene`; `parameter`, the name of one of its scalar parameters, such as "mu" or "belt_speed". The load is the final one.
+    - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own value lies between them.
+    - `start`: as in `limit_cycle`; a `LimitCycle` may be unstable. Unless given, the scene's limit cycle, or its saddle cycle
+      if the limit cycle is a torus.
+    - `points`: the largest number of cycles computed in each direction.
+    - `derivatives`: whether to differentiate special points in all parameters.
 
     **Returns:** a dataset over `point`, in the order along the branch:
 
     - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
     - `sliding_stable`, whether steady sliding is stable there;
-    - `multipliers` over `multiplier`, largest first, without the one of the cycle's own direction;
+    - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
     - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
-    - `special`: what is special about a point, or nothing: "fold", "period doubling", "Neimark–Sacker", or how the contact
+    - `special`: the kind of a special point, else empty: "fold", "period doubling", "Neimark–Sacker", or how the contact
       modes change there ("grazing of slip: stick inserted"). Special points are computed to rounding;
-    - with `derivatives`, `d_special` over `of`: derivatives of the parameter at which a special point lies. They are not
-      numbers at points that are not special, in the parameter itself, and where the change of modes is no simple one.
+    - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
+      points, for the parameter itself, and where the change of modes is not a simple one.
 
     The attributes `begins` and `ends` say in a sentence where each end is, and why.
 
-    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not hold the scene's value, and whatever
-    `limit_cycle` refuses; `NoLimitCycle` where there is no cycle to start from, or it is a torus.
+    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value, and for
+    anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
 
     **Example:**
 
@@ -102,7 +102,7 @@ def continue_cycle(
     arguments.truth("derivatives", derivatives)
     cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
     if cycle.kind != "periodic" and start is None:
-        # On the way round a fold the branch of the saddle comes to the cycle that has become a torus.
+        # Past a fold, the branch of the saddle cycle leads to the unstable cycle inside the torus.
         cycle = saddle_cycle(final, cycle)
     if cycle.kind != "periodic":
         raise NoLimitCycle(
@@ -133,12 +133,12 @@ def continue_cycle(
 def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     """The limit cycle at a point of a branch.
 
-    **Arguments:** `branch`, from `continue_cycle`; `i`, the place of the point.
+    **Arguments:** `branch`, from `continue_cycle`; `i`, the index of the point.
 
     **Returns:** a `LimitCycle`.
 
-    **Raises:** `TypeError` or `ValueError` for what is no branch, or an `i` that is not among its points; `NoLimitCycle`
-    where the section is not met, as where the amplitude is next to nothing.
+    **Raises:** `TypeError` or `ValueError` for an object that is no branch, or an `i` that is not among its points;
+    `NoLimitCycle` if the motion does not cross the section, which happens at nearly zero amplitude.
 
     **Example:**
 
@@ -221,7 +221,7 @@ def _equilibrium(scene: Scene):
 
 
 def word_of(phases: Phases) -> str:
-    """The contact modes of a cycle in words; sliding that outruns the belt is "slide back"."""
+    """The contact modes of a cycle as text; sliding faster than the belt is "slide back"."""
     longest = int(np.argmax(phases.h))
     usual = next((mode.direction for mode in phases.modes if mode.status == Status.SLIDE), 1.0)
     if phases.modes[longest].status == Status.SLIDE:
@@ -233,5 +233,5 @@ def word_of(phases: Phases) -> str:
 
     words = [of(mode) for mode in phases.modes]
     turned = [words[k:] + words[:k] for k in range(len(words))]
-    # One way to begin, so that the same cycle has the same word everywhere.
+    # Rotated to a unique beginning, so that the same cycle has the same word at all points.
     return " – ".join(max(turned))

@@ -1,4 +1,4 @@
-"""A limit cycle: what was computed of it, and what can be read off it."""
+"""A limit cycle, its properties, and the quantities computed from it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,19 +16,19 @@ from .around import Phase, floquet_multipliers, seen_around, word
 from .closing import Closed
 from .section_map import Point, return_with_jacobian, sliding_state
 
-# A multiplier this much inside the unit circle is taken to be inside.
+# A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
 
 
-# A multiplier of the section's return map this close to 1 is taken for 1.
+# A multiplier of the section's return map this close to 1 counts as 1.
 FAMILY = 1e-7
 
 
 class LimitCycle(eqx.Module):
     """A periodic motion, stable or not, or a torus, computed on the Poincaré section.
 
-    The section is where the tangential velocity rises through zero. Multipliers belong to small deviations, per period; one of
-    a periodic motion's is 1, for a deviation along the cycle.
+    On the section the tangential velocity rises through zero. A multiplier is the factor by which a small deviation changes in
+    one period; one multiplier of a periodic motion is 1, for a deviation along the cycle.
 
     **Example:**
 
@@ -39,20 +39,21 @@ class LimitCycle(eqx.Module):
 
     scene: Scene  # under its final load
     kind: str = eqx.field(static=True)  # "periodic" or "torus"
-    period: float  # s; of a torus, the mean time between points of the section
+    period: float  # s; for a torus, the mean time between points of the section
     state: Float[np.ndarray, " state"]  # displacements (m) and velocities (m/s) on the section
     contact: Contact  # the contact mode there
     word: tuple[Phase, ...]  # contact modes in order, with their durations (s)
-    multipliers: Complex[np.ndarray, " m"]  # by size, largest first
+    # By size, largest first; for a torus, exp of the Lyapunov exponents per return.
+    multipliers: Complex[np.ndarray, " m"]
     stable: bool
     amplitude: float  # peak tangential speed, m/s
-    # How far it is from closing; of a torus, how far its points are, in the median, from the curve of the others.
+    # Distance of the return from the start; for a torus, the median distance of its points from the curve through the others.
     residual: float  # relative to its size
     crossings: int  # points of the section in one period
-    harmonics: Complex[np.ndarray, "count n"]  # lines of the velocities, m/s
-    points: Float[np.ndarray, "k state"]  # of the section, on one period or the torus, as deviations from sliding
+    harmonics: Complex[np.ndarray, "count n"]  # Fourier coefficients of the velocities, m/s
+    points: Float[np.ndarray, "k state"]  # on the section, of one period or the torus, as deviations from sliding
     return_jacobian: Float[np.ndarray, "state state"]  # of the section's return map over one period
-    rotation_number: float | None = None  # of a torus: turns per return
+    rotation_number: float | None = None  # of a torus, in turns per return
 
     @property
     def frequency(self) -> float:
@@ -66,14 +67,14 @@ class LimitCycle(eqx.Module):
 
     @property
     def unstable_directions(self) -> int:
-        """How many independent small deviations grow."""
+        """The number of multipliers outside the unit circle: of independent small deviations that grow."""
         values = section_multipliers(self.return_jacobian)
         return int(np.sum(np.abs(values) > 1.0))
 
     @property
     def in_family(self) -> bool:
-        """Whether a second multiplier is 1, so that neighbouring motions are periodic, too: oscillators that do not feel each
-        other may be shifted against each other in time. Such a motion is neither stable nor unstable.
+        """Whether a second multiplier is 1, so that neighbouring motions are periodic, too: uncoupled oscillators may be
+        shifted against each other in time. Such a motion is neither stable nor unstable.
         """
         if self.kind != "periodic" or np.ndim(self.contact.status) == 0:
             return False
@@ -90,7 +91,7 @@ class LimitCycle(eqx.Module):
         return simulate(self.scene, t1=end, dt_save=end / points, y0=self.state, energy=energy)
 
     def to_dataset(self):
-        """One period with names, units and the scene it came from; multipliers and points of the section beside it."""
+        """One period with names, units and the scene it came from; with its multipliers and points of the section."""
         dataset = self.trajectory().to_dataset()
         return dataset.assign(
             multiplier_real=("multiplier", self.multipliers.real),
@@ -112,7 +113,9 @@ class LimitCycle(eqx.Module):
 
     @property
     def energy(self) -> dict[str, float]:
-        """Energy per period by line of the ledger, in J: works of the contact, dampers and load, and the impact loss."""
+        """Energy per period by line of the ledger, in J: work of the contact, the dampers and the load, and the loss in
+        impacts.
+        """
         ledger = self.trajectory(64, energy=True).energy
         assert ledger is not None
         lines = {name: float(np.asarray(line)[-1]) for name, line in ledger.work.lines("work").items()}
@@ -136,14 +139,16 @@ def _named(status: Status | tuple[Status, ...]) -> str:
 
 
 def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[np.ndarray, " state"]:
-    """Eigenvalues of the return map's derivative, largest first: the multipliers without that of the cycle's own direction."""
+    """Eigenvalues of the return map's derivative, largest first: the multipliers without that for a deviation along the
+    cycle.
+    """
     values = np.linalg.eigvals(jacobian).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
 
 
 @in_double_precision
 def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCycle:
-    """Everything about a closed cycle."""
+    """The limit cycle of a fixed point of the return map."""
     seen = seen_around(scene, stepper, closed.point, closed.period, closed.segments)
     largest = np.abs(section_multipliers(closed.jacobian))[0]
     return LimitCycle(
@@ -165,7 +170,7 @@ def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCy
 
 
 def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> Float[np.ndarray, "k state"]:
-    """The points of the section on one period from the given one on."""
+    """The points on the section during one period, beginning with the given one."""
     points = [np.asarray(point.y)]
     for _ in range(crossings - 1):
         found, _ = return_with_jacobian(scene, stepper, point, 1)
@@ -188,7 +193,7 @@ def under_final_load(scene: Scene) -> Scene:
 
 
 def point_of(cycle: LimitCycle) -> Point:
-    """The cycle's point on the section, as the return map wants it."""
+    """The cycle's point on the section, in the form that the return map takes."""
     contact = Contact(jnp.asarray(cycle.contact.status, jnp.int32), jnp.asarray(cycle.contact.direction, jnp.float64))
     return Point(jnp.asarray(cycle.deviation, jnp.float64), contact)
 

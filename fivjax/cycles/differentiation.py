@@ -2,8 +2,8 @@ r"""Derivatives of a limit cycle in the parameters of its scene, by the implicit
 
 A cycle is a root of $P(y, θ) - y = 0$. With $J = ∂P/∂y$ there, $dy/dθ = (I - J)^{-1} ∂P/∂θ$; period and peak are functions of
 $y$ and $θ$, and the derivative of a simple multiplier $λ$ with eigenvectors $l$ and $r$ of $J$ is
-$l^H (dJ/dθ)\, r / l^H r$. Event times are differentiated implicitly all through, so it is one period that is differentiated,
-never the way to the cycle. At a grazing event, and at a fold, there is no derivative.
+$l^H (dJ/dθ)\, r / l^H r$. Only one period is differentiated, through its events, and not the transient towards the cycle. At a
+grazing event, and at a fold, there is no derivative.
 """
 
 import math
@@ -26,7 +26,7 @@ from .section_map import Point, mechanics_about_sliding, section_return, sliding
 
 
 class CycleDerivatives(eqx.Module):
-    """Derivatives of a limit cycle, by name of the parameter; per unit of the parameter."""
+    """Derivatives of a limit cycle by name of the parameter, each per unit of that parameter."""
 
     period: dict[str, float]  # s
     amplitude: dict[str, float]  # m/s
@@ -42,8 +42,8 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
         d.period["k1"], d.amplitude["mu"]
 
     **Arguments:** `cycle`, from `limit_cycle` or `saddle_cycle`; `wrt`, names of parameters of its scene; `multipliers`,
-    whether those of the section's return map are differentiated too, largest first: second derivatives, which take minutes to
-    compile.
+    whether to differentiate the multipliers of the section's return map, too (largest first). This takes second derivatives,
+    which need minutes to compile.
 
     **Returns:** `CycleDerivatives`.
 
@@ -120,8 +120,8 @@ def _slopes(
         def image(y):
             return section_return(short, own, mechanics, Point(y, point.contact), crossings)
 
-        # One step of Newton's method from the root: the same root, with its derivative. A second one makes the derivative of
-        # what is a derivative itself, the return map's, right.
+        # A step of Newton's method from the root gives the same root, with its derivative. For the derivative of the return
+        # map's Jacobian a second step is needed.
         y = point.y
         for _ in range(1 + twice):
             gap = image(y).point.y - y

@@ -1,4 +1,4 @@
-"""Following a branch of cycles: steps, changes of the contact modes on the way, and where it ends."""
+"""Following a branch of cycles: its steps, the changes of the contact modes on the way, and its ends."""
 
 from typing import NamedTuple
 
@@ -13,22 +13,22 @@ from .pseudo_arclength import Curve, Family, Place, multipliers_of
 from .special_points import MEETS_SLIDING, Special, between, change_between, grazing_of, name_of, vanishing, without
 from .verification import Real, on_section, real_motion
 
-# Lengths of steps, in the curve's own units (cycle size, period and parameter scale).
+# Lengths of steps, in the units of the curve (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
-# Easy steps become longer by the first factor while they are shorter than `FIRST`, by the second later.
+# After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second above.
 SOON, LATER = 3.0, 1.5
-# Tangents of neighbours have at least this cosine.
+# The angle between the tangents at neighbouring points has at least this cosine.
 STRAIGHT = 0.99
 # Halvings that bracket a change of modes before it is computed.
 HALVINGS = 14
-# How far beyond a change the next modes are looked for, in shares of the step.
+# Distances beyond a change of modes at which the next modes are determined, as shares of the step.
 BEYOND = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-# A cycle of pure sliding this much smaller than it was meets the equilibrium.
+# A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
 SMALL = 0.02
 
 
 class Point(NamedTuple):
-    """A cycle on the branch and what is known of it."""
+    """A cycle on the branch with its multipliers, and its kind if it is a special point."""
 
     curve: Curve
     place: Place
@@ -38,7 +38,7 @@ class Point(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What is special about it, if anything."""
+        """The kind of special point; empty for all others."""
         return "" if self.special is None else self.special.name
 
 
@@ -50,26 +50,26 @@ class Followed(NamedTuple):
 
 
 def seen(family: Family, curve: Curve, place: Place, special: Special | None = None) -> Point:
-    """A cycle with its real motion."""
+    """A point of the branch from a computed cycle, with the real motion that starts on it."""
     real = real_motion(family.at(place.parameter), family.stepper, place.phases)
     return Point(curve, place, real, multipliers_of(place.images), special)
 
 
 def is_real(family: Family, place: Place) -> bool:
-    """Whether the real motion has the modes that a cycle was computed with."""
+    """Whether the real motion has the contact modes with which a cycle was computed."""
     real = real_motion(family.at(place.parameter), family.stepper, place.phases)
     return real is not None and real.has_the_modes_of(place.phases)
 
 
 def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[float, float], most: int) -> Followed:
-    """The branch from a cycle on, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
+    """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
     curve, here = start.curve, start
     tangent = curve.tangent(here.place, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
     points: list[Point] = []
     step = FIRST
     while len(points) < most:
-        # Not past the equilibrium, where a cycle has shrunk to nothing.
+        # Not beyond the equilibrium, where the amplitude is zero.
         step = min(step, 0.5 * _smallness(curve, here.place))
         following = curve.along(here.place, tangent, step)
         if following is None:
@@ -135,7 +135,9 @@ def _specials(family, curve: Curve, a: Place, tangent, b: Place | None) -> list[
 
 
 def _smallness(curve: Curve, place: Place) -> float:
-    """The size of a cycle of pure sliding, in the curve's own; others end before they are small."""
+    """The size of a cycle of pure sliding, relative to its size where the curve began; other cycles end before they are
+    small.
+    """
     pure = len(place.phases.modes) == 1 and place.phases.modes[0].ending == AT_SECTION
     return float(np.linalg.norm(place.u[: len(curve.of_state)])) if pure else np.inf
 
@@ -153,7 +155,7 @@ def _sliding_matrix(scene: Scene):
 
 
 def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
-    """Eigenvalues of small vibrations about steady sliding, in 1/s, the fastest growing first."""
+    """Eigenvalues of steady sliding, in 1/s, the fastest growing first."""
     matrix = np.asarray(_sliding_matrix(scene))
     if not np.all(np.isfinite(matrix)):
         return np.full(len(matrix), np.nan, complex)
@@ -162,7 +164,7 @@ def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
 
 
 def _meets_sliding(family: Family, last: Point) -> Followed:
-    """The last cycle, and after it the equilibrium at its stability limit, which a cycle shrinks to there."""
+    """The end of a branch of shrinking cycles: the last cycle, and the equilibrium at its stability limit."""
     from scipy.optimize import brentq
 
     def growth(parameter: float) -> float:
@@ -187,7 +189,7 @@ def _meets_sliding(family: Family, last: Point) -> Followed:
 
 
 def _change(family: Family, here: Point, tangent: Float[np.ndarray, " m"], step: float):
-    """The change of modes within a step: the special point, and where to go on (point, tangent, step), if anywhere."""
+    """The change of modes within a step: the special point, and the point, tangent and step with which to go on, if any."""
     curve = here.curve
     low, high, ahead = 0.0, step, curve.along(here.place, tangent, step)
     valid = here.place
@@ -212,7 +214,7 @@ def _change(family: Family, here: Point, tangent: Float[np.ndarray, " m"], step:
 
 
 def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent, step: float):
-    """Beyond the change there are more phases."""
+    """A change beyond which there are more phases."""
     for share in BEYOND:
         place = curve.along(ahead, tangent, share * step)
         if place is None:
@@ -247,7 +249,7 @@ def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent,
 
 
 def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, step: float):
-    """Beyond the change there are fewer phases."""
+    """A change beyond which there are fewer phases."""
     shorter = _shorter(family, valid, phase)
     if shorter is None:
         return None
@@ -276,12 +278,12 @@ def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, st
 
 
 def _shorter(family: Family, valid: Place, phase: int):
-    """The phases without one, as a guess of a cycle, and how they follow from those with it."""
+    """The phases without the given one, as a guess of a cycle; and the change that leads to them."""
     phases = valid.phases
     count, modes = len(phases.modes), phases.modes
     before, after = modes[phase - 1], modes[(phase + 1) % count]
     if count == 2 and modes[phase][:2] != after[:2]:
-        # What is left has no event: it starts on the section.
+        # The remaining phase has no event: it starts and ends on the section.
         kept = (after._replace(ending=AT_SECTION),)
         change = change_between(modes, kept)
         real = real_motion(family.at(valid.parameter), family.stepper, phases)
@@ -305,7 +307,7 @@ def _near(curve: Curve, found: Place, guess: Place, step: float) -> bool:
 
 
 def _outward(family: Family, curve: Curve, first: Place, tangent, special: Place | None):
-    """The direction of a curve in which its cycles are real."""
+    """The direction along a curve in which its cycles are real motions."""
     for length in (1e-6, 1e-5, 1e-4, 1e-3):
         real = []
         for sign in (1.0, -1.0):

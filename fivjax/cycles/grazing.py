@@ -1,8 +1,8 @@
-r"""Where a cycle's sequence of contact modes ends: a guard that just touches zero inside a phase.
+r"""Grazings: cycles at which a sequence of contact modes ends, because a guard touches zero inside a phase.
 
-Of the two sequences that meet there, the one with fewer phases goes on smoothly beyond. On it the place is a simple root of the
-cycle's equations together with $g = 0$ and $\dot g = 0$ at one instant of one phase: Newton's method locates it to rounding,
-and the implicit function theorem differentiates it.
+Of the two sequences that meet there, the one with fewer phases has a smooth curve of cycles beyond that point. On this curve
+the grazing is a simple root of the cycle's equations together with $g = 0$ and $\dot g = 0$ at one instant of one phase.
+Newton's method finds it to rounding, and the implicit function theorem differentiates it.
 """
 
 from typing import NamedTuple
@@ -27,13 +27,13 @@ NAMES = {
 
 
 class Touch(NamedTuple):
-    """A guard that is smallest at an instant inside a phase, or decides at its start what follows."""
+    """A minimum of a guard inside a phase; or a guard at the start of a phase, where it decides which mode follows."""
 
     phase: int
     guard: int
     time: float  # s after the phase's start
     value: float  # relative to the guard's largest value
-    bend: float  # its second derivative in time, of the guard itself; zero at the start of a phase, an instant that is fixed
+    bend: float  # the guard's second derivative in time; zero at the start of a phase, where the instant is fixed
 
 
 class Grazing(NamedTuple):
@@ -41,11 +41,11 @@ class Grazing(NamedTuple):
 
     place: Place
     touch: Touch
-    row: Float[np.ndarray, " m"]  # derivative of the smallest guard in the unknowns
+    row: Float[np.ndarray, " m"]  # derivative of the guard's minimum by the unknowns
 
 
 def touches(curve: Curve, place: Place) -> list[Touch]:
-    """All smallest values of guards inside the phases of a cycle, the lowest first."""
+    """All minima of guards inside the phases of a cycle, the lowest first."""
     family, phases = curve.family, place.phases
     looked = inside(family.at(place.parameter), family.stepper, phases)
     found = []
@@ -71,7 +71,7 @@ def touches(curve: Curve, place: Place) -> list[Touch]:
 
 
 def looked_at(curve: Curve, parameter: float, phases: Phases, touch: Touch, direction=None) -> tuple[Images, Images]:
-    """Images of all phases, and of the touched one up to the instant of touching."""
+    """Images of all phases, and of the phase with the minimum up to its instant."""
     family, k = curve.family, touch.phase
     status, pointing, _ = phases.modes[k]
     partial = Mode(status, pointing, touch.guard)
@@ -90,7 +90,7 @@ def looked_at(curve: Curve, parameter: float, phases: Phases, touch: Touch, dire
 
 
 def row_of(curve: Curve, phases: Phases, touch: Touch, partial: Images) -> Float[np.ndarray, " m"]:
-    """The derivative of a smallest guard in the unknowns: its instant may move, without effect to first order."""
+    """The derivative of a guard's minimum by the unknowns; to first order, a change of its instant has no effect."""
     size = phases.y.shape[1]
     row = np.zeros(len(curve.scales))
     row[touch.phase * size : (touch.phase + 1) * size] = partial.guard_y[0]
@@ -133,7 +133,7 @@ def grazing_near(curve: Curve, guess: Place, touch: Touch) -> Grazing | None:
 
 
 def _bend(curve: Curve, u, touch: Touch, shift: float) -> float:
-    """The guard's second derivative, by the difference of its slopes."""
+    """The guard's second derivative in time, by a difference of its slopes."""
     phases, parameter = curve.phases(u)
     apart = 1e-4 * curve.time
     slopes = [

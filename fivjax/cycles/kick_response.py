@@ -1,4 +1,4 @@
-"""The motion after a kick, and how the place where it crosses the section depends on every parameter of the scene."""
+"""The motion after a kick: its crossings of the section, and their derivatives in the parameters of the scene."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from .multiple_shooting import parameter_direction
 from .section_map import MOST_SEGMENTS, Point, longest_return, mechanics_about_sliding
 
-# Crossings of the section that are kept, at most.
+# The most crossings of the section that are kept.
 MOST_CROSSINGS = 1024
 
 
@@ -25,10 +25,10 @@ class Crossings(NamedTuple):
     """The crossings of the section after a kick, in order; rows beyond `count` are empty."""
 
     y: Float[np.ndarray, "k state"]  # deviations from sliding
-    y_parameter: Float[np.ndarray, "d k state"]  # and their derivatives along directions in the parameters
+    y_parameter: Float[np.ndarray, "d k state"]  # their derivatives along directions of the parameters
     status: Int[np.ndarray, " k"]
     direction: Float[np.ndarray, " k"]
-    events: Int[np.ndarray, " k"]  # contact events up to there
+    events: Int[np.ndarray, " k"]  # contact events up to the crossing
     count: int
 
 
@@ -41,22 +41,22 @@ class _Record(NamedTuple):
 
 
 def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
-    """The scene's derivatives in several of its parameters, stacked along a first axis."""
+    """The scene's derivatives by several of its parameters, stacked along a first axis."""
     each = [parameter_direction(scene, name) for name in names]
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
 
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int, *, rough: bool = False) -> Crossings:
-    """Crossings after the kick of the scene's load, from steady sliding on; as many as asked for, if there are.
+    """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many.
 
-    With `rough`, derivatives are good enough for Newton's method, which corrects itself, and take a third of the time.
+    With `rough`, derivatives take a third of the time and are only good enough for Newton's method, which corrects itself.
     """
     start = Point(jnp.zeros(2 * scene.structure.size), Contact(jnp.asarray(1, jnp.int32), jnp.sign(scene.belt_speed)))
     return _followed(scene, stepper, directions, start, None, crossings, rough)
 
 
 def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:
-    """Crossings from a point of the section on, without a kick."""
+    """Crossings of the motion from a point of the section, without a kick."""
     quiet = scene.replace(p=1.0, duration=0.0)
     return _followed(quiet, stepper, directions, point, None, crossings)
 
@@ -64,7 +64,7 @@ def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point,
 def started(
     scene: Scene, stepper: EventExact, start: Point, directions: Float[np.ndarray, "d state"], crossings: int
 ) -> Crossings:
-    """Crossings from any state on, without a kick, with derivatives along directions in that state."""
+    """Crossings of the motion from any state, without a kick, with derivatives along directions of that state."""
     quiet = scene.replace(p=1.0, duration=0.0)
     fixed = jax.tree.map(lambda leaf: np.zeros((len(directions), *np.shape(leaf))), quiet)
     return _followed(quiet, stepper, fixed, start, directions, crossings)
@@ -94,7 +94,7 @@ def _kicked(
         assert isinstance(load, Pulse)
         mechanics = mechanics_about_sliding(scene)
         short = stepper if rough else for_derivatives(stepper, mechanics)
-        # Loads are deviations, too.
+        # Loads are deviations from the final load.
         more = (load.p - 1.0) * load.force
         begin = physics.status_from_forces(mechanics, more, y)
         quiet = load.duration <= 0
@@ -135,7 +135,7 @@ def _recorded(total: _Record, segment: Segment) -> _Record:
     after = segment.after
     crossed: Bool[Array, ""] = after.rise.happened
     happened = total.happened + jnp.any(after.ended)
-    # What is written beyond the end is dropped.
+    # An index beyond the end drops what is written.
     place = jnp.where(crossed, total.count, len(total.events))
     return _Record(
         total.y.at[place].set(after.y, mode="drop"),

@@ -1,14 +1,14 @@
-r"""A cycle with a prescribed sequence of contact modes, as the root of a system that stays smooth where the sequence ends.
+r"""Cycles with a prescribed sequence of contact modes, as roots of a system that is smooth even where the sequence ends.
 
-A cycle is its *phases*: in phase $k$ the motion starts at $y_k$ and keeps one contact mode for a time $h_k$, at whose end one
-guard is zero (or, in a cycle without any event, the tangential velocity rises through zero). With $φ$ the flow of one mode and
-$T$ the transition at its end,
+A cycle consists of *phases*: in phase $k$ the motion starts at $y_k$ and stays in one contact mode for a time $h_k$, at whose
+end one guard is zero (or, in a cycle without events, the tangential velocity rises through zero). With $φ$ the flow of one mode
+and $T$ the transition at its end,
 
 $$ T_k(φ_k(y_k, h_k)) = y_{k+1}, \qquad g_k(φ_k(y_k, h_k)) = 0, $$
 
-cyclically, is as many equations as unknowns. The flow of one mode goes on, smoothly, where its guards are no longer positive
-and for times that are negative. So what a cycle with these phases becomes beyond a grazing, where real motion has other phases,
-has a value too, and the grazing is a simple root, which Newton's method finds to rounding.
+cyclically, are as many equations as unknowns. The flow of one mode can be continued smoothly where its guards are no longer
+positive, and for negative times. So the equations have solutions beyond a grazing, too, where the real motion has other phases,
+and the grazing is a simple root, which Newton's method finds to rounding.
 """
 
 from typing import NamedTuple
@@ -26,16 +26,16 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from .around import Round
 from .section_map import mechanics_about_sliding
 
-# The row that ends a phase: one of the two guards of its mode, or the section.
+# A phase ends at one of the two guards of its mode (0 or 1), or at the section.
 AT_SECTION = 2
-# Instants of each phase at which its guards are looked at.
+# Instants of each phase at which its guards are evaluated.
 LOOKS = 48
-# Phases that are compiled for, at least: few cycles have more.
+# The smallest number of phases that is compiled: few cycles have more.
 LEAST = 16
 
 
 class Mode(NamedTuple):
-    """What a phase is: its contact mode, and which guard ends it."""
+    """The contact mode of a phase, and the guard that ends it."""
 
     status: int
     direction: float  # of friction, if it slides; else zero
@@ -43,7 +43,7 @@ class Mode(NamedTuple):
 
 
 class Phases(NamedTuple):
-    """A cycle, or a guess of one: modes, and where and how long each phase is. States are deviations from sliding."""
+    """A cycle, or a guess of one: mode, first state and duration of each phase. States are deviations from sliding."""
 
     modes: tuple[Mode, ...]
     y: Float[np.ndarray, "k state"]
@@ -51,12 +51,12 @@ class Phases(NamedTuple):
 
     @property
     def period(self) -> float:
-        """In s."""
+        """The sum of the durations, in s."""
         return float(np.sum(self.h))
 
 
 class Images(NamedTuple):
-    """Where each phase leads, and the derivatives."""
+    """The state after each phase, the guard that ends it, and their derivatives."""
 
     y: Float[np.ndarray, "k state"]  # the start of the next one
     guard: Float[np.ndarray, " k"]
@@ -69,7 +69,7 @@ class Images(NamedTuple):
 
 
 def phases_around(segments: Round) -> Phases | None:
-    """The phases that one period of real motion from a point of the section consists of; none where it is at rest."""
+    """The phases of one period of real motion from a point of the section; None where it is at rest."""
     count = int(segments.count)
     modes, starts, lengths, whole = [], [], [], True
     for k in range(count):
@@ -97,12 +97,12 @@ def phases_around(segments: Round) -> Phases | None:
 
 
 def same_modes(a: tuple[Mode, ...], b: tuple[Mode, ...]) -> bool:
-    """Whether two sequences are the same, wherever they begin."""
+    """Whether two sequences are the same up to rotation."""
     return len(a) == len(b) and any(a == b[k:] + b[:k] for k in range(len(b)))
 
 
 def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> Images:
-    """Images of all phases and their derivatives in state, duration and along a direction in the parameters."""
+    """Images of all phases, and their derivatives by state and duration and along a direction of the parameters."""
     modes = phases.modes
     following = modes[1:] + modes[:1]
     return looked_up(scene, direction, stepper, modes, following, phases.y, phases.h)
@@ -134,7 +134,7 @@ def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, follow
 def _images(scene, direction, stepper, y, h, status, pointing, ending, next_status, next_pointing):
     mechanics, mechanics_direction = jax.jvp(mechanics_about_sliding, (scene,), (direction,))
     n2, stepper = y.shape[1], for_derivatives(stepper, mechanics)
-    # Directions of the derivatives: the state's, the duration's, the parameter's.
+    # Directions of the derivatives: those of the state, the duration, the parameter.
     eye = jnp.eye(n2 + 2, dtype=y.dtype)
 
     def of_phase(y, h, *modes):
@@ -168,14 +168,14 @@ def _image(stepper, mechanics: Mechanics, y: State, h, status, pointing, ending,
 
 
 class Inside(NamedTuple):
-    """Guards and tangential speed inside phases, at even shares of each."""
+    """Guards and states inside phases, at equally spaced instants of each."""
 
     guards: Float[np.ndarray, "k look 2"]
     states: Float[np.ndarray, "k look state"]
 
 
 def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
-    """Guards and states along all phases, the two ends of each among them."""
+    """Guards and states along all phases, including both ends of each."""
     count = len(phases.modes)
     most = power_of_4(max(count, LEAST))
     fill = np.minimum(np.arange(most), count - 1)
@@ -204,11 +204,11 @@ def _inside(scene, stepper, y, h, status, pointing):
 
 
 def parameter_direction(scene: Scene, name: str) -> Scene:
-    """The scene's derivative in one of its parameters: one there, and zero elsewhere."""
+    """The scene's derivative by one of its parameters: one for that parameter, zero for all others."""
     value = jnp.asarray(scene.parameters[name], jnp.float64)
     return jax.jvp(lambda value: scene.replace(**{name: value}), (value,), (jnp.ones_like(value),))[1]
 
 
 def moved_along(scene: Scene, direction: Scene, by: Float[Array, ""] | float) -> Scene:
-    """The scene with a parameter changed; without the checks of `replace`, which take longer than a return."""
+    """The scene with a parameter changed, without the checks of `replace`, which take longer than a return of the section."""
     return jax.tree.map(lambda leaf, slope: np.asarray(leaf) + by * np.asarray(slope), scene, direction)

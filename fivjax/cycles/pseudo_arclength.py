@@ -1,8 +1,8 @@
 r"""A branch of cycles with one sequence of contact modes, followed by its arclength.
 
-The unknowns of `multiple_shooting` and the parameter together are one more than the equations, so the cycles form a curve. A
-point of it is found by Newton's method in the plane through a prediction, at right angles to the tangent: that passes folds,
-where the parameter turns round.
+The unknowns of `multiple_shooting` and the parameter together are one more than the equations, so the cycles form a curve.
+Newton's method finds a point of it in the plane through a prediction that is normal to the tangent. This works at folds, too,
+where the parameter turns back.
 """
 
 from typing import NamedTuple
@@ -16,9 +16,9 @@ from ..steppers.event_exact import EventExact
 from .multiple_shooting import Images, Mode, Phases, images, moved_along
 
 MOST_ITERATIONS = 10
-# Newton's method has converged where its next correction would be this small, relative to the cycle's size.
+# Newton's method has converged if its next correction would be this small, relative to the cycle's size.
 EXACT = 3e-12
-# And where corrections no longer shrink, this is close enough: what is left is rounding.
+# If corrections no longer shrink, this is small enough: they are rounding errors.
 CLOSE = 1e-9
 
 
@@ -49,10 +49,10 @@ class Place(NamedTuple):
 
 
 class Curve:
-    """Cycles with one sequence of modes."""
+    """The curve of cycles with one sequence of modes."""
 
     def __init__(self, family: Family, phases: Phases):
-        """`phases`, a cycle of these modes, or a guess of one: sizes are measured in its own."""
+        """`phases`: a cycle of these modes, or a guess of one; its size and period are the units of the unknowns."""
         self.family, self.modes = family, phases.modes
         self.weights = np.asarray(family.scene.structure.weights)
         self.size = float(np.max(np.linalg.norm(self.weights * phases.y, axis=-1)))
@@ -61,17 +61,17 @@ class Curve:
         self.scales = np.concatenate([self.of_state, np.full(len(self.modes), self.time), [family.scale]])
 
     def unknowns(self, phases: Phases, parameter: float) -> Float[np.ndarray, " m"]:
-        """Phases and parameter as one vector, in the curve's own units."""
+        """Phases and parameter as one vector, in the units of the curve."""
         return np.concatenate([phases.y.ravel(), phases.h, [parameter]]) / self.scales
 
     def phases(self, u: Float[np.ndarray, " m"]) -> tuple[Phases, float]:
-        """What a vector stands for."""
+        """Phases and parameter from such a vector."""
         count, values = len(self.modes), u * self.scales
         many = count * len(self.weights)
         return Phases(self.modes, values[:many].reshape(count, -1), values[many:-1]), float(values[-1])
 
     def system(self, u: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray, Images, Phases, float]:
-        """Residuals and their derivatives, each equation in units of its own derivatives."""
+        """Residuals and their derivatives, each equation scaled by the size of its derivatives."""
         phases, parameter = self.phases(u)
         family = self.family
         found = images(family.at(parameter), family.direction, family.stepper, phases)
@@ -82,7 +82,7 @@ class Curve:
         return residuals / sizes, rows / sizes[:, None], found, phases, parameter
 
     def corrected(self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None) -> Place | None:
-        """The cycle next to a guess: in the plane through the guess with this normal, or the nearest, without one."""
+        """The cycle near a guess: in the plane through the guess with this normal, or without a normal the nearest one."""
         target, last = u.copy(), np.inf
         for iteration in range(MOST_ITERATIONS):
             residuals, rows, found, phases, parameter = self.system(u)
@@ -105,13 +105,13 @@ class Curve:
         return None
 
     def tangent(self, place: Place, like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
-        """The curve's direction there, of unit length, on the side of `like`."""
+        """The unit tangent of the curve, on the side of `like`."""
         _, _, axes = np.linalg.svd(place.jacobian)
         found = axes[-1]
         return found if like is None or found @ like >= 0 else -found
 
     def along(self, place: Place, tangent: Float[np.ndarray, " m"], by: float) -> Place | None:
-        """The cycle about a distance `by` further on along the tangent."""
+        """The cycle at a distance of about `by` along the tangent."""
         return self.corrected(place.u + by * tangent, tangent)
 
     def at_parameter(self, guess: Float[np.ndarray, " m"], parameter: float) -> Place | None:
@@ -122,10 +122,10 @@ class Curve:
 
 
 def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
-    """How many times the guard that ends a phase is zero at the phase's own start.
+    """The multiplicity of the root that the guard which ends a phase has at the phase's own start.
 
-    Slip that sets out the other way is zero there once, after sticking twice; a gap that opens, three times. The duration zero
-    would solve their equations always, so these roots are divided out.
+    A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after lift-off a triple
+    one. A duration of zero would always solve their equations, so these roots are divided out.
     """
     before, own = modes[k - 1], modes[k]
     if own.status == Status.SLIDE and own.ending == 1:
@@ -136,7 +136,7 @@ def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
 
 
 def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of all equations of a cycle, and their derivatives in states, durations and the parameter."""
+    """Residuals of all equations of a cycle, and their derivatives by states, durations and the parameter."""
     count, size = phases.y.shape
     many = count * size
     found = _without_roots_at_start(found, phases)
@@ -168,7 +168,7 @@ def _without_roots_at_start(found: Images, phases: Phases) -> Images:
 
 
 def monodromy(found: Images) -> Float[np.ndarray, "state state"]:
-    """The derivative of the return map from the first phase's start to the next one's, by saltation at each event."""
+    """The derivative of the motion over one period, from the start of the first phase, with saltation at each event."""
     matrix = np.eye(found.y.shape[1])
     for k in range(len(found.guard)):
         with np.errstate(all="ignore"):
@@ -178,7 +178,7 @@ def monodromy(found: Images) -> Float[np.ndarray, "state state"]:
 
 
 def multipliers_of(found: Images) -> Complex[np.ndarray, " m"]:
-    """Floquet multipliers without the one of the cycle's own direction, largest first; not a number at a grazing."""
+    """Floquet multipliers without the one for a deviation along the cycle, largest first; NaN at a grazing."""
     matrix = monodromy(found)
     if not np.all(np.isfinite(matrix)):
         return np.full(len(matrix) - 1, np.nan, complex)

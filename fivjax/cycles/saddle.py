@@ -1,9 +1,9 @@
 """The unstable cycle on the boundary between sliding and squeal: edge tracking, then Newton's method.
 
-Between a state that slides in the end and one on a limit cycle there is one on the boundary of the two basins. A trajectory
-that starts next to it stays with the boundary for long before it leaves to either side, and on the boundary it comes to
-what attracts there: a saddle cycle, with one multiplier outside the unit circle. What two neighbours on either side pass
-while they are together tells where it is.
+On the line between a state that returns to sliding and one on a limit cycle there is a state on the boundary of the two basins.
+A trajectory that starts very close to it stays close to the boundary for long before it leaves to either side. It approaches
+the attractor within the boundary: a saddle cycle, with one multiplier outside the unit circle. Two neighbouring trajectories on
+either side of the boundary pass near that cycle while they are close together, which gives Newton's method its first guess.
 """
 
 import jax
@@ -20,12 +20,12 @@ from .search import MOST_CROSSINGS, NoLimitCycle, limit_cycle, states_in_contact
 from .section_map import points_along
 from .torus import POINTS, SIDE_BY_SIDE
 
-# Looks (of `POINTS` points of the section each) at a trajectory before it is taken for one that stays on the boundary.
+# A trajectory that is undecided after so many times `POINTS` points of the section counts as one that stays away from sliding.
 MOST_LOOKS = 60
-# Neighbours on the boundary are apart once they differ by this share of their size; then the search begins anew between them.
+# Neighbours have separated once they differ by this share of their size; then the search begins anew between them.
 APART = 1e-4
 ROUNDS = 24
-# A trajectory has come to a cycle, or is back at sliding, when it is this close, relative to the cycle.
+# A trajectory has reached the cycle when it is this close to it, relative to the cycle's size.
 CAPTURED = 1e-2
 FADED = 1e-2
 
@@ -39,7 +39,7 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
 
     **Returns:** a `LimitCycle` with exactly one multiplier outside the unit circle.
 
-    **Raises:** `NoLimitCycle` (a `ValueError`) where there is no limit cycle, or where what attracts on the boundary is not
+    **Raises:** `NoLimitCycle` (a `ValueError`) if there is no limit cycle, or if the attractor within the boundary is not
     periodic; `ValueError` for a scene without sliding equilibrium or beyond Painlevé's limit.
 
     **Example:**
@@ -91,7 +91,7 @@ class _Fates:
             shrinking = sizes[:, -1] < 0.7 * sizes[:, POINTS // 2]
             slid = (quiet & shrinking) | (sizes[:, -1] < FADED * self.size)
             fate = np.where(fate >= 0, fate, np.where(slid, 0, np.where(apart < CAPTURED * self.size, 1, -1)))
-            # Sections that are no longer met: rest, which is no vibration, or a failure; neither is sliding.
+            # The section is no longer crossed: the contact sticks for good, or a failure. Neither is sliding.
             fate = np.where((fate < 0) & ~np.isfinite(sizes[:, -1]), 1, fate)
             if np.all(fate >= 0):
                 break
@@ -99,7 +99,7 @@ class _Fates:
         return np.where(fate < 0, 1, fate)
 
     def narrowed(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Two neighbours, one rounding apart, on the line between a state that slides and one that does not."""
+        """Two states that differ by rounding, on either side of the boundary, on the line between `low` and `high`."""
         a, b = 0.0, 1.0
         while True:
             shares = a + (b - a) * np.arange(1, SIDE_BY_SIDE + 1) / (SIDE_BY_SIDE + 1)
@@ -110,7 +110,7 @@ class _Fates:
                 return low + a * (high - low), low + b * (high - low)
 
     def together(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The points of the section that two neighbours pass until they are apart."""
+        """The points of the section that two neighbours pass until they separate."""
         pair = np.stack([low, high])[np.arange(SIDE_BY_SIDE) % 2]
         now = states_in_contact(self.scene, jnp.asarray(pair))
         paths = np.zeros((2, 0, pair.shape[1]))
@@ -128,7 +128,7 @@ class _Fates:
         return paths[0], paths[1]
 
     def saddle_near(self, paths: tuple[np.ndarray, np.ndarray]) -> LimitCycle | None:
-        """The saddle cycle near the place where the neighbours' path repeats best."""
+        """The saddle cycle near the point where the path of the neighbours repeats best."""
         path = self.weights * paths[0]
         sizes = np.linalg.norm(path, axis=-1)
         tried = []

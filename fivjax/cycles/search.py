@@ -1,4 +1,4 @@
-"""Searching for limit cycles: trajectories are released, and where one seems to repeat, Newton's method closes the cycle."""
+"""The search for limit cycles: trajectories are released, and where one nearly repeats, Newton's method computes the cycle."""
 
 import itertools
 from collections.abc import Sequence
@@ -22,19 +22,20 @@ from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
 from .torus import POINTS, SIDE_BY_SIDE, on_torus, torus_of
 
-# Loads that trajectories are released from, in final loads.
+# Trajectories are released from rest under these multiples of the final load.
 RELEASES = (1.2, 1.5, 2.0, 3.0, 4.5, 6.0)
-# How many looks at trajectories are taken, one after each `POINTS` points of the section.
+# How often trajectories are examined, once after each `POINTS` points of the section.
 LOOKS = 40
-# Points of the section in one period, at most, for it to be tried as a periodic motion.
+# The largest number of points of the section in one period that is tried for a periodic motion.
 MOST_CROSSINGS = 12
-# A motion that comes back to within this share of its size may be near a cycle.
+# A motion that returns to within this share of its size may be near a cycle.
 NEARLY = 0.1
-# The same cycle: their points are this close, relative to their size.
+# Two cycles are the same if their amplitudes and periods differ by less than this share.
 SAME = 1e-6
-# A motion has died out when it has no events any more and is this much smaller than the belt's motion, or has shrunk so much.
+# A motion without events has faded if its size is below this share of the smaller of two: the belt's motion, and its own size
+# at the beginning.
 FADED = 1e-6
-# Every so many looks a motion that is neither periodic nor fading is tried as a torus.
+# A motion that is neither periodic nor fading is tried as a torus each time it was examined so often.
 TORUS_AFTER = 8
 
 
@@ -59,16 +60,16 @@ class NoLimitCycle(ValueError):
 def limit_cycle(scene: Scene, start=None) -> LimitCycle:
     r"""A limit cycle of the scene under its final load.
 
-    A state on the Poincaré section (where the tangential velocity rises through zero) is sought that the return map $P$
-    leads back to itself, $P(y) = y$, by Newton's method with the exact derivative of $P$ through every contact event.
+    It is a fixed point $P(y) = y$ of the return map $P$ of the Poincaré section (where the tangential velocity rises through
+    zero), found by Newton's method with the exact derivative of $P$ through every contact event.
 
-    **Arguments:** `scene`; `start`: nothing (trajectories are released from several loads, and the first stable cycle of the
-    largest amplitude that they meet is returned), or where to begin: a `Trajectory` (its last row), a `LimitCycle` (of another
-    scene close by), or a pair of a state `(2n,)` in m and m/s and a status. From a start, an unstable cycle may be found.
+    **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
+    pair of a state `(2n,)` in m and m/s and a status. From such a start, an unstable cycle may be found, too. Without `start`,
+    trajectories are released from rest under several loads, and the stable cycle with the largest amplitude is returned.
 
     **Returns:** a `LimitCycle`.
 
-    **Raises:** `NoLimitCycle` (a `ValueError`) where none is met; `ValueError` for a scene without sliding equilibrium, or
+    **Raises:** `NoLimitCycle` (a `ValueError`) if none is found; `ValueError` for a scene without sliding equilibrium, or
     beyond Painlevé's limit.
 
     **Example:**
@@ -101,10 +102,10 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
 
 @in_double_precision
 def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
-    """All stable limit cycles that a search meets, the one with the largest amplitude first.
+    """All stable limit cycles that a search finds, the one with the largest amplitude first.
 
-    Trajectories are released at rest from several multiples of the final load, and from each of `starts` (states `(2n,)`
-    in m and m/s, or trajectories). More than one cycle may coexist; there may be others that no trajectory came to.
+    Trajectories are released from rest under several multiples of the final load, and from each of `starts` (states `(2n,)`
+    in m and m/s, or trajectories). Several cycles may coexist; there may be others that no trajectory reached.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
 
@@ -120,14 +121,14 @@ def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
 
 
 class Met(NamedTuple):
-    """An attractor that released trajectories came to, or a motion that was given up."""
+    """An attractor that released trajectories reached; or a motion that was given up, and why."""
 
     cycle: LimitCycle | None
     why: str
 
 
 def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met]:
-    """What each of several starts (leading axis) comes to: each attractor once, largest amplitude first."""
+    """The attractors that trajectories from several starts (leading axis) reach: each once, largest amplitude first."""
     many = starts.y.shape[0]
     if many > SIDE_BY_SIDE:
         parts = [
@@ -162,7 +163,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             if cycle is not None and cycle.in_family:
                 families += 1
                 continue
-            # A torus is looked for of one contact only.
+            # Tori are sought only with one contact.
             turn = look % TORUS_AFTER == TORUS_AFTER - 1 and len(scene.structure.contacts) == 1
             if cycle is None and turn and _keeps_its_size(sizes[k]):
                 cycle = torus_of(scene, stepper, here)
@@ -172,7 +173,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             keep[k] = cycle is None or not cycle.stable
         open_ = np.flatnonzero(keep)
         now = jax.tree.map(lambda leaf: leaf[:, -1], returns.point)
-        # Those that are done repeat one that is not, so that one number of trajectories is compiled.
+        # Trajectories that are done are replaced by copies of one that is not, so that only one batch size is compiled.
         if len(open_):
             filler = np.where(keep, np.arange(len(keep)), open_[0])
             now = jax.tree.map(lambda leaf, filler=filler: leaf[filler], now)
@@ -206,7 +207,7 @@ def _moves(scene: Scene, point: Point) -> bool:
 
 
 def _belt_s_motion(scene: Scene) -> float:
-    """The weighted size of the belt's motion; of several contacts that of the fastest belt."""
+    """The weighted size of the belt's motion; with several contacts that of the fastest belt."""
     tangential, _ = contact_coordinates(scene.structure)
     weights = np.asarray(scene.structure.weights)[scene.structure.size + tangential]
     return float(np.max(weights * np.abs(np.asarray(scene.belt_speed))))
@@ -214,7 +215,7 @@ def _belt_s_motion(scene: Scene) -> float:
 
 def _has_faded(scene: Scene, sizes: np.ndarray, begun: float, look: int) -> bool:
     small = sizes[-1] < FADED * min(_belt_s_motion(scene), begun)
-    # Without events the motion is the linear one, or close to it: shrinking for this long, it will not grow again.
+    # Without events the motion is linear or nearly so: if it has shrunk for this long, it will not grow again.
     return bool(small or (look > 1 and sizes[-1] < 0.5 * sizes[len(sizes) // 2] < 0.25 * sizes[0]))
 
 
@@ -224,7 +225,7 @@ def _keeps_its_size(sizes: np.ndarray) -> bool:
 
 
 def _known(scene: Scene, found: list[LimitCycle], weights: np.ndarray, points: np.ndarray) -> bool:
-    """Whether the last points lie on a cycle that is known already."""
+    """Whether the last points lie on a cycle found before."""
     for cycle in found:
         if cycle.kind == "torus":
             if on_torus(scene, cycle, weights * points):
@@ -247,7 +248,7 @@ def _among(found: list[LimitCycle], cycle: LimitCycle) -> bool:
 def _closed_near(
     scene: Scene, stepper: EventExact, point: Point, path: Float[np.ndarray, "k state"]
 ) -> LimitCycle | None:
-    """The cycle that a trajectory with these last (weighted) points of the section may be coming to."""
+    """The cycle that a trajectory with these last (weighted) points of the section may be approaching."""
     size = np.linalg.norm(path[-1])
     back = np.array([np.linalg.norm(path[-1] - path[-1 - k]) / size for k in range(1, MOST_CROSSINGS + 1)])
     if np.min(back) > NEARLY:
@@ -257,7 +258,7 @@ def _closed_near(
     if closed is None or not _moves(scene, closed.point):
         return None
     if np.linalg.norm(np.asarray(scene.structure.weights) * np.asarray(closed.point.y) - path[-1]) > 0.5 * size:
-        return None  # Newton's method went elsewhere
+        return None  # Newton's method converged to another cycle
     return limit_cycle_of(scene, stepper, closed)
 
 
@@ -298,10 +299,10 @@ def _state_of(scene: Scene, start) -> np.ndarray:
 
 
 def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
-    """A point of the section to begin at, and the numbers of crossings a period to try."""
+    """A point of the section to begin at, and the numbers of crossings per period to try."""
     status = None
     if isinstance(start, LimitCycle):
-        # Its own point need not be one of this scene's section: there an impact may fall on the other side of it.
+        # The point of the other scene's cycle need not be on this scene's section, if an impact falls on the section.
         start, status = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation, start.contact.status
     elif isinstance(start, tuple | list) and len(start) == 2:
         start, status = start

@@ -1,11 +1,11 @@
 r"""The Poincaré section's return map, exact through every contact event, with its derivative.
 
-The section is where the tangential velocity rises through zero. Over a period of any motion its mean is zero, so every
-limit cycle crosses the section, one that sticks, slips back or takes off as much as one that only slides. Where an impact
-throws the velocity over zero, the state just after the impact is the point.
+On the section the tangential velocity rises through zero. The mean of this velocity over a period is zero, so every limit cycle
+crosses the section. Where an impact makes the velocity jump over zero, the point of the section is the state just after the
+impact.
 
-States are deviations from the sliding equilibrium under the final load: a small cycle under a high load is then as exact
-as a large one.
+States are deviations from the sliding equilibrium under the final load, so that a small cycle under a high load is as exact as
+a large one.
 """
 
 import math
@@ -24,9 +24,9 @@ from ..model.scene import Scene, steady_sliding
 from ..steppers.core import Followed, Segment, Total, follow
 from ..steppers.event_exact import EventExact, for_derivatives
 
-# Segments on the way from one point of the section to the next, at most: hundreds of events in one swing.
+# The most segments from one point of the section to the next: enough for hundreds of events.
 MOST_SEGMENTS = 4096
-# The same on the way to a later one.
+# The most segments from one point of the section to a later one.
 MOST_TO_CROSSING = 64 * MOST_SEGMENTS
 
 
@@ -38,19 +38,20 @@ class Point(eqx.Module):
 
 
 class Return(NamedTuple):
-    """Where the return map leads."""
+    """The image of a point under the return map."""
 
     point: Point
-    time: Float[Array, ""]  # how long it took, s
-    events: Int[Array, ""]  # contact events on the way
-    segments: Int[Array, ""]  # segments on the way
-    arrived: Bool[Array, ""]  # whether the section was met
+    time: Float[Array, ""]  # time of return, s
+    events: Int[Array, ""]  # number of contact events in that time
+    segments: Int[Array, ""]  # number of segments in that time
+    arrived: Bool[Array, ""]  # whether the section was reached
 
 
 def mechanics_about_sliding(scene: Scene) -> Mechanics:
     """Mechanics for displacements and loads as deviations from the sliding equilibrium under the final load.
 
-    A vibration of nanometres under a load that bends the springs by metres would be lost in the rounding of totals.
+    With total displacements, a vibration of nanometres under a load that stretches the springs by metres would be lost in
+    rounding.
     """
     load = scene.load.final
     _, normal_force = steady_sliding(scene, load)
@@ -64,7 +65,7 @@ def sliding_state(scene: Scene, load: Float[Array, ""]) -> State:
 
 
 def longest_return(scene: Scene) -> Float[Array, ""]:
-    """A time (s) in which a motion that goes on has long met the section: a hundred of its slowest natural periods."""
+    """A time (s) within which any sustained motion crosses the section: a hundred of the slowest natural periods."""
     structure = scene.structure
     rates = jnp.diag(structure.stiffness) / jnp.diag(structure.mass)
     return 100 * 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
@@ -80,9 +81,10 @@ def to_crossing(
     observe: Callable[[Total, Segment], Total],
     most: int,
 ) -> tuple[Bool[Array, ""], Followed, Total]:
-    """A motion from a start to its `crossings`-th crossing of the section, or for a time `longest` (s), or `most` segments.
+    """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) or `most` segments at
+    most.
 
-    Returns whether it has crossed so often, where it has come to, and the total of what `observe` adds of each segment.
+    Returns whether it has crossed so often, the end of the motion, and the total of what `observe` adds for each segment.
     """
 
     def observe_crossings(counted, segment: Segment):
@@ -114,9 +116,9 @@ def moved(
     crossings: Int[Array, ""] | int,
     longest: Float[Array, ""],
 ) -> Return:
-    """The motion from a start to its `crossings`-th crossing of the section, or for a time `longest` (s).
+    """The motion from a start to its `crossings`-th crossing of the section, or for a time `longest` (s) if that is shorter.
 
-    Whichever comes first, and `arrived` says which. Differentiable forward.
+    `arrived` says which it was. Differentiable in forward mode.
     """
     none = jnp.zeros((), jnp.int32)
 
@@ -134,9 +136,9 @@ def moved(
 def section_return(
     stepper: EventExact, scene: Scene, mechanics: Mechanics, point: Point, crossings: Int[Array, ""] | int
 ) -> Return:
-    """From a point of the section, or any other start, to its `crossings`-th crossing.
+    """The motion from a point of the section, or any other start, to its `crossings`-th crossing.
 
-    Not a number where the section is not met within `longest_return` for each crossing.
+    NaN where the section is not crossed within `longest_return` for each crossing.
     """
     found = moved(stepper, mechanics, point, crossings, longest_return(scene) * crossings)
     y = jnp.where(found.arrived, found.point.y, jnp.nan)
@@ -146,7 +148,7 @@ def section_return(
 def return_with_jacobian(
     scene: Scene, stepper: EventExact, point: Point, crossings: int
 ) -> tuple[Return, Float[np.ndarray, "state state"]]:
-    """The return map at a point, and its derivative: saltation at each event and at the section included."""
+    """The return map at a point, and its derivative, with saltation at each event and at the section."""
     found, jacobian = _moved_with_jacobian(
         scene, stepper, point, jnp.asarray(crossings, jnp.int32), jnp.asarray(jnp.inf, jnp.float64)
     )
@@ -156,8 +158,8 @@ def return_with_jacobian(
 def flow_with_jacobian(
     scene: Scene, stepper: EventExact, start: Point, time: float
 ) -> tuple[Point, Float[np.ndarray, "state state"]]:
-    """Where the motion is after a time (s), and its derivative in the start at that fixed time."""
-    # The same program as the return map's, with crossings that are never reached.
+    """The state after a given time (s), and its derivative by the start."""
+    # The program of the return map, with a number of crossings that is never reached.
     never = jnp.asarray(np.iinfo(np.int32).max, jnp.int32)
     found, jacobian = _moved_with_jacobian(scene, stepper, start, never, jnp.asarray(time, jnp.float64))
     return found.point, np.asarray(jacobian)
@@ -184,7 +186,7 @@ def _moved_with_jacobian(scene: Scene, stepper: EventExact, point: Point, crossi
 
 @compiled
 def points_along(scene: Scene, stepper: EventExact, starts: Point, count: int) -> Return:
-    """The next `count` points of the section from each of several starts (leading axis); after a failure, not a number."""
+    """The next `count` points of the section from each of several starts (leading axis); NaN after a failure."""
     mechanics = mechanics_about_sliding(scene)
 
     def to_next(point, _):

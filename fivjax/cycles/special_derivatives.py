@@ -1,9 +1,10 @@
-r"""Derivatives of where a special point lies, in all parameters of the scene, by the implicit function theorem.
+r"""Derivatives of special points of a branch in all parameters of the scene, by the implicit function theorem.
 
-A special point is a root of the cycle's equations $F(u, λ; θ) = 0$ together with one more. At a grazing that is the smallest
-value of a guard, at the vanishing of a phase its duration: one linear system. A fold has a vector $l$ with $l^T ∂F/∂u = 0$, so
-$dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit circle, $|m|(λ, θ) = 1$, and its derivatives along the
-family of cycles are differences of values that are good to rounding.
+A special point is a root of the cycle's equations $F(u, λ; θ) = 0$ together with one more equation. At a grazing it says that
+the minimum of a guard is zero, at the vanishing of a phase that its duration is zero: one linear system gives the derivatives.
+At a fold there is a vector $l$ with $l^T ∂F/∂u = 0$, so $dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit
+circle, $|m|(λ, θ) = 1$, and the derivatives of $|m|$ along the family of cycles are differences of values that are exact to
+rounding.
 """
 
 import numpy as np
@@ -15,14 +16,14 @@ from .multiple_shooting import images, moved_along, parameter_direction
 from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
 from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier
 
-# Relative change of a parameter over which multipliers are compared.
+# Relative change of a parameter for differences of multipliers.
 APART = 1e-6
 
 
 def derivatives_of_special_points(
     family: Family, points: list[Point]
 ) -> tuple[list[str], Float[np.ndarray, "point of"]]:
-    """Names of the parameters, and the derivatives for each point; not a number where there are none."""
+    """Names of the parameters, and the derivatives for each point; NaN where there are none."""
     scene = family.scene
     names = [name for name, value in scene.parameters.items() if np.ndim(value) == 0 and name != family.name]
     values = np.full((len(points), len(names)), np.nan)
@@ -74,7 +75,7 @@ def _of_stability_limit(family: Family, limit: float, name: str) -> float:
 
 
 def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray, slope: np.ndarray) -> float:
-    """By differences of the multiplier's size along the families over either parameter."""
+    """By differences of the multiplier's size along the families over both parameters."""
     curve, place = special.curve, special.place
     scene = family.at(place.parameter)
     value = float(np.asarray(scene.parameters[name]))
@@ -100,6 +101,6 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
 
 
 def _solved(curve: Curve, u: np.ndarray, like: Curve) -> Place | None:
-    # In the units of the curve that the guess was made in.
+    # Converted from the units of the curve in which the guess was made.
     values = u * like.scales
     return curve.at_parameter(values / curve.scales, values[-1])

@@ -13,9 +13,9 @@ from .pseudo_arclength import Curve, Place, multipliers_of
 
 FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
 MEETS_SLIDING = "amplitude meets the sliding equilibrium"
-# Multipliers this close to the real axis are real.
+# Multipliers this close to the real axis count as real.
 REAL = 1e-9
-# A branch that runs at one value of the parameter, to rounding, has no folds: cycles of a linear motion at its stability limit.
+# A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability limit.
 LEVEL = 1e-8
 
 
@@ -25,18 +25,18 @@ class Special(NamedTuple):
     name: str
     curve: Curve
     place: Place
-    # The equation that it adds to the cycle's: a row in the unknowns; none for a fold, which adds none.
+    # The linearised equation that it adds to those of the cycle; None for a fold, which adds none.
     row: Float[np.ndarray, " m"] | None = None
     grazing: Grazing | None = None
     multiplier: complex | None = None
 
 
 class Change(NamedTuple):
-    """How one sequence of modes becomes another with fewer phases."""
+    """The change from one sequence of modes to another with fewer phases."""
 
-    phase: int  # in the longer sequence, the one that vanishes, or that two become one at
+    phase: int  # the phase of the longer sequence that vanishes, or at which two phases become one
     merges: bool  # whether its neighbours become one phase, inside which a guard then touches zero
-    word: str  # what is inserted or removed
+    word: str  # the mode or event that is inserted or removed
 
 
 # ------------------------------------------------------------------------------------------------------ smooth branches
@@ -72,12 +72,12 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
 
 
 def doubling(values: Complex[np.ndarray, " m"]) -> float:
-    """A number that changes its sign where a multiplier passes -1."""
+    """A function that changes its sign where a multiplier passes -1."""
     return float(np.prod(values + 1).real)
 
 
 def pairing(values: Complex[np.ndarray, " m"]) -> float:
-    """A number that changes its sign where a pair of conjugate multipliers passes the unit circle."""
+    """A function that changes its sign where a pair of conjugate multipliers passes the unit circle."""
     upper = values[values.imag > REAL * np.maximum(np.abs(values), REAL)]
     return float(np.prod(np.abs(upper) - 1)) if len(upper) else np.nan
 
@@ -118,7 +118,7 @@ def _root(place: Callable[[float], Place | None], test: Callable[[Place], float]
 
 
 def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | None:
-    """How the longer sequence loses phases and becomes the shorter; none if it takes more than one change."""
+    """The change that makes the longer sequence the shorter one; None if it takes more than one change."""
     longer, shorter = tuple(longer), tuple(shorter)
     count = len(longer)
 
@@ -126,7 +126,7 @@ def change_between(longer: Sequence[Mode], shorter: Sequence[Mode]) -> Change | 
         return a[:2] == b[:2]
 
     if len(shorter) == 1 and shorter[0].ending == AT_SECTION:
-        # Without any event the section stands in for one.
+        # Without any event the section takes the place of one.
         extra = [i for i in range(count) if not alike(longer[i], shorter[0])]
         return Change(extra[0], True, _inserted(longer[extra[0]])) if count == 2 and len(extra) == 1 else None
     for i in range(count):
@@ -149,7 +149,7 @@ def _inserted(mode: Mode) -> str:
 
 
 def grazing_of(curve: Curve, guess: Place, lowest: int = 4) -> Grazing | None:
-    """The cycle next to a guess on which a guard touches zero: the nearest such guard's."""
+    """The cycle near a guess on which a guard touches zero: the nearest one of those found."""
     for touch in sorted(touches(curve, guess), key=lambda touch: abs(touch.value))[:lowest]:
         found = grazing_near(curve, guess, touch)
         if found is not None:
@@ -158,7 +158,7 @@ def grazing_of(curve: Curve, guess: Place, lowest: int = 4) -> Grazing | None:
 
 
 def vanishing(curve: Curve, guess: Place, phase: int) -> Special | None:
-    """The cycle next to a guess on which a phase has shrunk to nothing."""
+    """The cycle near a guess on which the duration of a phase is zero."""
     u, normal = guess.u.copy(), np.zeros_like(guess.u)
     place_of = len(curve.of_state) + phase
     u[place_of], normal[place_of] = 0.0, 1.0
@@ -167,7 +167,7 @@ def vanishing(curve: Curve, guess: Place, phase: int) -> Special | None:
 
 
 def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> str:
-    """What to call a change of the modes."""
+    """The name of a change of the modes."""
     what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}"
     if grazing is None:
         return what or "contact modes change"
@@ -177,7 +177,7 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
 
 
 def without(phases: Phases, change: Change, shorter: Sequence[Mode]) -> Phases | None:
-    """The phases with the vanishing one taken out."""
+    """The phases without the vanishing one."""
     count, i = len(phases.modes), change.phase
     y, h = phases.y, phases.h
     if len(shorter) == 1 and shorter[0].ending == AT_SECTION:

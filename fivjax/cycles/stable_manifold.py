@@ -1,15 +1,15 @@
 r"""The kick after which a motion neither returns to sliding nor comes to the limit cycle, and its derivatives.
 
-The motion after the critical kick stays on the border between the two, and comes to what attracts there: a saddle cycle $x_s$
-of the section's return map, with one multiplier $Λ$ outside the unit circle. With $l$ its left eigenvector, and $x_N$ the
-$N$-th crossing of the section after a kick $p$,
+The motion after the critical kick stays on the boundary between the two basins and approaches the attractor within it: a saddle
+cycle $x_s$ of the section's return map, with one multiplier $Λ$ outside the unit circle. With $l$ its left eigenvector, and
+$x_N$ the $N$-th crossing of the section after a kick $p$,
 
 $$ F_N(p, θ) = l^T (x_N(p, θ) - x_s(θ)) = 0 $$
 
-is the critical kick, ever more exactly as $N$ grows: what is left out is of second order in the distance, and its effect on
-$p$ shrinks with $1 / F_N'$. One trajectory gives $F_N$ and its derivative in $p$ for every $N$; Newton's method takes the $N$
-that is best. At the root $dp/dθ = -F_{N,θ} / F_{N,p}$, where the derivative of the trajectory runs through every event on the
-way from the kick to the saddle, and $l^T x_{s,θ} = l^T P_θ / (1 - Λ)$.
+gives the critical kick, more exactly the larger $N$ is: the terms left out are of second order in the distance, and their
+effect on $p$ falls like $1 / F_N'$. One trajectory gives $F_N$ and its derivative by $p$ for every $N$; Newton's method uses
+the $N$ with the smallest error. At the root $dp/dθ = -F_{N,θ} / F_{N,p}$, with the derivative of the trajectory through every
+event from the kick to the saddle, and $l^T x_{s,θ} = l^T P_θ / (1 - Λ)$.
 """
 
 from typing import NamedTuple
@@ -28,12 +28,12 @@ from .kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked, ret
 from .search import states_in_contact
 from .section_map import Point
 
-# Trajectories that Newton's method may take, and where it has converged, relative to p.
+# The most trajectories of Newton's method, and the relative change of p at which it has converged.
 MOST_TRAJECTORIES = 12
 EXACT = 1e-13
-# A trajectory is near the saddle within this share of the saddle's size.
+# A trajectory is near the saddle if its distance is below this share of the saddle's size.
 NEAR = 0.3
-# Points of the section in one period of a saddle, at most, and places that are tried.
+# The most points of the section in one period of a saddle, and the number of first guesses tried.
 MOST_POINTS, TRIED = 6, 8
 
 
@@ -42,12 +42,12 @@ class Critical(NamedTuple):
 
     p: float
     d_p: dict[str, float]  # by parameter
-    trajectories: int  # that Newton's method took
+    trajectories: int  # number that Newton's method took
     saddle: Closed
 
 
 class Saddle(NamedTuple):
-    """A saddle cycle with what Newton's method wants of it."""
+    """A saddle cycle with the multiplier and eigenvector that Newton's method needs."""
 
     closed: Closed
     multiplier: float
@@ -68,7 +68,7 @@ def saddle_of(closed: Closed, weights: Float[np.ndarray, " state"]) -> Saddle | 
 
 
 def saddle_passed(scene: Scene, stepper: EventExact, path: Crossings) -> Saddle | None:
-    """The saddle cycle that a trajectory passes: near where it repeats best."""
+    """The saddle cycle that a trajectory passes, near the point where it repeats best."""
     weights = np.asarray(scene.structure.weights)
     y = weights * path.y[: path.count]
     sizes = np.linalg.norm(y, axis=-1)
@@ -77,7 +77,7 @@ def saddle_passed(scene: Scene, stepper: EventExact, path: Crossings) -> Saddle 
         if len(y) <= count + 1:
             continue
         back = np.linalg.norm(y[count:] - y[:-count], axis=-1) / sizes[:-count]
-        # Pure sliding that fades repeats well, too.
+        # Returns without events do not count: sliding that fades slowly repeats well, too.
         back = np.where(path.events[count : path.count] > path.events[: path.count - count], back, np.inf)
         lowest = (back[1:-1] <= back[:-2]) & (back[1:-1] <= back[2:])
         places = np.flatnonzero(lowest) + 1
@@ -96,7 +96,7 @@ def saddle_passed(scene: Scene, stepper: EventExact, path: Crossings) -> Saddle 
 
 
 class Approach(NamedTuple):
-    """What a trajectory tells at each of its crossings near the saddle."""
+    """$F_N$ and its derivative at each crossing of a trajectory near the saddle."""
 
     place: np.ndarray
     distance: np.ndarray  # from the saddle, relative to its size
@@ -110,7 +110,7 @@ def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state
     away = weights * path.y[: path.count] - target
     distance = np.linalg.norm(away, axis=-1) / np.linalg.norm(target)
     status = path.status[: path.count] == int(saddle.closed.point.contact.status)
-    # Up to where it is closest: what comes later has left, and may have come back another way.
+    # Up to the closest crossing: later the trajectory leaves, and may return on another way.
     closest = int(np.argmin(np.where(status, distance, np.inf)))
     place = np.flatnonzero((distance < NEAR) & status & (np.arange(path.count) <= closest))
     slopes = (weights * path.y_parameter[which, : path.count]) @ saddle.left
@@ -121,7 +121,7 @@ def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state
 def critical_kick(
     scene: Scene, bracket: tuple[float, float], names: tuple[str, ...], saddle: Saddle | None = None
 ) -> Critical | None:
-    """The critical kick inside a bracket by Newton's method, with its derivatives; none where no saddle is passed.
+    """The critical kick inside a bracket by Newton's method, with its derivatives; None if no saddle is passed.
 
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters;
     `saddle`, if it is known.
@@ -129,7 +129,7 @@ def critical_kick(
     stepper, weights = EventExact(), np.asarray(scene.structure.weights)
     low, high = bracket
     along_p = directions_of(scene, ("p",))
-    # From the side that slides: all that repeats on the way there, with events, is the saddle.
+    # From the side that slides: there only the saddle makes a motion with events repeat.
     p, best, crossings = low, np.inf, MOST_CROSSINGS
     for taken in range(1, MOST_TRAJECTORIES + 1):
         path = kicked(scene.replace(p=p), stepper, along_p, crossings, rough=True)
@@ -150,7 +150,7 @@ def critical_kick(
         if abs(step) <= EXACT * p or (best < 1e-11 * p and abs(step) >= 0.5 * best):
             slopes = _derivatives(scene.replace(p=p), stepper, names, saddle, weights, int(near.place[-1]) + 1)
             return Critical(p, slopes, taken, saddle.closed)
-        # The next one stays longer, but not twice as long.
+        # The next trajectory stays near the saddle for longer, but not twice as long.
         crossings = min(2 * int(near.place[-1]) + 32, MOST_CROSSINGS)
         p, best = p + step, abs(step)
     return None
@@ -165,7 +165,7 @@ def _derivatives(
     crossings: int,
 ) -> dict[str, float]:
     every = ("p", *names)
-    # One number of directions, so that one program is compiled.
+    # Padded to a fixed number of directions, so that one program is compiled.
     filled = every + ("p",) * (-len(every) % 16)
     directions = directions_of(scene, filled)
     path = kicked(scene, stepper, directions, crossings)
@@ -178,8 +178,8 @@ def _derivatives(
     value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
     found = {name: float(-value[k] / value[0]) for k, name in enumerate(every) if name != "p"}
     if float(np.asarray(scene.restitution)) == 0 and "restitution" in found:
-        # The least rebound is a flight that the derivative of no rebound does not see. What the impact then presses more, the
-        # flight and the next impact press less: to first order nothing changes.
+        # At restitution 0 the derivative misses the short flight after a small rebound. The additional impulse of the impact is
+        # what the forces during the flight and the next impact lack, so to first order nothing changes.
         found["restitution"] = 0.0
     return found
 
@@ -188,7 +188,7 @@ def _derivatives(
 def manifold_normal(
     scene: Scene, y: Float[np.ndarray, " state"], saddle: Saddle | None = None
 ) -> tuple[Float[np.ndarray, " state"], Saddle] | None:
-    """The normal of the stable manifold at a state close to it, and the saddle it belongs to; none where no saddle is passed.
+    """The normal of the stable manifold at a state close to it, and the saddle it belongs to; None if no saddle is passed.
 
     **Arguments:** `scene`; `y`, a deviation from the sliding equilibrium under the final load; `saddle`, if it is known.
     """

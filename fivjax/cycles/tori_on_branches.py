@@ -1,4 +1,4 @@
-"""What a branch's cycles become where a pair of multipliers has left the unit circle: tori, and cycles that they lock to."""
+"""Attractors where a pair of multipliers of a branch's cycles has left the unit circle: tori, and cycles locked on them."""
 
 from typing import TYPE_CHECKING
 
@@ -16,27 +16,27 @@ from .search import attractors_met, states_in_contact
 if TYPE_CHECKING:
     import xarray as xr
 
-# How far from the cycle motions are released, relative to it: a motion on either side of a small torus, and one far out.
+# Relative distances from the cycle at which motions are released: inside and outside of a small torus.
 RELEASED = (1e-3, -1e-3, 0.02, -0.02)
 KINDS = ("torus", "locked", "another cycle", "none")
 
 
 @in_double_precision
 def tori_along(branch: "xr.Dataset", points: int = 12) -> "xr.Dataset":
-    """What attracts beside the cycles of a branch that a pair of multipliers has made unstable.
+    """The attractors beside the cycles of a branch that a pair of multipliers has made unstable.
 
         tori = fj.tori_along(fj.continue_cycle(scene, "mu", (0.02, 0.3)))
 
-    Between a Neimark–Sacker point and where its pair comes back, or the cycle has other modes of instability, motions are
-    released beside some of the cycles, and followed to what attracts them.
+    Where exactly one complex pair of multipliers lies outside the unit circle, beyond a Neimark–Sacker bifurcation, motions are
+    released beside some of the cycles and followed to their attractor.
 
-    **Arguments:** `branch`, from `continue_cycle`; `points`, at most so many of its points.
+    **Arguments:** `branch`, from `continue_cycle`; `points`, the largest number of its points that are examined.
 
-    **Returns:** a dataset over `point`: `place` on the branch, `parameter`, `kind` ("torus"; "locked", a cycle that closes
-    after more crossings of the section; "another cycle"; "none", where nothing was met), `amplitude` (peak tangential speed,
-    m/s) and `rotation_number` of a torus (turns per return, without its sense).
+    **Returns:** a dataset over `point`: `place` (the index on the branch), `parameter`, `kind` ("torus"; "locked", a cycle that
+    closes after more crossings of the section; "another cycle"; "none", if no attractor was found), `amplitude` (peak
+    tangential speed, m/s) and `rotation_number` of a torus (turns per return, without sign).
 
-    **Raises:** `ValueError` for what is no branch.
+    **Raises:** `ValueError` for an object that is no branch.
 
     **Example:**
 
@@ -83,14 +83,14 @@ def tori_along(branch: "xr.Dataset", points: int = 12) -> "xr.Dataset":
 
 
 def _turning(multipliers: np.ndarray, special: np.ndarray) -> np.ndarray:
-    """Points whose cycles one complex pair of multipliers, and nothing else, makes unstable."""
+    """Points with exactly one complex pair of multipliers outside the unit circle."""
     outside = np.abs(multipliers) > 1 + 1e-6
     complex_ = np.abs(multipliers.imag) > 1e-9
     return np.flatnonzero((outside.sum(axis=1) == 2) & ((outside & complex_).sum(axis=1) == 2) & (special == ""))
 
 
 def _attractor(cycle: LimitCycle) -> LimitCycle | None:
-    """What attracts motions that are released beside a cycle; a torus before a cycle."""
+    """The attractor of motions that are released beside a cycle; a torus rather than a cycle."""
     states = np.stack([(1 + by) * cycle.deviation for by in RELEASED])
     met = attractors_met(cycle.scene, EventExact(), states_in_contact(cycle.scene, jnp.asarray(states)))
     found = [one.cycle for one in met if one.cycle is not None]

@@ -1,23 +1,24 @@
-r"""Tori: motions that beat for ever, as closed curves of the section that the return map turns.
+r"""Tori: quasi-periodic motions, as closed curves on the section that the return map leaves invariant.
 
-Where a limit cycle has lost its stability in a Neimark–Sacker bifurcation, the points of the section wind around a curve that
-the return map leads into itself, and never repeat. With $ρ$ turns a return, the $j$-th point lies at the phase $jρ$ (modulo
-1), and in the order of their phases the points of one long trajectory trace the curve. Where an impact falls on the section
-the curve is in several pieces, and where the sequence of contact events changes along it, it has kinks, with images that fade
-under the map; so it is kept as points, not as a Fourier series. Between them it is smooth: left out, half of the points lie on
-cubics through their neighbours to some 1e-9 of the curve's size, and the closer, by the fourth power, the more there are.
+Where a limit cycle has lost its stability in a Neimark–Sacker bifurcation, the points of the section wind around an invariant
+curve of the return map and never repeat. With a rotation number of $ρ$ turns per return, the $j$-th point lies at the phase
+$jρ$ (modulo 1), and the points of one long trajectory, in the order of their phases, trace the curve. Where an impact falls on
+the section the curve is in several pieces, and where the sequence of contact events changes along it, it has kinks, whose
+images under the map become weaker. So it is kept as points, not as a Fourier series. Between kinks it is smooth: the median
+distance of points from cubics through their neighbours is some 1e-9 of the curve's size, and falls with the fourth power of
+their number.
 
 A torus is accepted when
 
-- its points wind around the curve many times, and do not drift: early and late ones have the same mean, to a small share of
-  the curve's extent, as the averages of a motion on a torus have and those of a slow transient have not;
-- its curve is smooth in the order of the phases: neighbours lie close together, but for few jumps;
-- the largest Lyapunov exponent of the return map is zero, to what so many returns can tell: not positive (chaos), and the
-  second is negative: deviations from the curve contract;
-- trajectories that start in a tube about the curve are back in half the tube some returns later. A motion that fades slowly,
-  or passes the ghost of a vanished cycle, fails that: next to it nothing comes back.
+- its points wind around the curve many times without drift: early and late points have the same mean, to a small share of the
+  curve's extent, unlike those of a slow transient;
+- its curve is smooth in the order of the phases: neighbours lie close together, except at a few jumps;
+- the largest Lyapunov exponent of the return map is zero, as far as so many returns can tell: a positive one would be chaos.
+  The second exponent is negative: deviations from the curve contract;
+- trajectories that start in a tube about the curve return into half of the tube. A motion that fades slowly, or passes the
+  ghost of a vanished cycle, fails this test, because its neighbours do not return to it.
 
-What meets none of this is no limit cycle.
+A motion that fails one of these tests is no torus.
 """
 
 from typing import NamedTuple
@@ -34,38 +35,39 @@ from .around import seen_around, word
 from .cycle import LimitCycle, under_final_load
 from .section_map import Point, points_along, return_with_jacobian, sliding_state
 
-# Trajectories side by side and points of the section at a time, in a search, too: one program is compiled for all.
+# Trajectories in a batch, and points of the section followed at a time; the same as in searches, so that one program serves
+# both.
 SIDE_BY_SIDE, POINTS = 8, 96
 # Points of the curve, in multiples of `POINTS`.
 CHUNKS = 24
-# Returns over which Lyapunov exponents are taken.
+# Number of returns over which Lyapunov exponents are computed.
 EXPONENT_RETURNS = 384
-# The largest exponent counts as zero, and the second as negative, beyond this (per return).
+# The largest exponent counts as zero up to this size, and the second as negative below minus this (per return).
 ZERO = 0.01
-# Neighbours on the curve are farther apart than this share of its size at jumps only, and of jumps there are few.
+# Neighbours on the curve are closer than this share of its size, except at jumps; and the largest number of jumps.
 JUMP, MOST_JUMPS = 0.05, 12
-# The points wind around the curve at least so often, and the means of the first and the last third of them differ by less than
-# this share of their extent.
+# The least number of turns around the curve; and the largest difference between the means of the first and the last third of
+# the points, as a share of their extent.
 LEAST_TURNS = 20
 DRIFT = 0.05
-# The tube's radius, relative to the size of the points, or to the extent of the curve if that is small; starts in it.
+# The radius of the tube, relative to the size of the points, or to the extent of the curve if that is small.
 TUBE, TUBE_OF_EXTENT = 0.02, 0.2
 TUBE_STARTS = 64
-# They have to be back, for the last returns of a look, within so many looks of `POINTS` returns.
+# Starts have to be back for the last `HOME` of `POINTS` returns, within `TUBE_LOOKS` times as many.
 HOME, TUBE_LOOKS = 16, 4
 
 
 class Curve(NamedTuple):
-    """A closed curve of the section."""
+    """A closed curve on the section."""
 
     points: Float[np.ndarray, "k state"]  # in the order of their phases, deviations from sliding
     rotation: float  # turns per return
     jumps: int
-    residual: float  # the median distance of a point from the curve through the others, relative to its size
+    residual: float  # the median distance of a point from the curve through the others, relative to the curve's size
 
 
 def torus_of(scene: Scene, stepper: EventExact, point: Point) -> LimitCycle | None:
-    """The torus that a trajectory at this point of the section has come to; none if it is none."""
+    """The torus that a trajectory at this point of the section has reached; None if it is no torus."""
     orbit = _orbit(scene, stepper, point)
     if orbit is None:
         return None
@@ -119,7 +121,7 @@ def _orbit(scene: Scene, stepper: EventExact, point: Point):
 
 
 def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k state"]) -> Curve | None:
-    """The curve through the points of one trajectory, if its points lie on one."""
+    """The curve through the points of one trajectory; None if they do not lie on one."""
     weighted = weights * returns
     size = np.mean(np.linalg.norm(weighted, axis=-1))
     rotation = _rotation(weighted)
@@ -135,9 +137,10 @@ def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k state"]) -> Curve 
 
 
 def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]:
-    """How far each second point of a closed path lies from the cubic through the two others on either side of it.
+    """The distance of each second point of a closed path from the cubic through the two others on either side of it.
 
-    The cubic's argument is the way along the chord between the nearest two: phases need not be known. Infinite at a jump.
+    The argument of the cubic is the distance along the chord between the nearest two, so phases need not be known. Infinite at
+    a jump.
     """
     left_out = np.arange(1, len(path) - len(path) % 2, 2)
     others = path[(left_out[:, None] + np.array([-3, -1, 1, 3])) % len(path)]
@@ -153,12 +156,12 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
 
 
 def _extent(weighted: Float[np.ndarray, "k state"]) -> float:
-    """How far points lie from their middle, in the root mean square."""
+    """The root mean square distance of points from their mean."""
     return float(np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1))))
 
 
 def _drifts(weighted: Float[np.ndarray, "k state"]) -> bool:
-    """Whether the points move on in the mean: on a torus they go round and round."""
+    """Whether the mean of the points changes with time, which it does not on a torus."""
     third = len(weighted) // 3
     x = (np.arange(third) + 0.5) / third
     bump = np.exp(-1.0 / (x * (1 - x)))[:, None]
@@ -167,19 +170,19 @@ def _drifts(weighted: Float[np.ndarray, "k state"]) -> bool:
 
 
 def tube_radius(weighted: Float[np.ndarray, "k state"]) -> float:
-    """The radius of the tube about a curve through these points."""
+    """The radius of the tube about a curve through these weighted points."""
     size = float(np.mean(np.linalg.norm(weighted, axis=-1)))
     return min(TUBE * size, TUBE_OF_EXTENT * _extent(weighted))
 
 
 def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
-    """Turns per return: a guess from the angle about the middle, then where the points in order make the shortest path."""
+    """Turns per return: first from the angle about the mean, then so that the points in their order have the shortest path."""
     centred = weighted - np.mean(weighted, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     plane = centred @ axes[:2].T
     angle = np.arctan2(plane[:, 1], plane[:, 0])
     turns = np.diff(np.unwrap(angle)) / (2 * np.pi)
-    # Weights that vanish smoothly at both ends average a quasi-periodic sequence far better than equal ones.
+    # Weights that vanish smoothly at both ends average a quasi-periodic sequence much better than equal weights.
     x = (np.arange(len(turns)) + 0.5) / len(turns)
     bump = np.exp(-1.0 / (x * (1 - x)))
     guess = np.sum(bump * turns) / np.sum(bump)
@@ -210,13 +213,13 @@ def lyapunov_exponents(scene: Scene, stepper: EventExact, point: Point) -> Float
         basis, upper = np.linalg.qr(moved)
         logs.append(np.log(np.maximum(np.abs(np.diag(upper)), 1e-300)))
         point = found.point
-    # The first returns turn the basis into place.
+    # The first returns are left out: the basis of deviations aligns itself in them.
     exponents = np.mean(logs[EXPONENT_RETURNS // 6 :], axis=0)
     return np.sort(exponents)[::-1][:4]
 
 
 def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
-    """Whether starts in the tube about the curve come back into half of it, and stay while they are followed."""
+    """Whether starts in the tube about the curve return into half of it and are there for the last `HOME` returns."""
     weights = np.asarray(scene.structure.weights)
     weighted = weights * curve.points
     radius = tube_radius(weighted)

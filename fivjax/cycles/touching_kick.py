@@ -1,13 +1,14 @@
-r"""A critical kick whose motion just touches another contact mode, and its derivatives.
+r"""Critical kicks of kind "grazing": the motion just touches another contact mode. And their derivatives.
 
-Where static friction exceeds kinetic friction, a contact that only just comes to rest on the belt sticks, and lets go with a
-jump of force: two kicks that differ by nothing but this touch part at once. The border between them is no saddle's manifold,
-but the kick on whose motion a guard $g$ (slip speed, normal force, gap, margin of the friction cone) just touches zero,
+Where static friction exceeds kinetic friction, a contact that only just comes to rest on the belt sticks, and the friction
+force jumps when it slips again. So two motions of which only one touches sticking separate at once. The boundary between such
+kicks is not the stable manifold of a saddle, but the kick for which a guard $g$ (slip speed, normal force, gap, margin of the
+friction cone) just touches zero,
 
 $$ g(p, t) = 0, \qquad \frac{∂g}{∂t}(p, t) = 0, $$
 
-after as many events as happen before. The motion of one contact mode goes on, smoothly, where its guard is negative, so the
-root is a simple one, and because $∂g/∂t$ is zero there, $dp/dθ = -g_θ / g_p$.
+after a given number of events. The motion in one contact mode can be continued smoothly where its guard is negative, so this is
+a simple root, and because $∂g/∂t$ is zero there, $dp/dθ = -g_θ / g_p$.
 """
 
 from typing import NamedTuple
@@ -28,25 +29,25 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from .kick_response import directions_of
 from .section_map import MOST_SEGMENTS, longest_return, mechanics_about_sliding
 
-# Events that are compared, and returns' worth of time in which two kicks part, at most.
+# The most events that are compared; and the longest time in which two motions separate, in slowest periods.
 MOST_EVENTS, MOST_TIME = 1024, 20.0
-# Events are the same as long as they are no further apart than this share of the slowest period.
+# Events of two motions are the same if their times differ by no more than this share of the slowest period.
 TOGETHER = 1e-2
 MOST_ITERATIONS = 20
-# Newton's method has converged: relative to p, and to the slowest period.
+# Newton's method has converged if its steps are below these, relative to p and to the slowest period.
 EXACT_P, EXACT_T = 1e-13, 1e-8
-# Touches that are tried, and how far below one another is looked for, relative to p.
+# The most touches that are tried; and how far below one the next is sought, relative to p.
 MOST_TOUCHES, JUST_BELOW = 8, 1e-11
 
 
 class GrazingKick(NamedTuple):
-    """A critical kick that just touches."""
+    """A critical kick of kind "grazing"."""
 
     p: float
     d_p: dict[str, float]  # by parameter
-    trajectories: int  # that Newton's method took
-    time: float  # of touching, s after the kick began
-    events: int  # contact events before
+    trajectories: int  # number that Newton's method took
+    time: float  # of the touch, s after the kick began
+    events: int  # number of contact events before the touch
 
 
 class _Events(NamedTuple):
@@ -58,13 +59,13 @@ class _Events(NamedTuple):
 
 @in_double_precision
 def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, ...]) -> GrazingKick | None:
-    """The kick inside a bracket on whose motion a guard touches zero, where that is what parts its two ends; else none.
+    """The kick inside a bracket for which a guard touches zero, if this separates the motions at both ends; else None.
 
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters.
     """
     stepper, (low, high) = EventExact(), bracket
     period = float(longest_return(scene)) / 100
-    # One number of directions, so that one program is compiled.
+    # Padded to a fixed number of directions, so that one program is compiled.
     directions = directions_of(scene, ("p", *names) + ("p",) * (-(len(names) + 1) % 16))
 
     def events(p: float) -> _Events:
@@ -78,7 +79,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         found = _touched(scene, stepper, directions, names, (low, high), parting, period)
         if found is None:
             return None
-        # Another swing may reach further, and touch already at a smaller kick.
+        # Another oscillation may come closer and touch already at a smaller kick.
         high = found.p * (1 - JUST_BELOW)
         above = events(high)
     return None
@@ -93,7 +94,7 @@ def _touched(
     parting: tuple[int, float, int],
     period: float,
 ) -> GrazingKick | None:
-    """Newton's method in the kick and the time of touching."""
+    """Newton's method in the kick and the time of the touch."""
     (place, time, guard), (low, high) = parting, bracket
     p, apart, width = high, 1e-4 * period, high - low
     for taken in range(1, MOST_ITERATIONS + 1):
@@ -115,7 +116,7 @@ def _touched(
 
 
 def _parting(a: _Events, b: _Events, together: float) -> tuple[int, float, int] | None:
-    """The first event that only one of two motions has: how many came before, its time and its guard."""
+    """The first event that only one of two motions has: the number of events before it, its time and its guard."""
     for k in range(min(MOST_EVENTS, max(int(a.count), int(b.count)))):
         in_a, in_b = k < a.count, k < b.count
         if in_a and in_b and abs(a.time[k] - b.time[k]) <= together:
@@ -171,7 +172,9 @@ def _events(scene: Scene, stepper: EventExact) -> _Events:
 
 
 def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, events: int, guard: int):
-    """A guard at a time after so many events, its derivative in time, and those along directions in the parameters."""
+    """A guard at a time after `events` events, its time derivative, and the derivatives of both along directions of the
+    parameters.
+    """
     found = _guard_with_derivatives(
         scene, stepper, directions, jnp.asarray(time), jnp.asarray(events, jnp.int32), jnp.asarray(guard, jnp.int32)
     )
@@ -201,7 +204,7 @@ def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene
                 most=64 * MOST_SEGMENTS,
                 kind="lax",
             )
-            # The last event is behind: on in this mode, whatever its guards say.
+            # After the last event the motion goes on in this mode, regardless of its guards.
             y = short.in_one_mode(mechanics, after.contact, after.y, after.left, load)
             contact, happened = after.contact, after.total
         guards = physics.guards(mechanics, contact, jnp.where(time < duration, more, none), y)

@@ -1,4 +1,4 @@
-"""What the motion that starts on a computed cycle does really: its modes, its peak and its point on the section."""
+"""The real motion that starts on a computed cycle: its modes, its peak and its point on the section."""
 
 from typing import NamedTuple
 
@@ -13,16 +13,16 @@ from .around import Seen, seen_around
 from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around, same_modes
 from .section_map import Point, return_with_jacobian
 
-# Crossings of the section in one period, at most.
+# The most crossings of the section in one period.
 MOST_CROSSINGS = 24
-# A motion is back where it started within this share of its size, or it is not the cycle.
+# A motion on the cycle returns to its start within this share of its size.
 BACK = 1e-6
 
 
 class Real(NamedTuple):
     """One period of the motion that starts on a computed cycle."""
 
-    start: Point  # where it was looked at from, in the middle of the longest phase
+    start: Point  # its first state, in the middle of the longest phase
     seen: Seen
     phases: Phases | None
 
@@ -32,11 +32,11 @@ class Real(NamedTuple):
 
 
 def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | None:
-    """One period of the real motion from a cycle; none where what was computed runs backwards in time."""
-    # A phase that is just vanishing, on a special point, lasts as long as rounding says.
+    """One period of the real motion from a computed cycle; None if a computed phase has a negative duration."""
+    # At a special point the duration of a vanishing phase is zero up to rounding.
     if not (np.all(np.isfinite(phases.y)) and np.all(phases.h > -1e-9 * phases.period)):
         return None
-    # From the middle of a phase no event is near, so that none is met twice or not at all.
+    # Started in the middle of a phase, far from events, so that none is met twice or missed.
     longest = int(np.argmax(np.where([mode.status == Status.STICK for mode in phases.modes], 0.0, phases.h)))
     status, direction, ending = phases.modes[longest]
     states = phases.y if ending == AT_SECTION else inside(scene, stepper, phases).states[:, LOOKS // 2]
@@ -49,7 +49,7 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | Non
 
 
 def on_section(scene: Scene, stepper: EventExact, real: Real) -> Point | None:
-    """Where a motion crosses the section first; none if it does not."""
+    """The first crossing of the section; None if there is none."""
     if float(real.start.y[scene.structure.size + scene.structure.tangential]) == 0.0:
         return real.start
     found, _ = return_with_jacobian(scene, stepper, real.start, 1)
@@ -57,7 +57,7 @@ def on_section(scene: Scene, stepper: EventExact, real: Real) -> Point | None:
 
 
 def crossings_of(scene: Scene, stepper: EventExact, point: Point, weights: Float[np.ndarray, " state"]) -> int | None:
-    """How often a cycle crosses the section until it is back at a point of it; none if it does not come back."""
+    """How often a cycle crosses the section until it returns to the given point; None if it does not return."""
     y = weights * np.asarray(point.y)
     now = point
     for count in range(1, MOST_CROSSINGS + 1):
