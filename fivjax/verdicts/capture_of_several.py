@@ -1,7 +1,7 @@
-"""What the proof of a limit cycle asks of several contacts: the directions that section and contact mode leave free.
+"""The proof of a limit cycle for several contacts: the directions that section and contact modes leave free.
 
-With one contact these are coordinates. The section of several is a sum of velocities, so that the free directions are a
-subspace: here a basis of it, orthonormal in weighted coordinates, takes the coordinates' place.
+With one contact these are coordinates. With several, the section is a weighted sum of velocities, and the free directions are a
+subspace; a basis of it, orthonormal in weighted coordinates, takes the place of the coordinates.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ def free_directions(
 ) -> Float[np.ndarray, "state f"]:
     """Orthonormal weighted directions in which the section and the contact modes leave the state free.
 
-    `section` is the row of velocities that is zero on it (`steppers.section`).
+    `section` has the weights of the velocities whose sum is zero on the section (`steppers.section`).
     """
     n = len(section)
     closed, sticking = normal[status != Status.DETACH], tangential[status == Status.STICK]
@@ -38,9 +38,9 @@ def trial_of_several(
     weights: Float[np.ndarray, " state"],
     basis: Float[np.ndarray, "state f"],
 ) -> Trial | None:
-    """`capture.trial` with a `basis` of free directions; none where the cycle is not stable by a margin.
+    """`capture.trial` with a `basis` of free directions; None if the cycle is not stable by a margin.
 
-    Two oscillators that vibrate and do not feel each other have a multiplier of 1 for the shift between them: none.
+    Uncoupled oscillators have a second multiplier of 1, for a shift in time between them, so there is no check to make.
     """
     found = adapted_norm(basis.T @ (weights[:, None] * jacobian / weights) @ basis)
     size = float(np.linalg.norm(weights * centre))

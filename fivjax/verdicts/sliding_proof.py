@@ -1,12 +1,12 @@
 r"""The proof that sliding is reached: no contact event can happen again.
 
 While the contact slides and the load no longer changes, the deviation $z$ from the sliding equilibrium obeys
-$\dot z = A z$ (plus a remainder, for friction that depends on speed). Sliding ends when the pressing force or the slip
-speed runs out. Both are affine in $z$, so the proof is a bound on two signals $\sum_k a_k e^{λ_k t}$ over all the
-future. A quiet interval proves nothing: close to the stability limit two modes are almost parallel, and the answer to a
+$\dot z = A z$ (plus a remainder, for friction that depends on slip speed). Sliding ends when the normal force or the slip
+speed reaches zero. Both are affine in $z$, so the proof is a bound on two sums $\sum_k a_k e^{λ_k t}$ over the whole
+future. A quiet interval proves nothing: close to the stability limit two modes are almost parallel, and the response to a
 kick grows for a second before it decays.
 
-- Constant friction: the exact envelope of the sum, the slow beat of the modes included (`envelope_peak`).
+- Constant friction: a bound on the sum that includes the slow beat of the modes (`envelope_peak`).
 - Speed-dependent friction: the linear motion with a bound on the remainder (`decays_nonlinearly`).
 """
 
@@ -22,21 +22,21 @@ from ..model.sliding import sliding_states
 
 ENVELOPE_DECADES = 12.0
 ENVELOPE_INSTANTS = 161
-# Modes this close, relative to the fastest, are near-parallel or may become so.
+# Modes whose eigenvalues are this close, relative to the largest, are bounded together, because they may be nearly parallel.
 CLOSE = 0.2
-# States are computed from modal coordinates only where no more than so many of their digits are lost.
+# States are computed from modal coordinates only where the condition number of the modes is below this.
 WELL_CONDITIONED = 1e5
 
 
 class SlidingModes(eqx.Module):
-    """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper one is kept, counted twice."""
+    """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper mode is kept, counted twice."""
 
     linear: LinearSliding
     eigenvalues: Complex[Array | np.ndarray, "*groups k"]  # 1/s
     to_modal: Complex[Array | np.ndarray, "*groups k m"]  # rows of V⁻¹
     from_modal: Complex[Array | np.ndarray, "*groups m k"]  # z is the real part of this times w
-    regular: Bool[Array | np.ndarray, "*groups"]  # V is far enough from singular for z to be had from w
-    # Shares of the modes in the two signals; of several contacts, in the two of each.
+    regular: Bool[Array | np.ndarray, "*groups"]  # whether V is far enough from singular to compute z from w
+    # Shares of the modes in pressing and slip; with several contacts, in those of each.
     pressing: Complex[Array | np.ndarray, "*groups_contacts k"]
     slip: Complex[Array | np.ndarray, "*groups_contacts k"]
     remainder: Complex[Array | np.ndarray, "*groups_contacts k"]
@@ -49,12 +49,12 @@ class SlidingModes(eqx.Module):
 
 
 class Envelope(eqx.Module):
-    """What `envelope_peak` wants to know of the modes, at some instants; clusters are modes that are bounded together."""
+    """Tables of the modes at some instants for `envelope_peak`; clusters are modes that are bounded together."""
 
-    growth: Complex[Array | np.ndarray, "*groups c i k"]  # of each mode relative to the mean of its cluster
-    bending: Float[Array | np.ndarray, "*groups c i k"]  # bounds on the second derivatives of that, 1/s²
+    growth: Complex[Array | np.ndarray, "*groups c i k"]  # of each mode, relative to the mean of its cluster
+    bending: Float[Array | np.ndarray, "*groups c i k"]  # bounds on the second derivatives of `growth`, 1/s²
     decay: Float[Array | np.ndarray, "*groups c interval"]  # of the cluster
-    chord: Float[Array | np.ndarray, "*groups c interval"]  # how far a unit of bending departs from the chord, s²
+    chord: Float[Array | np.ndarray, "*groups c interval"]  # largest distance from the chord per second derivative, s²
     last: Float[Array | np.ndarray, "*groups c k"]  # sizes of the modes at the last instant
     members: Float[Array | np.ndarray, "*groups c k"]  # one for the modes of a cluster, else zero
 
@@ -62,19 +62,19 @@ class Envelope(eqx.Module):
 def sliding_modes(linear: LinearSliding) -> SlidingModes:
     """Modal coordinates of a batch of sliding motions (leading axis), by NumPy.
 
-    They are wanted once per structure and friction, not once per step, and general eigenvectors are not to be had on
+    They are needed once per structure and friction, not in each step, and eigenvectors of general matrices are not available on
     every accelerator.
     """
     linear = jax.tree.map(np.asarray, linear)
     finite = np.all(np.isfinite(linear.matrix), axis=(-2, -1))
     matrix = np.where(finite[:, None, None], linear.matrix, -np.eye(linear.matrix.shape[-1]))
     eigenvalues, vectors = np.linalg.eig(matrix)
-    # A defective matrix has no modal coordinates. Infinite ones make every bound infinite, so nothing is proved.
+    # A defective matrix has no modal coordinates. Infinite entries make every bound infinite, so nothing is proved.
     inverse = np.full(vectors.shape, np.inf, complex)
     condition = np.where(finite, np.linalg.cond(vectors), np.inf)
     regular = condition < 1e12
     inverse[regular] = np.linalg.inv(vectors[regular])
-    # Conjugate pairs: the upper half plane first, then cut off what only repeats it.
+    # Sorted so that the upper half plane comes first; the conjugates are then cut off.
     order = np.argsort(-eigenvalues.imag, axis=-1, kind="stable")
     kept = int(np.max(np.sum(eigenvalues.imag >= 0, axis=-1)))
     eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)[:, :kept]
@@ -108,7 +108,7 @@ def _slowest_period(eigenvalues: np.ndarray) -> np.ndarray:
 
 
 def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
-    """For each set of eigenvalues, in falling order of frequency, rows of ones where modes are close to each other."""
+    """For each set of eigenvalues, in falling order of frequency, clusters of close modes as rows of ones and zeros."""
     gaps = np.abs(np.diff(eigenvalues, axis=-1)) > CLOSE * np.abs(eigenvalues[:, :1])
     number = np.cumsum(np.concatenate([np.zeros((len(gaps), 1), int), gaps], axis=-1), axis=-1)
     return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
@@ -121,8 +121,10 @@ def slides_forever(
     deviation: State,
     under_final_load: Bool[Array, ""] | bool,
 ) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now, `under_final_load`, never stops sliding; from the state's
-    deviation from the equilibrium. Several contacts do so together: all slide now, and none of them ever stops.
+    """Whether a bound shows that a contact which slides now never stops sliding.
+
+    `deviation` is that of the state from the equilibrium; without `under_final_load` nothing is proved. With several contacts:
+    all of them slide now, and none ever stops.
     """
     linear = modes.linear
     z = deviation[sliding_states(deviation.shape[0] // 2, mechanics.normal)]
@@ -140,8 +142,8 @@ def slides_forever(
         signals, margins = (
             [part[i] for part in parts for i in range(len(mechanics.places))] for parts in (signals, margins)
         )
-    # The bound is dear. In a batch a loop runs only if one of the trajectories wants it: where both signals, each cluster of
-    # modes at its largest, are within their margins now.
+    # The bound is costly. As the body of a loop it is computed for a batch only if some trajectory needs it: one for which
+    # pressing and slip, with each cluster of modes at its present size, are within their margins.
     for shares, margin in zip(signals, margins, strict=True):
         sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
 
@@ -151,7 +153,7 @@ def slides_forever(
         proved = jnp.asarray(True)
         for peak, margin in zip(peaks, margins, strict=True):
             proved = proved & (peak < margin)
-        # The signals change, so that XLA cannot take what depends on them out of the loop and compute it every time.
+        # The loop changes `signals`, because XLA would move work on loop constants out of the loop and always compute it.
         return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
 
     begin = sliding, jnp.zeros_like(sliding), signals
@@ -159,7 +161,7 @@ def slides_forever(
 
 
 def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
-    """Tables for `envelope_peak`, of a batch of sets of decaying modes (leading axis), by NumPy.
+    """Tables for `envelope_peak`, for a batch of sets of decaying modes (leading axis), by NumPy.
 
     Clusters are rows of ones and zeros.
     """
@@ -167,7 +169,8 @@ def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
     own = np.where(np.isfinite(eigenvalues), eigenvalues, -1.0)[:, None, None, :]
     mean = np.sum(members * own, axis=-1, keepdims=True) / np.maximum(np.sum(members, axis=-1, keepdims=True), 1.0)
     offsets = members * (own - mean)
-    # Long enough for sums of sizes 10⁵ times too large to decay, and finer where the motion is still large.
+    # Long enough for a sum of sizes that is 10⁵ times too large to decay, and finer at the beginning, where the motion is
+    # large.
     slowest = 1e-6 * np.max(np.abs(own), axis=-1, keepdims=True) + 1e-300
     horizon = ENVELOPE_DECADES / np.maximum(-mean.real, slowest)
     t = horizon * np.linspace(0.0, 1.0, ENVELOPE_INSTANTS)[:, None] ** 2
@@ -184,14 +187,14 @@ def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
 
 
 def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Array, ""]:
-    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes,
-    tight also for near-parallel ones.
+    r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes, which is tight for nearly
+    parallel modes, too.
 
     Near a coalescence the shares $a_k$ are huge and cancel, so the sum of their sizes is a useless bound. With the mean
-    exponent $\bar λ$ of such a cluster of modes taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ is slow: between two
-    instants a distance $h$ apart it lies within $h^2 \max|u''| / 8$ of the chord, and
-    $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. Past the last instant the sum of sizes has decayed and is bound
-    enough. Clusters are bounded one by one.
+    exponent $\bar λ$ of such a cluster of modes taken out, $u(t) = \sum a_k e^{(λ_k - \bar λ) t}$ varies slowly: between two
+    instants a time $h$ apart it lies within $h^2 \max|u''| / 8$ of the chord, and
+    $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. After the last instant the sum of sizes has decayed and is a sufficient
+    bound. Clusters are bounded one by one.
     """
     sizes = jnp.abs(shares)
     growth = envelope.growth
@@ -208,10 +211,10 @@ def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Arr
 
 
 def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
-    r"""Whether the motion decays although friction depends on speed.
+    r"""Whether a bound shows that the motion decays, for friction that depends on slip speed.
 
     The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
-    pressing acceleration by $E/κ$. The remainder that linearisation leaves out is then at most $C E^2$, so
+    pressing acceleration by $E/κ$. The remainder of the linearisation is then at most $C E^2$, so
     $\dot E ≤ -r E + F C E^2$ with $r$ the slowest decay rate and $F = \sum e_k |f_k|$: once $F C E < r$, $E$ falls for ever.
     """
     linear = modes.linear
@@ -225,9 +228,9 @@ def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool
 
 
 def decays_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
-    r"""The same of several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any signal, relative to
-    the signal's margin. No signal then changes by more than $E$ of its margin, the remainders are at most $c_i E^2$, and
-    $\dot E ≤ -r E + \sum_i F_i c_i E^2$ with $F_i = \sum_k e_k |f_{ki}|$.
+    r"""The same for several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any normal force or slip
+    speed, relative to its margin. None of these then changes by more than $E$ times its margin, the remainders are at most
+    $c_i E^2$, and $\dot E ≤ -r E + \sum_i F_i c_i E^2$ with $F_i = \sum_k e_k |f_{ki}|$.
     """
     linear = modes.linear
     shares = [

@@ -1,8 +1,8 @@
-r"""How long a motion that slides will go on sliding for certain, and where it is then.
+r"""How long a sliding motion is certain to go on sliding, and its state at the end of that time.
 
 A little above the stability limit the motion about an unstable sliding equilibrium grows for thousands of periods before its
-first event. While the contact slides, the deviation is $z(t) = \sum_k v_k w_k e^{λ_k t}$ exactly, so nobody has to step
-through all that: with $σ = \max_k \mathrm{Re} λ_k > 0$ a signal $\sum_k a_k w_k e^{λ_k t}$ stays within its margin $m$ at
+first event. While the contact slides, the deviation is exactly $z(t) = \sum_k v_k w_k e^{λ_k t}$, so this time need not be
+stepped through: with $σ = \max_k \mathrm{Re} λ_k > 0$, a sum $\sum_k a_k w_k e^{λ_k t}$ stays within its margin $m$ at
 least until $e^{σt} \sum_k |a_k w_k| = m$.
 """
 
@@ -13,18 +13,18 @@ from ..contact import Contact, Mechanics, State, Status
 from ..model.sliding import sliding_states
 from .sliding_proof import SlidingModes
 
-# Of the time for which sliding is certain, so much is used: rounding must not lead past an event.
+# The share of the time for which sliding is certain that is used, because rounding must not lead past an event.
 USED = 0.999
-# Times shorter than so many periods of the slowest growing mode are left to the stepper.
+# Times shorter than so many periods are left to the stepper.
 LEAST_PERIODS = 4.0
 
 
 def slid_on(
     mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State, allowed: Bool[Array, ""]
 ) -> tuple[State, Float[Array, ""]]:
-    """The deviation from the equilibrium when sliding stops to be certain, and the time until then (s).
+    """The deviation from the equilibrium at the end of the time for which sliding is certain, and that time (s).
 
-    Zero time, and the same state, where that is soon, or where it is not `allowed`: the load must be final.
+    Zero time, and the same state, if that time is short, or if it is not `allowed`: the load must be the final one.
     """
     linear = modes.linear
     keep = sliding_states(deviation.shape[0] // 2, mechanics.normal)

@@ -1,6 +1,6 @@
 r"""The proof that a contact sticks for ever, its forces growing without bound: it jams on the belt.
 
-Where friction is strong and the structure leans into the belt, what sticks presses itself on ever harder, and the belt
+Where friction is strong and the structure leans into the belt, a sticking contact is pressed on ever harder, and the belt
 carries it along for ever: the model has no bounded motion then. While it sticks, $q_t = x + v s$ after the time $s$, and the
 other coordinates $q_r$ follow a drift $a + b s$ with a deviation $e$ that obeys
 $M_{rr} \ddot e + C_{rr} \dot e + K_{rr} e = 0$, so that $\tfrac12 \dot e^T M_{rr} \dot e + \tfrac12 e^T K_{rr} e$ never grows.
@@ -19,18 +19,18 @@ from ..model.scene import Scene
 
 
 class StickingDrift(eqx.Module):
-    """What the proof wants to know of a scene, worked out once."""
+    """The data of a scene that the proof needs, worked out once."""
 
     load: Float[Array, ""]  # N
     base: Float[Array, " state"]  # the drift's state where the tangential displacement is zero
-    per_displacement: Float[Array, " state"]  # and how it changes with that displacement
-    slopes: Float[Array, "2"]  # how fast the guards rise along the drift, N/s
+    per_displacement: Float[Array, " state"]  # derivative of the drift's state by that displacement
+    slopes: Float[Array, "2"]  # rates at which the guards rise along the drift, N/s
     energy: Float[Array, "state state"]  # the deviation's energy as a quadratic form, J
-    reach: Float[Array, "2"]  # how far a deviation of unit energy can move the guards, N/√J
+    reach: Float[Array, "2"]  # largest change of the guards by a deviation of unit energy, N/√J
 
 
 def sticking_drift(scene: Scene) -> StickingDrift:
-    """The drift of a sticking contact under the final load, and what its guards do along it."""
+    """The drift of a sticking contact under the final load, and its guards along it."""
     structure, mechanics, load = scene.structure, Mechanics(scene), scene.load.final
     n, t = structure.size, structure.tangential
     rest = np.array([i for i in range(n) if i not in (t, structure.normal)], int)
@@ -66,7 +66,7 @@ def sticking_drift(scene: Scene) -> StickingDrift:
 
 
 def sticks_forever(drift: StickingDrift, mechanics: Mechanics, contact: Contact, y: State) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which sticks now, under its final load, never comes free."""
+    """Whether a bound shows that a contact which sticks now, under its final load, sticks for ever."""
     carried = drift.base + drift.per_displacement * y[mechanics.tangential]
     deviation = y - carried
     size = jnp.sqrt(jnp.maximum(jnp.sum(deviation * jnp.sum(drift.energy * deviation, axis=-1)), 0.0))

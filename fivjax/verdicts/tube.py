@@ -1,9 +1,9 @@
-"""The check that a motion which beats for ever is attracting: what starts in a tube about it comes back.
+"""The check that a torus attracts: motions that start in a tube about it come back.
 
-Where a limit cycle has lost its stability to a torus, no state of the section repeats. The torus is then known by a set of its
-crossing states, and the proof is that of an attractor: starts that are displaced from the set by a fixed share of its size, in
-all directions and further in as well as further out, all come back to within half of that, and stay there for many crossings.
-Next to a slow fade, and next to the ghost of a fold, nothing comes back: what is further in goes in.
+Where a limit cycle has lost its stability to a torus, no state of the section repeats. The torus is then given by a set of its
+crossing states. It attracts if all starts that are displaced from the set by a fixed share of its size, inwards, outwards and
+in other directions, come back to within half of that distance and stay there for many crossings. Near a slow fade, and near the
+ghost of a cycle just past its fold, they do not come back: starts that are displaced inwards go on inwards.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float
 
 # The tube's radius, relative to the mean size of the states.
 RADIUS = 0.04
-# Starts in it: one in four displaced outwards, one in four inwards, the others at random.
+# Number of starts in it: one in four displaced outwards, one in four inwards, the others at random.
 STARTS = 16
-# Crossings in a row within half the tube.
+# Number of crossings in a row that must lie within half the tube.
 HOME = 16
 
 
 def directions_from(
     states: Float[np.ndarray, "k 2n"],
 ) -> tuple[Float[np.ndarray, "m 2n"], Float[np.ndarray, "m 2n"], float]:
-    """Some of a set of states, all along it; where starts are displaced to from each; and the mean size of the states."""
+    """States spread over a set; the direction in which a start is displaced from each; and the mean size of the states."""
     chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
     random = np.random.default_rng(0).normal(size=chosen.shape)
     kind = np.arange(STARTS) % 4
@@ -31,11 +31,11 @@ def directions_from(
 def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
     """States on the edge of the tube about weighted deviations `states`.
 
-    `velocity`, `gap` and `gap_rate` are places of the tangential velocity, which is zero on the section, and of the normal
+    `velocity`, `gap` and `gap_rate` are the indices of the tangential velocity, which is zero on the section, and of the normal
     displacement and velocity, which are zero in contact.
     """
     chosen, away, size = directions_from(states)
-    # Shares of rounding are contact.
+    # A gap this small is a rounding error of contact.
     open_ = chosen[:, gap] > 1e-6 * size
     away[:, velocity] = 0.0
     away[~open_, gap] = away[~open_, gap_rate] = 0.0
@@ -47,7 +47,7 @@ def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate:
 
 
 def home(states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"]) -> Bool[np.ndarray, " m"]:
-    """Which starts are back: all of their last crossing states lie within half the tube."""
+    """Which starts have come back: all of their last crossing states lie within half the tube."""
     size = np.mean(np.linalg.norm(states, axis=-1))
     points = np.where(np.isfinite(ends), ends, np.inf).reshape(-1, ends.shape[-1])
     finite = np.all(np.isfinite(points), axis=-1)

@@ -1,4 +1,4 @@
-"""Starts in a tube about a set of crossing states, of several contacts (`tube` has those of one)."""
+"""Starts in a tube about a set of crossing states, for several contacts (`tube` has those for one)."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,12 +13,12 @@ def starts_of_several(
 ) -> Float[np.ndarray, "m 2n"]:
     """States on the edge of the tube about weighted deviations `states`.
 
-    `section` is what the section's row of velocities is in weighted ones; `gaps` are the places of the normal displacements,
-    which are zero in contact like the velocities there.
+    `section` has the section's weights of velocities, in weighted coordinates; `gaps` are the indices of the normal
+    displacements, which are zero in contact, as are their velocities.
     """
     n = len(section)
     chosen, away, size = directions_from(states)
-    # Shares of rounding are contact.
+    # A gap this small is a rounding error of contact.
     open_ = chosen[:, gaps] > 1e-6 * size
     away = _on_section(_closed(away, open_, gaps), section)
     found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What can be said of a trajectory's end: proved, or withheld, or why not (the neighbouring modules hold the proofs)."""
+"""Verdicts on trajectories: proved, undecided, or failed and why (the proofs are in the other modules here)."""
 
 import enum
 
@@ -6,7 +6,7 @@ from ..simulation.ending import Ending
 
 
 class Verdict(enum.IntEnum):
-    """The codes in a map. `MEANING` has a sentence for each.
+    """The codes of verdicts in a map; the attribute `meaning` of the variable `verdict` has a sentence for each.
 
     **Example:**
 
@@ -45,5 +45,5 @@ MEANING = {
     Verdict.NOT_RUN: "interrupted before a verdict; run it again",
 }
 
-# Where a trajectory could not be followed, as opposed to followed without a proof.
+# Verdicts of trajectories that could not be followed, as opposed to those that were followed without a proof.
 FAILURES = frozenset(Verdict) - {Verdict.SLIDING, Verdict.LIMIT_CYCLE, Verdict.UNDECIDED, Verdict.NOT_RUN}
