@@ -27,10 +27,14 @@ def specials(branch) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def branch():
+def cycle():
+    return fj.limit_cycle(paper(1.0, 0.2))
+
+
+@pytest.fixture(scope="module")
+def branch(cycle):
     """From the stable cycle at μ = 0.2 down over its fold, and up again along the unstable one."""
-    scene = paper(1.0, 0.2)
-    return fj.continue_cycle(scene, "mu", (0.16, 0.21), start=fj.limit_cycle(scene), derivatives=True)
+    return fj.continue_cycle(cycle.scene, "mu", (0.16, 0.21), start=cycle, derivatives=True)
 
 
 def test_the_branch_passes_its_fold_and_names_what_happens_on_the_way(branch):
@@ -80,14 +84,11 @@ def test_cycle_at_gives_the_cycle_back(branch):
 @pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
 def test_no_cycle_is_born_below_the_fold(branch):
     """An independent solver started on the fold's cycle: 1e-4 above it goes on for ever, 1e-4 below it fades."""
-    place = int(np.argmax(branch.special.values == "fold"))
-    deviation = fj.cycle_at(branch, place).deviation
-    scenes = [
-        reference.paper_scene(mu=float(branch.parameter[place]) + by, belt_speed=1.0, deviation=(1.02 * deviation))
-        for by in (1e-4, -1e-4)
-    ]
-    for scene in scenes:
-        scene["deviation"] = (scene["deviation"][:3], scene["deviation"][3:])
+    fold = branch.isel(point=int(np.argmax(branch.special.values == "fold")))
+    mu = float(fold.parameter)
+    displacement, velocity = np.split(fold["state"].values, 2)
+    deviation = 1.02 * (displacement - fj.sliding_equilibrium(paper(1.0, mu))), 1.02 * velocity
+    scenes = [reference.paper_scene(mu=mu + by, belt_speed=1.0, deviation=deviation) for by in (1e-4, -1e-4)]
     assert list(reference.fate(scenes).fate) == ["sustained", "slides"]
 
 
@@ -120,7 +121,7 @@ def test_benchmark_a_s_unstable_branch_runs_from_the_hopf_point_to_the_grazing()
     assert branch.word.values[-1] == "stick – slide"
 
 
-def test_a_branch_is_drawn_and_saved(branch, tmp_path):
+def test_a_branch_is_drawn_and_saved(branch, cycle, tmp_path):
     """Solid where stable, dashed where not, special points by name; several branches share one picture."""
     assert branch.sliding_stable.all()
     path = fj.save(branch, tmp_path / "branch.nc")
@@ -131,7 +132,7 @@ def test_a_branch_is_drawn_and_saved(branch, tmp_path):
     assert {"fold", "1 m/s", "again", "stable", "unstable"} <= set(texts)
     assert fj.show(branch).axes[0].get_xlabel() == axes.get_xlabel()
     with pytest.raises(TypeError, match="continue_cycle"):
-        fj.plot.branch(fj.cycle_at(branch, 0))
+        fj.plot.branch(cycle)
 
 
 def test_the_command_writes_branch_and_picture(branch, monkeypatch, tmp_path, capsys):

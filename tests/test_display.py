@@ -18,7 +18,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def run(scene):
-    return fj.simulate(scene, 0.4, 1 / 1500, energy=True)
+    return fj.simulate(scene, 0.4, 1 / 150, energy=True)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,22 @@ import fivjax as fj
 
 # As exact as the default, in more steps, of which short motions need few: it compiles in half the time.
 FEW = fj.EventExact(order=8)
-END = 4.0
+# One functional, one parameter and one end for each number of coordinates, and structures, friction and loads of one kind:
+# so they share what is compiled.
+END = {2: 4.0, 3: 2.5}
+
+
+def steady(force: float) -> fj.Pulse:
+    """A load that does not change."""
+    return fj.Pulse(force, 1.0, start=100.0)
+
+
+def structure(stiffness, mass=None, damping=None, load_direction=None) -> fj.Structure:
+    """Coordinates of which the first is along the belt and the last away from it; pressed on along the last."""
+    n = len(stiffness)
+    mass, damping = np.eye(n) if mass is None else mass, np.zeros((n, n)) if damping is None else damping
+    load_direction = -np.eye(n)[-1] if load_direction is None else load_direction
+    return fj.Structure(mass, damping, stiffness, load_direction, tangential=0, normal=n - 1)
 
 
 def test_state_in_all_parameters_through_nine_events():
@@ -102,8 +117,8 @@ def test_the_end_of_a_kick_on_a_saved_instant():
     assert float(on_it) == pytest.approx(float(between), rel=1e-9)
 
 
-def existing(scene, y0, t1=END) -> fj.Derivatives:
-    # One functional and one parameter for all, so that they share what is compiled.
+def existing(scene, y0) -> fj.Derivatives:
+    t1 = END[scene.structure.size]
     return fj.derivatives(measure.last_state, scene, ["force"], t1, t1, y0=y0, method=FEW)
 
 
@@ -111,8 +126,8 @@ def existing(scene, y0, t1=END) -> fj.Derivatives:
 def test_a_graze_is_said_to_have_no_derivative(touch, exist):
     """A gap q = F + (h - F) cos t with a lifting load F comes down to 2F - h: just above or just below the belt, the
     velocity after it turns by twice itself with the next digit of F."""
-    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
-    scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.ConstantLoad(0.5 * (1.0 + touch)), restitution=1.0)
+    lifted = structure(np.eye(2), load_direction=[0.0, 1.0])
+    scene = fj.Scene(lifted, fj.Coulomb(0.0), 0.0, steady(0.5 * (1.0 + touch)), restitution=1.0)
     d = existing(scene, ([0.0, 1.0], [0.0, 0.0]))
     assert d.exist is exist
     assert d.events == (1 if touch < 0 else 0)
@@ -127,12 +142,12 @@ def test_two_events_that_swap_order_have_no_derivative(late, exist):
     of either decides which of the two happens."""
     # A mass along the belt, and another above it that presses by a spring: N swings on its own.
     stiffness = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])
-    structure = fj.Structure(np.eye(3), np.zeros((3, 3)), stiffness, [0.0, -1.0, 0.0], tangential=0, normal=2)
-    scene = fj.Scene(structure, fj.Coulomb(0.0), 1.0, fj.ConstantLoad(1.0))
+    pressed = structure(stiffness, load_direction=[0.0, -1.0, 0.0])
+    scene = fj.Scene(pressed, fj.Coulomb(0.0, 0.0), 1.0, steady(1.0))
     # x = r sin(t - b), whose speed has grown to that of the belt at this instant.
     r, ends = 1.5, 2 * np.pi / 3 + late
     b = ends + np.arccos(1 / r)
-    d = existing(scene, ([-r * np.sin(b), -3.0, 0.0], [r * np.cos(b), 0.0, 0.0]), 2.5)
+    d = existing(scene, ([-r * np.sin(b), -3.0, 0.0], [r * np.cos(b), 0.0, 0.0]))
     assert d.exist is exist, d.reason
 
 
@@ -140,15 +155,15 @@ def test_two_events_that_swap_order_have_no_derivative(late, exist):
 def test_an_event_on_a_jump_of_the_load_has_no_derivative(late, exist):
     """A mass falls onto the belt at the instant at which the load jumps: it lands under the one load or the other."""
     load = fj.Pulse(1.0, 2.0, start=np.sqrt(2.0) + late, duration=10.0)
-    scene = fj.Scene(point_mass(0.0), fj.Coulomb(0.0), 0.0, load, restitution=0.5)
-    d = existing(scene, ([0.0, 1.0], [0.0, 0.0]), 2.0)
+    scene = fj.Scene(structure(np.zeros((2, 2))), fj.Coulomb(0.0), 0.0, load, restitution=1.0)
+    d = existing(scene, ([0.0, 1.0], [0.0, 0.0]))
     assert d.exist is exist, d.reason
 
 
 @pytest.mark.parametrize(("begin", "exist"), [(3.0 - 1e-9, False), (3.0 + 1e-9, False), (2.7, True), (3.3, True)])
 def test_rest_at_the_edge_of_the_friction_cone_has_no_derivative(begin, exist):
     """A block that swings about μN/k = 1 turns at 2 - x₀ = -1: where friction just holds it, or just does not."""
-    scene = fj.Scene(point_mass(1.0), fj.Coulomb(1.0), 0.0, fj.ConstantLoad(1.0))
+    scene = fj.Scene(structure(np.diag([1.0, 0.0])), fj.Coulomb(1.0), 0.0, steady(1.0))
     d = existing(scene, ([begin, 0.0], [0.0, 0.0]))
     assert d.exist is exist, d.reason
     if begin == 3.0 - 1e-9:
@@ -158,13 +173,18 @@ def test_rest_at_the_edge_of_the_friction_cone_has_no_derivative(begin, exist):
 @pytest.mark.parametrize(("late", "exist"), [(1e-10, False), (0.1, True)])
 def test_an_event_at_the_very_end_has_no_derivative(late, exist):
     """The last row is before the impact, or after it."""
-    scene = fj.Scene(point_mass(1.0), fj.Coulomb(0.0), 0.0, fj.ConstantLoad(1.0), restitution=0.5)
-    height = 0.5 * (END - late) ** 2
+    scene = fj.Scene(structure(np.diag([1.0, 0.0])), fj.Coulomb(0.0), 0.0, steady(1.0), restitution=0.5)
+    height = 0.5 * (END[2] - late) ** 2
     assert existing(scene, ([0.0, height], [0.0, 0.0])).exist is exist
 
 
 def test_quiet_motion_has_derivatives_and_says_so():
-    d = fj.derivatives(measure.last_state, measure.paper(p=1.0), ["p"], 0.05, 0.05, method=FEW)
+    """The paper's oscillator, all of it a hundred times as slow: in few steps."""
+    paper = measure.paper()
+    mass, damping, stiffness, load_direction = map(np.asarray, paper.structure.matrices)
+    slow = structure(1e-4 * stiffness, mass, 1e-2 * damping, load_direction)
+    scene = fj.Scene(slow, fj.Coulomb(0.227, 0.227), 0.03, steady(1e-2))
+    d = existing(scene, (fj.sliding_equilibrium(paper), np.zeros(3)))
     assert d.exist and d.events == 0
 
 
@@ -173,12 +193,13 @@ def test_a_mode_at_rest_is_differentiated_in_steps_of_its_own():
 
     The closed form is the step response of that mass alone. One row is saved: the steps in between are the method's.
     """
-    structure = fj.belt_oscillator(m1=0.9, m2=0.1, c1=0.0, c2=0.1, k1=1.0, k2=1.0, theta=0.0)
-    scene = fj.Scene(structure, fj.Coulomb(0.5, mu_static=1.0), belt_speed=0.2, load=fj.ConstantLoad(1.0))
-    riding = ([-0.4, -1.0, 0.0], [0.2, 0.0, 0.0])
-    d = fj.derivatives(measure.last_state, scene, ["force"], END, END, y0=riding, method=FEW)
+    matrices = fj.belt_oscillator(m1=0.9, m2=0.1, c1=0.0, c2=0.1, k1=1.0, k2=1.0, theta=0.0).matrices
+    mass, damping, stiffness, load_direction = map(np.asarray, matrices)
+    level = structure(stiffness, mass, damping, load_direction)
+    scene = fj.Scene(level, fj.Coulomb(0.5, mu_static=1.0), belt_speed=0.2, load=steady(1.0))
+    d = existing(scene, ([-0.4, -1.0, 0.0], [0.2, 0.0, 0.0]))
     rates = np.array([[0.0, 1.0], [-1.0 / 0.9, -0.1 / 0.9]])
-    answer = np.linalg.solve(rates, (scipy.linalg.expm(END * rates) - np.eye(2)) @ [0.0, -1.0 / 0.9])
+    answer = np.linalg.solve(rates, (scipy.linalg.expm(END[3] * rates) - np.eye(2)) @ [0.0, -1.0 / 0.9])
     np.testing.assert_allclose(d["force"], [0.0, answer[0], 0.0, 0.0, answer[1], 0.0], rtol=0, atol=1e-12)
 
 
@@ -188,9 +209,9 @@ def test_a_run_that_did_not_reach_its_end_has_no_derivatives():
     The mass slides where it stays, in one step for the motion and in thousands for what deviates from it.
     """
     stiffness = 1e6
-    scene = fj.Scene(point_mass(stiffness), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
-    d = fj.derivatives(measure.last_state, scene, ["mu"], END, END, y0=([0.2 / stiffness, 0.0], [0.0, 0.0]), method=FEW)
-    assert not d.exist and np.all(np.isnan(d["mu"])) and "not finite" in d.reason
+    scene = fj.Scene(structure(np.diag([stiffness, 0.0])), fj.Coulomb(0.2), 1.0, steady(1.0))
+    d = existing(scene, ([0.2 / stiffness, 0.0], [0.0, 0.0]))
+    assert not d.exist and np.all(np.isnan(d["force"])) and "not finite" in d.reason
 
 
 @pytest.mark.parametrize(

@@ -107,11 +107,11 @@ def random_scene(rng: np.random.Generator, n: int) -> fj.Scene:
     )
 
 
-# Each number of coordinates, and each choice of two for the contact, is compiled anew: these have two kinds between them.
-SEEDS = (0, 3, 12, 28)
+# Each number of coordinates, and each choice of two for the contact, is compiled anew: these are of one kind.
+SEEDS = (0, 12, 28)
 
 
-@pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 4, 5, 6, 7))])
+@pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
 def test_any_structure_moves_as_by_the_series_stepper(seed):
     """Two to five coordinates, static friction above dynamic, rebounds, belts both ways: the same events, the same end."""
     rng = np.random.default_rng(seed)

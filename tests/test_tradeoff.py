@@ -5,18 +5,28 @@ import json
 import numpy as np
 import oracle
 import pytest
+from catalogue import LOW_ORDER
 
 import fivjax as fj
+from fivjax.maps import tradeoff_study
 from fivjax.maps.tradeoff_study import recommend, table
+
+SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
+PARTS = {"end state alone": 1.0, "energy ledger": 1.5}
+
+
+def study():
+    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "exact": LOW_ORDER}
+    how = dict(t1=0.15, trajectories=4, precisions=("float64",), boundary=False, progress=False)
+    return fj.tradeoff(SCENE, methods=methods, **how)
 
 
 @pytest.fixture(scope="module")
 def measured():
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
-    methods = {"coarse": fj.WhereSwitched(dt=2e-4), "exact": fj.EventExact()}
-    return fj.tradeoff(
-        scene, methods=methods, t1=0.15, trajectories=4, precisions=("float64",), boundary=False, progress=False
-    )
+    """A study whose parts are stood in for: each of them is compiled for seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff_study, "_parts", lambda *_: PARTS)
+        return study()
 
 
 def test_state_errors_are_those_against_the_oracle(measured):
@@ -26,8 +36,7 @@ def test_state_errors_are_those_against_the_oracle(measured):
     )
     assert len(reference.events) >= 5
     q, v = reference.q[-1], reference.v[-1]
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
-    run = fj.simulate(scene, 0.15, 0.15, fj.WhereSwitched(dt=2e-4))
+    run = fj.simulate(SCENE, 0.15, 0.15, fj.WhereSwitched(dt=2e-4))
     error = max(
         np.abs(run.displacement[-1] - q).max() / np.abs(q).max(),
         np.abs(run.velocity[-1] - v).max() / np.abs(v).max(),
@@ -38,7 +47,14 @@ def test_state_errors_are_those_against_the_oracle(measured):
 
 def test_costs_are_costs_and_parts_are_named(measured):
     assert (measured["cost"] > 0).all() and measured["cost"].attrs["units"] == "s"
-    assert {"end state alone", "energy ledger", "stored output, 1000 rows"} <= set(measured["part"].values.tolist())
+    assert dict(zip(measured["part"].values, measured["part_cost"].values, strict=True)) == PARTS
+
+
+@pytest.mark.slow
+def test_each_part_costs_what_it_costs():
+    parts = study()["part_cost"]
+    assert {"end state alone", "energy ledger", "stored output, 1000 rows"} <= set(parts["part"].values.tolist())
+    assert (parts > 0).all()
 
 
 def test_a_recommendation_is_the_cheapest_that_is_good_enough(measured):

@@ -61,7 +61,9 @@ def test_crossings_are_the_series_stepper_s(maps, exactly, starts):
     assert np.all(np.isnan(found.path[:, 0]))
 
 
+@pytest.mark.slow
 def test_the_peak_on_the_way_is_known_to_rounding(maps, exactly, starts):
+    """By the series stepper, which is compiled for it; `test_attractor` compares amplitudes with an independent solver."""
     np.testing.assert_allclose(maps.peaks(*starts, CROSSINGS), exactly.peaks(*starts, CROSSINGS), rtol=1e-9)
 
 
