@@ -176,6 +176,60 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
     assert 0 < m["attractor_multiplier"].item() < 1 and np.all(m["attractor"] == 0)
 
 
+def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
+    """The paper's torus, kept from the search that comes first: it is found from where the trajectory is in the end."""
+    known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
+    monkeypatch.setattr("fivjax.maps.attractors.tori_among", lambda *_: ({}, []))
+    monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
+    monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)
+    late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
+    assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
+    assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0
+    assert late["attractor_amplitude"].item() == pytest.approx(known["attractor_amplitude"].item(), rel=2e-3)
+
+
+MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)
+MANY |= dict(theta=0.2852258747704728, c1=5.276279472159822, c2=0.8020836517718353)
+PASSING = dict(m1=0.969426838229293, m2=0.010182597880315619, k1=13492.702752569177, k2=25362.931711655165)
+PASSING |= dict(theta=0.10388554288577523, c1=0.787197661431328, c2=3.4813158892322353)
+RARE = dict(m1=1.0198503182174699, m2=0.02779954695588265, k1=147094.27066485942, k2=126925.55483150625)
+RARE |= dict(theta=0.22013984675203263, c1=0.8390953754335995, c2=0.457083396430323)
+
+
+@pytest.mark.slow
+def test_late_trajectories_have_the_references_amplitudes_and_their_verdict_alone():
+    """Three cycles and two tori, one of them with a narrow basin. Few trajectories of a group are asked where they are as long as
+    time is left, all of them once it is over. Without that most of these were undecided, some only beside others.
+    """
+    scene, kicks = paper(0.2980455667638255, 1.5691123393166873, **MANY), [1.5793, 2.2167, 3.1512, 4.3208, 5.1958]
+    together = fj.bistability_map(scene, p=kicks, progress=False)
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks])
+    assert theirs.fate.tolist() == ["sustained"] * len(kicks)
+    assert np.all(together["verdict"] == fj.Verdict.LIMIT_CYCLE)
+    np.testing.assert_allclose(together["amplitude"], theirs.amplitude, rtol=1e-2)
+    np.testing.assert_allclose(together["amplitude"][1:3], theirs.amplitude[1:3], rtol=1e-9)  # on cycles
+    for place in (1, 4):
+        alone = fj.bistability_map(scene, p=kicks[place : place + 1], progress=False)
+        assert alone["amplitude"].item() == pytest.approx(theirs.amplitude[place], rel=1e-2)
+
+
+@pytest.mark.slow
+def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_not():
+    """Neighbours part by one per cent per crossing in the one and by nothing in the other; neither is a limit cycle."""
+    chaos = fj.bistability_map(paper(0.6393391935903446, 9.602345607398314, **RARE), p=[0.5, 1.5], progress=False)
+    assert np.all(chaos["verdict"] == fj.Verdict.UNDECIDED) and np.all(chaos["chaotic"])
+    # Chaotic for thousands of periods, then on one of two cycles: which one is a matter of rounding.
+    passing = fj.bistability_map(paper(0.7962659284901421, 41.42511253421955, **PASSING), p=[2.2, 4.8], progress=False)
+    assert np.all(passing["verdict"] == fj.Verdict.UNDECIDED) and np.all(passing["chaotic"])
+    fading = dict(m1=0.9855383061050841, m2=0.030357371740907798, k1=158293.2646841661, k2=103339.15007802399)
+    fading |= dict(theta=0.06138792475277073, c1=6.516258313521397, c2=0.351555082727242)
+    scene = paper(0.2624679100513595, 0.13967129502237938, **fading)
+    fade = fj.bistability_map(scene, p=[1.7767, 1.9584], progress=False)
+    assert np.all(fade["verdict"] == fj.Verdict.UNDECIDED) and not np.any(fade["chaotic"])
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in (1.7767, 1.9584)], periods=1e5)
+    assert theirs.fate.tolist() == ["slides", "slides"]
+
+
 def test_a_slow_fade_near_the_stability_limit_is_no_limit_cycle():
     """Friction close to its critical value takes nearly all damping from sliding; this one squeals for two seconds."""
     scene = paper(0.0981, 1.0, m1=1.2, m2=0.014, c1=29.0, c2=0.125, k1=56.8e3, k2=61.4e3, theta=0.1)

@@ -20,6 +20,8 @@ NEARLY = 0.1
 # The same for many crossings: after so many of them any motion on a torus comes back nearly.
 MORE_NEARLY = 0.02
 CROSSINGS, MORE_CROSSINGS = 8, 40
+# The same for a motion whose time is over: it has settled on a cycle, or never will.
+SETTLED = 1e-3
 # A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
 # neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
 WEAKLY, SMALLEST_OF_MANY = 0.95, 1e-3
@@ -48,9 +50,11 @@ def stable_cycles(
     at: Section,
     known: dict[int, list[Cycle]],
     crossings: int = CROSSINGS,
+    settled: bool = False,
 ) -> list[tuple[int, Int, Cycle]]:
     """The stable cycles of up to so many `crossings` that motions from these states are near to: of each the group, the rows
-    that led to it, and it. Those of a group that are `known` are not computed anew.
+    that led to it, and it. Those of a group that are `known` are not computed anew. Of motions that have `settled` all cycles
+    count, however weakly they attract and however near one has to be.
     """
     weights = maps.weights
     last, states = maps.path(group, at, crossings + 1)
@@ -60,7 +64,7 @@ def stable_cycles(
         back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
-        close = nearest <= np.where(lag > CROSSINGS, MORE_NEARLY, NEARLY)
+        close = nearest <= (SETTLED if settled else np.where(lag > CROSSINGS, MORE_NEARLY, NEARLY))
         near = np.flatnonzero(np.isfinite(size) & (size > 0) & close)
     if not len(near):
         return []
@@ -81,7 +85,7 @@ def stable_cycles(
             rows_of.append([near[row]])
     before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = [float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row])))) for row in kept]
-    locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY)
+    locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY) & (not settled)
     attempts = [
         _trial(maps, closed, row) if old is None and not weak else None
         for row, old, weak in zip(kept, before, locked_weakly, strict=True)
@@ -96,7 +100,8 @@ def stable_cycles(
         return found
     chosen = np.array([kept[k] for k in stable])
     own, centre = group[near[chosen]], closed.at.rows(chosen)
-    neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable])
+    smallest = np.where((lag[chosen] > CROSSINGS) & (not settled), SMALLEST_OF_MANY, SMALLEST)
+    neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable], smallest)
     amplitude = maps.peaks(own, centre, lag[chosen])
     _, points = maps.path(own, centre, int(np.max(lag[chosen])))
     points = np.concatenate([centre.y[:, None], points], axis=1)
@@ -180,12 +185,11 @@ def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
     return trial(y, status, direction, closed.jacobian[row], maps.weights, free)
 
 
-def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial]) -> list[Neighbourhood | None]:
-    """`verdicts.capture.neighbourhood` of several cycles at once."""
-    many = np.asarray(crossings) > CROSSINGS
+def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial], smallest) -> list[Neighbourhood | None]:
+    """`verdicts.capture.neighbourhood` of several cycles at once, not smaller than so, relative to each one's size."""
     radius = np.array([attempt.largest for attempt in trials])
-    smallest = np.where(many, SMALLEST_OF_MANY, SMALLEST) / LARGEST * radius
-    radius[many] /= 8  # their points lie close together
+    smallest = smallest / LARGEST * radius
+    radius[np.asarray(crossings) > CROSSINGS] /= 8  # their points lie close together
     found: list[Neighbourhood | None] = [None] * len(trials)
     open_ = list(range(len(trials)))
     while open_:

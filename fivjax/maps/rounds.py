@@ -14,6 +14,7 @@ import numpy as np
 from ..foundation.kept_programs import kept
 from ..verdicts.verdict import Verdict
 from . import attractors
+from .at_last import Narrow, fates
 from .attractors import Attractors, Follower
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
@@ -23,7 +24,7 @@ from .progress import Setting, begin, placed, released, step
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
 from .sharing import Batch, grouped, shared_by, with_values
-from .tori import is_chaotic
+from .tori import Torus, followed_on
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4
@@ -85,8 +86,11 @@ def follow_all(
             which = basins.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[which >= 0] = Verdict.LIMIT_CYCLE
         finished = (verdict != Verdict.UNDECIDED) | ~in_time
-        chaotic = basins.chaotic(pending, now, finished & (verdict == Verdict.UNDECIDED))
-        ended = Ended(verdict, *basins.described(pending, verdict, which, chaotic))
+        late = finished & (verdict == Verdict.UNDECIDED)
+        # Who says how long to follow says which motions count.
+        chaotic, at_last = basins.at_last(pending, now, late, proving=t_max is None, report=report)
+        verdict[list(at_last)] = Verdict.LIMIT_CYCLE
+        ended = Ended(verdict, *basins.described(pending, verdict, which, chaotic, at_last))
         chosen = np.flatnonzero(finished)
         record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
         report(int(finished.sum()))
@@ -121,6 +125,9 @@ class Basins:
         self.torus = shared.tree.attractor  # views: what is written here is written there
         self.torus_period = np.full(len(distinct), np.nan)
         self.settled_by = np.zeros(len(distinct))  # s
+        # Those of each group when the time of its trajectories is over.
+        self.cycles_at_last: dict[int, list[Cycle]] = {}
+        self.tori_at_last: dict[int, list[Narrow]] = {}
 
     def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
         """Finds the attractors of these groups, where they are not `known`."""
@@ -209,25 +216,39 @@ class Basins:
         which = captured(self.maps, self.group[pending], attractors.section_of(now), latest, known)
         return np.where(which >= 0, np.array([*places, -1])[which], -1)
 
-    def chaotic(self, pending: np.ndarray, now, chosen: np.ndarray) -> np.ndarray:
-        """Which of the chosen ones have neighbours that part from them exponentially."""
-        found = np.zeros(len(pending), bool)
-        asks = np.flatnonzero(chosen & np.isfinite(now.crossing).all(axis=1))
-        if self.maps is not None and len(asks):
-            found[asks] = is_chaotic(self.maps, self.group[pending[asks]], attractors.section_of(now).rows(asks))
-        return found
+    def at_last(
+        self, pending: np.ndarray, now, late: np.ndarray, proving: bool, report
+    ) -> tuple[np.ndarray, dict[int, Cycle | Torus]]:
+        """Of trajectories whose time is over: which are chaotic, and, if that is to be proved, the attractors that others have
+        come to.
+        """
+        chaotic = np.zeros(len(pending), bool)
+        asks = np.flatnonzero(late & np.isfinite(now.crossing).all(axis=1) & (now.events > 0))
+        if self.maps is None or not len(asks):
+            return chaotic, {}
+        group, at = self.group[pending[asks]], attractors.section_of(now).rows(asks)
+        if not proving:
+            chaotic[asks] = followed_on(self.maps, group, at).chaotic
+            return chaotic, {}
+        cycles = {int(g): self.cycles_at_last.setdefault(int(g), self._cycles_of(g)) for g in np.unique(group)}
+        found = fates(self.maps, group, at, cycles, self.tori_at_last, report)
+        chaotic[asks] = found.chaotic
+        return chaotic, {int(row): one for row, one in zip(asks, found.attractor, strict=True) if one is not None}
 
-    def described(self, pending: np.ndarray, verdict: np.ndarray, which: np.ndarray, chaotic: np.ndarray):
+    def described(self, pending: np.ndarray, verdict: np.ndarray, which: np.ndarray, chaotic: np.ndarray, at_last):
         """Kind, amplitude, period and multiplier of each one's attractor."""
         torus = (verdict == Verdict.LIMIT_CYCLE) & (which < 0)
         group = self.group[pending]
         amplitude = np.where(torus, self.torus.amplitude[group], np.nan)
         period = np.where(torus, self.torus_period[group], np.nan)
         multiplier = np.full(len(pending), np.nan)
-        for row in np.flatnonzero(which >= 0):
-            cycle = self.cycles[which[row]]
-            amplitude[row], period[row], multiplier[row] = cycle.amplitude, cycle.period, cycle.multiplier
-        kind = np.where(torus, 1, np.where(which >= 0, 0, np.where(chaotic, CHAOTIC, NO_ATTRACTOR))).astype(np.int8)
+        known = {row: self.cycles[which[row]] for row in np.flatnonzero(which >= 0)} | at_last
+        for row, one in known.items():
+            amplitude[row], period[row] = one.amplitude, one.period
+            torus[row] = isinstance(one, Torus)
+            multiplier[row] = np.nan if torus[row] else one.multiplier
+        on_cycle = (verdict == Verdict.LIMIT_CYCLE) & ~torus
+        kind = np.where(torus, 1, np.where(on_cycle, 0, np.where(chaotic, CHAOTIC, NO_ATTRACTOR))).astype(np.int8)
         return kind, amplitude, period, multiplier
 
 

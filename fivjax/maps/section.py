@@ -30,8 +30,8 @@ from .windowed_returns import KEPT, SIDE_BY_SIDE, moved_in_windows, no_path, wit
 # States in a block: few, because often there are few.
 BLOCK = 32
 DERIVED_BLOCK = 16
-# Of central differences, relative to a state's size: the third root of rounding.
-STEP = 5e-6
+# Of central differences, relative to a state's size: the third root of rounding; and crossings that they are taken over.
+STEP, DIFFERENCED = 5e-6, 16
 
 
 class Section(NamedTuple):
@@ -115,6 +115,21 @@ class ReturnMaps:
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 
     def _differences(self, group, at: Section, crossings):
+        """Of many crossings, the product over some at a time: differences of a long way are not small."""
+        left, here = np.broadcast_to(crossings, len(group)).copy(), Section(*(np.array(part) for part in at))
+        time = np.zeros(len(group))
+        derivatives = np.zeros((*at.y.shape, at.y.shape[1]))
+        derivatives[:] = np.eye(at.y.shape[1])
+        while len(rows := np.flatnonzero(left > 0)):
+            part = np.minimum(left[rows], DIFFERENCED)
+            base, taken, slopes = self._differences_of_few(group[rows], here.rows(rows), part)
+            here.put(rows, base)
+            time[rows] += taken
+            derivatives[rows] = slopes @ derivatives[rows]
+            left[rows] -= part
+        return here, time, derivatives
+
+    def _differences_of_few(self, group, at: Section, crossings):
         """By central differences: the same program as everything else; neighbourhoods are checked by the map itself."""
         count, size = at.y.shape
         free = np.zeros((count, size), bool)

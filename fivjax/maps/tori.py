@@ -20,8 +20,11 @@ BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 FURTHER, PARTING_OVER, PARTING = 8, 48, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
 LOCKED = -0.01
-# Of a motion that nothing captures, it is asked so many times in a row; the first one finds the directions.
-PARTING_TIMES, CHAOTIC_FROM = 4, 0.03
+# A motion that nothing has captured in its time is followed on for so many times as many returns at most: until neighbours
+# have parted by so many e-folds since they were closest, or have closed in by so many since they were furthest apart. On a
+# torus they part and close in by turns, by two or three e-folds. Where they have parted by more before they close in, the
+# motion was chaotic for a time: another solver's rounding may lead to another attractor.
+PARTING_TIMES, PARTED, CLOSED_IN, AS_ON_A_TORUS = 128, 30.0, 15.0, 7.0
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 # The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share while the motions
@@ -44,12 +47,15 @@ def tori_among(
     known: list[list[Cycle]],
     within: int,
     report,
+    radius: float = tube.RADIUS,
+    end_radius: float = tube.RADIUS,
 ) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
     """Which of these sets, each with the place of its group, are tori: those, by the place; and the cycles of those that are
-    locked. `known` are the cycles of each group; starts about a torus have to be back `within` so many crossings.
+    locked. `known` are the cycles of each group; starts about a torus, in a tube of this relative
+    `radius`, have to be back `within` so many crossings, in the inner half of one of `end_radius`.
     """
     own = np.array([groups[k] for k, _ in sets])
-    back, last = _back(maps, own, [states for _, states in sets], within, report)
+    back, last = _back(maps, own, [states for _, states in sets], within, report, radius, end_radius)
     if not len(back):
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
@@ -80,11 +86,17 @@ def tori_among(
 
 
 def _back(
-    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "k 2n"]], within: int, report
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " s"],
+    sets: list[Float[np.ndarray, "k 2n"]],
+    within: int,
+    report,
+    radius,
+    end_radius,
 ) -> tuple[Int[np.ndarray, " t"], Section]:
     """About which of the sets all starts come back within so many crossings; and where the starts are then, set by set."""
     weights, count = maps.weights, tube.STARTS
-    starts = [about(maps, states[:: len(states) // count] / weights) for states in sets]
+    starts = [about(maps, states[:: len(states) // count] / weights, radius) for states in sets]
     own = np.repeat(group, count)
     last = section_at(np.concatenate(starts) / weights, maps.normal, maps.sliding[own])
     running, back, ok = np.arange(len(own)), np.zeros(len(own), bool), np.ones(len(sets), bool)
@@ -100,7 +112,7 @@ def _back(
         ok[running[lost] // count] = False
         for k in np.unique(running // count):
             mine = running // count == k
-            back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine])
+            back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine], end_radius)
         running = running[ok[running // count] & ~back[running]]
         if not len(running):
             break
@@ -111,21 +123,34 @@ def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
     """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; the mean
     time of a return (s); and where the motions are in the end.
     """
+    beside, growth, time = _beside(at), np.full(len(group), np.nan), np.zeros(len(group))
+    for _ in range(2):
+        growth, taken, at, beside = _parted(maps, group, at, beside)
+        time = time + taken
+    return growth, time / (2 * PARTING_OVER), at
+
+
+def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
+    """Neighbours, away from the equilibrium: that keeps what the section and the contact hold at zero."""
+    return at.y * (1 + APART)
+
+
+def _parted(maps: ReturnMaps, group, at: Section, beside):
+    """After `PARTING_OVER` returns: the logarithm of the growth of the distance to neighbours per return, the time taken (s),
+    where the motions are, and neighbours in the direction in which those from before are by then.
+    """
     weights = maps.weights
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
-    # Away from the equilibrium, which keeps what the section and the contact hold at zero.
-    beside, growth, time = at.y * (1 + APART), np.full(len(group), np.nan), np.zeros(len(group))
-    for _ in range(2):
-        pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-        image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)
-        time = time + image.time[: len(group)]
-        at, other = image.at.rows(slice(None, len(group))), image.at.rows(slice(len(group), None))
-        away = weights * (other.y - at.y)
-        distance = np.linalg.norm(away, axis=1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            growth = np.log(distance[:, 0] / (APART * size[:, 0])) / PARTING_OVER
-            beside = at.y + APART * size * away / distance / weights
-    return growth, time / (2 * PARTING_OVER), at
+    apart = np.linalg.norm(weights * (beside - at.y), axis=1)
+    pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
+    image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)
+    at, other = image.at.rows(slice(None, len(group))), image.at.rows(slice(len(group), None))
+    away = weights * (other.y - at.y)
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        growth = np.log(distance[:, 0] / apart) / PARTING_OVER
+        beside = at.y + APART * size * away / distance / weights
+    return growth, image.time[: len(group)], at, beside
 
 
 def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t"]:
@@ -146,25 +171,48 @@ def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t
     return peak
 
 
-def is_chaotic(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Bool[np.ndarray, " m"]:
-    """Whether neighbours part exponentially from motions that start here: by so much per return, over hundreds of returns."""
+class Followed(NamedTuple):
+    """What motions do in the long run."""
+
+    chaotic: Bool[np.ndarray, " m"]  # neighbours part exponentially, or did for long
+    closing_in: Bool[np.ndarray, " m"]  # neighbours close in exponentially, as they do on a cycle
+    at: Section  # where the motions are then
+
+
+def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Followed:
+    """Whether neighbours part or close in exponentially where motions that start here lead to: asked over thousands of returns,
+    because events may be rare. On a torus they do neither.
+    """
     at = maps.returns(group, at, 1).at
-    growths = []
+    _, _, at, beside = _parted(maps, group, at, _beside(at))
+    running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
+    parted, least, most, furthest = np.zeros((4, len(group)))
     for _ in range(PARTING_TIMES):
-        growth, _, at = _parting(maps, group, at)
-        growths.append(growth)
+        growth, _, at, beside = _parted(maps, group[running], at, beside)
+        parted[running] += PARTING_OVER * growth
+        least, most = np.fmin(least, parted), np.fmax(most, parted)
+        furthest = np.fmax(furthest, parted - least)
+        last.put(running, at)
+        # Not a number is neither.
+        with np.errstate(invalid="ignore"):
+            left = ((parted - least < PARTED) & (most - parted < CLOSED_IN))[running]
+        running, at, beside = running[left], at.rows(left), beside[left]
+        if not len(running):
+            break
     with np.errstate(invalid="ignore"):
-        return np.mean(growths[1:], axis=0) > CHAOTIC_FROM
+        closing_in = most - parted >= CLOSED_IN
+        chaotic = furthest >= np.where(closing_in, AS_ON_A_TORUS, PARTED)
+    return Followed(chaotic, closing_in & ~chaotic, last)
 
 
-def about(maps: ReturnMaps, states) -> Float[np.ndarray, "m 2n"]:
-    """Weighted starts on the edge of the tube about states of the section, or about one."""
+def about(maps: ReturnMaps, states, radius: float = tube.RADIUS) -> Float[np.ndarray, "m 2n"]:
+    """Weighted starts on the edge of the tube of this relative `radius` about states of the section, or about one."""
     structure = maps.structure
     if len(structure.contacts) > 1:
         section = maps.section / maps.weights[structure.size :]
-        return starts_of_several(maps.weights * np.atleast_2d(states), section, np.asarray(maps.normal))
+        return starts_of_several(maps.weights * np.atleast_2d(states), section, np.asarray(maps.normal), radius)
     velocity, rate = structure.size + structure.tangential, structure.size + structure.normal
-    return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate)
+    return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate, radius)
 
 
 def section_at(

@@ -28,8 +28,10 @@ def directions_from(
     return chosen, away, float(np.mean(np.linalg.norm(states, axis=-1)))
 
 
-def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int) -> Float[np.ndarray, "m 2n"]:
-    """States on the edge of the tube about weighted deviations `states`.
+def starts(
+    states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int, radius: float = RADIUS
+) -> Float[np.ndarray, "m 2n"]:
+    """States on the edge of the tube about weighted deviations `states`, whose `radius` is relative to their mean size.
 
     `velocity`, `gap` and `gap_rate` are the indices of the tangential velocity, which is zero on the section, and of the normal
     displacement and velocity, which are zero in contact.
@@ -39,19 +41,21 @@ def starts(states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate:
     open_ = chosen[:, gap] > 1e-6 * size
     away[:, velocity] = 0.0
     away[~open_, gap] = away[~open_, gap_rate] = 0.0
-    found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    found = chosen + radius * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
     found[:, velocity] = 0.0
     found[open_, gap] = np.maximum(found[open_, gap], 1e-6 * size)
     found[~open_, gap] = found[~open_, gap_rate] = 0.0
     return found
 
 
-def home(states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"]) -> Bool[np.ndarray, " m"]:
+def home(
+    states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"], radius: float = RADIUS
+) -> Bool[np.ndarray, " m"]:
     """Which starts have come back: all of their last crossing states lie within half the tube."""
     size = np.mean(np.linalg.norm(states, axis=-1))
     points = np.where(np.isfinite(ends), ends, np.inf).reshape(-1, ends.shape[-1])
     finite = np.all(np.isfinite(points), axis=-1)
     points = np.where(finite[:, None], points, 0.0)
     apart = np.sum(points**2, axis=-1)[:, None] - 2 * points @ states.T + np.sum(states**2, axis=-1)
-    inside = finite & (np.min(apart, axis=1) <= (0.5 * RADIUS * size) ** 2)
+    inside = finite & (np.min(apart, axis=1) <= (0.5 * radius * size) ** 2)
     return np.all(inside.reshape(ends.shape[:-1]), axis=0)

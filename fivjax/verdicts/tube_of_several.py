@@ -10,6 +10,7 @@ def starts_of_several(
     states: Float[np.ndarray, "k 2n"],
     section: Float[np.ndarray, " n"],
     gaps: Int[np.ndarray, " c"],
+    radius: float = RADIUS,
 ) -> Float[np.ndarray, "m 2n"]:
     """States on the edge of the tube about weighted deviations `states`.
 
@@ -21,7 +22,7 @@ def starts_of_several(
     # A gap this small is a rounding error of contact.
     open_ = chosen[:, gaps] > 1e-6 * size
     away = _on_section(_closed(away, open_, gaps), section)
-    found = chosen + RADIUS * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    found = chosen + radius * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
     found[:, gaps] = np.where(open_, np.maximum(found[:, gaps], 1e-6 * size), 0.0)
     found[:, n + gaps] = np.where(open_, found[:, n + gaps], 0.0)
     return found
