@@ -1,1 +1,1 @@
-"""Many trajectories, each followed to its verdict: maps, critical kicks, what accuracy costs."""
+"""Many trajectories, each followed to its verdict: maps, basins, critical kicks, and the cost of accuracy."""

@@ -1,4 +1,4 @@
-"""Attractors that jobs have found, as bytes in a file (NumPy's npz, no pickles) and back, bit for bit."""
+"""Attractors that jobs have found, written to bytes (NumPy's npz, without pickles) and read again, bit for bit."""
 
 import io
 import json
@@ -11,7 +11,7 @@ from .captures import Cycle
 
 
 def to_bytes(found: dict[bytes, Attractors]) -> bytes:
-    """The attractors of groups, by the groups' parameters."""
+    """The attractors of groups, by the groups' parameters, as bytes."""
     arrays, index = {}, []
     for number, (key, one) in enumerate(found.items()):
         index.append([key.hex(), len(one.cycles), one.torus is not None])
@@ -27,7 +27,7 @@ def to_bytes(found: dict[bytes, Attractors]) -> bytes:
 
 
 def from_bytes(content: bytes) -> dict[bytes, Attractors]:
-    """What `to_bytes` was given."""
+    """The attractors that `to_bytes` has written."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     found = {}

@@ -1,4 +1,4 @@
-"""The table of attractors that a map's trajectories were captured by."""
+"""The table of the attractors that have captured a map's trajectories."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from jaxtyping import Int
 from ..verdicts.verdict import Verdict
 from .results import Verdicts
 
-# Amplitudes and periods of one cycle, computed from different guesses, agree to this.
+# Amplitudes and periods of the same cycle, computed from different guesses, agree to this relative error.
 SAME = 1e-6
 KINDS = np.array(["periodic", "torus"])
 
@@ -16,10 +16,10 @@ KINDS = np.array(["periodic", "torus"])
 def attractor_table(
     groups: Callable[[np.ndarray], Int[np.ndarray, " r"]], verdicts: Verdicts
 ) -> tuple[Int[np.ndarray, " trajectories"], dict[str, np.ndarray]]:
-    """Each trajectory's place in the table (-1 where it has none), and the table's columns by name.
+    """The index of each trajectory's attractor in the table (-1 without one), and the table's columns by name.
 
-    Attractors stand in the order of their groups, those of a group by amplitude. `groups` has the group of each
-    trajectory by its place.
+    Attractors are in the order of their groups, and by amplitude within a group. `groups` gives the group of each trajectory
+    from its index.
     """
     on_one = np.flatnonzero(verdicts.verdict == Verdict.LIMIT_CYCLE)
     columns = np.stack(

@@ -1,4 +1,4 @@
-"""What maps and critical kicks have in common: their axes and arguments, checked, and what their datasets say of the run."""
+"""Axes and arguments of maps and critical kicks, checked; and the critical friction that their datasets note."""
 
 import itertools
 import math
@@ -13,14 +13,14 @@ from ..model.scene import Scene, refuse_vector_contacts
 from ..steppers.base import AbstractStepper
 from .trajectories import Grid
 
-# Trajectories that a map may have: some 10 GB of results, and days of work.
+# The most trajectories of a map: some 10 GB of results, and days of work.
 MOST_TRAJECTORIES = 10**8
 
 
 def add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
     """Note the critical friction of linear theory where friction is an axis and nothing else changes it."""
     changes_it = set(scene.structure.parameters) & set(dataset.dims)
-    # Of the belt's speed only the sign counts.
+    # Only the sign of the belt speed matters.
     directions = np.unique(np.sign(dataset["belt_speed"] if "belt_speed" in dataset.dims else scene.belt_speed))
     if "mu" not in dataset.dims or changes_it or len(directions) != 1 or directions[0] == 0:
         return
@@ -35,16 +35,18 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
         hint = " Give the scene a Pulse as its load." if unknown[0] in ("p", "duration", "start") else ""
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
     checked = {name: arguments.axis(name, values) for name, values in axes.items()}
-    # Every rule on a parameter is a bound, or an order between two, so the corners of the grid stand for all of it.
+    # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the corners of the
+    # grid.
     for corner in itertools.product(*((values[0], values[-1]) for values in checked.values())):
         scene.replace(**dict(zip(checked, corner, strict=True)))
     return checked
 
 
 def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Grid:
-    """One trajectory for each combination of values on the axes, of which `states` are initial displacements and velocities.
+    """One trajectory for each combination of values on the axes; the axes named in `states` are initial displacements and
+    velocities.
 
-    **Raises:** `ValueError` for more of them than a map may have.
+    **Raises:** `ValueError` for more trajectories than a map may have.
     """
     total = math.prod(len(values) for values in axes.values())
     if total > MOST_TRAJECTORIES:

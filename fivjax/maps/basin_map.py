@@ -1,4 +1,4 @@
-"""Basins of attraction: where initial states lead, on the map's engine."""
+"""Basins of attraction: a map over initial states."""
 
 import contextlib
 from pathlib import Path
@@ -43,20 +43,20 @@ def basins(
 
     **Arguments:**
 
-    - `scene`: the scene; coordinates that are not on an axis start at the sliding equilibrium of the load's start.
+    - `scene`: the scene; coordinates that are not on an axis start at the sliding equilibrium under the load at the start.
     - `**axes`: one-dimensional, strictly increasing values: displacements (m) by the names of `scene.structure.coordinates`,
-      velocities (m/s) by these with a `d` before them; and, where wanted, any parameter of the scene, as in
-      `bistability_map`. Displacements are totals, as `y0` of `simulate` has them, not deviations.
-    - `kick`: whether the load goes through its history; unless wanted, it has its final value from the start.
+      velocities (m/s) by these names with a `d` in front; and any parameters of the scene, as in `bistability_map`.
+      Displacements are totals, as in `y0` of `simulate`, not deviations from sliding.
+    - `kick`: whether the load goes through its kick; else it has its final value from the start.
     - `method`, `t_max`, `memory`, `progress`, `executor`, `resume`: as in `bistability_map`.
 
     **Returns:** a dataset like that of `bistability_map`, with `verdict`, `amplitude` and `attractor` over the axes and the
-    table of attractors; beside it, over the attractors, `share` of the states that lead there, with `share_low` and
-    `share_high` (a Wilson interval of 95 %, as if the states were drawn at random), and the same of sliding as
-    `sliding_share`, `sliding_share_low` and `sliding_share_high`. States without a verdict count as none of them.
+    table of attractors. Over the attractors there is also `share`, the share of states that lead there, with `share_low` and
+    `share_high` (a 95 % Wilson interval, as if the states were drawn at random); for sliding these are `sliding_share`,
+    `sliding_share_low` and `sliding_share_high`. States without a verdict count for neither.
 
-    **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, no coordinate among them,
-    states below the belt, or on it and moving into it.
+    **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes without a coordinate, and
+    states below the belt or moving into it.
 
     **Example:**
 
@@ -101,7 +101,7 @@ def basins(
 
 
 def _states_among(scene: Scene, axes: dict) -> dict[str, int]:
-    """The axes that are displacements or velocities, with their places in the state."""
+    """The axes that are displacements or velocities, with their indices in the state."""
     known = state_places(scene.structure)
     unknown = [name for name in axes if name not in known and name not in scene.parameters]
     if unknown:
@@ -128,7 +128,7 @@ def _check_gap(scene: Scene, axes: dict[str, np.ndarray]) -> None:
 
 
 def _with_shares(dataset: xr.Dataset) -> xr.Dataset:
-    """With the share of each basin, and its interval."""
+    """The dataset with the share of each basin, and its interval."""
     total = dataset["verdict"].size
     reached = np.bincount(dataset["attractor"].values.ravel() + 1, minlength=dataset.sizes["attractors"] + 1)[1:]
     shares = np.stack(wilson(reached, total))

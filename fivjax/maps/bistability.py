@@ -1,4 +1,4 @@
-"""Bi-stability maps: many trajectories, one batch run, labelled results."""
+"""Bi-stability maps: the verdicts of many trajectories over any parameters, as a labelled dataset."""
 
 import contextlib
 import functools
@@ -38,7 +38,7 @@ def bistability_map(
     executor=None,
     **axes,
 ) -> xr.Dataset:
-    """Where a scene returns to sliding after its kick, and where it ends on a limit cycle; one batch run.
+    """Where a scene returns to sliding after its kick, and where it ends on a limit cycle, over any parameters.
 
         m = fj.bistability_map(scene, mu=np.linspace(0.05, 0.228, 64), p=np.linspace(1, 4, 64))
 
@@ -48,39 +48,43 @@ def bistability_map(
     - `**axes`: one-dimensional, strictly increasing values of any numeric parameter in `scene.parameters`, by name. One
       trajectory is run for each combination, from the sliding equilibrium of its own scene.
     - `method`: how to step, `EventExact()` unless given.
-    - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 20 s, or 2,000
-      periods of the structure's slowest mode if these are longer; and the time in which a motion just grows, without contact
-      events, is not counted: nobody has to step through it.
-    - `memory`: how much memory the jobs that run at a time in this process may take, in bytes; there is one at least.
+    - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 20 s or 2,000
+      periods of the structure's slowest mode, whichever is longer; where a cycle is known that attracts slowly, twelve of its
+      time constants. Time in which a motion grows slowly without contact events does not count, because it is not stepped
+      through.
+    - `memory`: the memory that all jobs running at a time in this process may take, in bytes; at least one job always runs.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
-    - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
+    - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.
     - `resume`: a file in which finished jobs are kept while the map runs, every few seconds; or a folder named `*.zarr`, for
       maps of many million trajectories, in which each job is kept at once and which `xarray.open_zarr` reads at any time (extra
-      `fivjax[zarr]`). If it exists, the map goes on from there: interrupted in whatever way and called again, on this
-      machine or another, the same call gives the same map, bit for bit. It stays; delete it when the map is saved.
-    - `executor`: who computes: threads of this process unless given, or anything like `concurrent.futures.ProcessPoolExecutor`
-      (loky, `mpi4py.futures`), a Dask `Client`, or a function that makes one of these. The map is the same, bit for bit. What
-      lost its worker is handed out anew; what kills its worker three times running alone has the verdict -9.
-    - `energy`: whether to keep each trajectory's energy ledger up to its verdict (see `fivjax.energy`): the works, the energy
-      lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), and `energy_residual`, the largest
-      error of the balance on the way, with `energy_exchanged` (the sizes of the works and the loss, net of each line) to
-      measure it against: 1e-8 of it at most, but for one trajectory in a thousand. It makes a map some ten times slower.
+      `fivjax[zarr]`). If it exists, the map goes on from there: after any interruption the same call, on this machine or
+      another, gives the same map, bit for bit. The file is not deleted at the end.
+    - `executor`: what runs the jobs: threads of this process unless given, or anything like
+      `concurrent.futures.ProcessPoolExecutor` (loky, `mpi4py.futures`), a Dask `Client`, or a function that makes one of these.
+      The map is the same, bit for bit. A job that lost its worker is run again; one that loses its worker three times while it
+      runs alone has the verdict -9.
+    - `energy`: whether to keep each trajectory's energy ledger up to its verdict (see `fivjax.energy`): work by line, the
+      energy lost in re-contacts, `kick_energy` (of the vibration when the kick ends, J), `energy_residual` (the largest error
+      of the balance, J) and its measure `energy_exchanged` (the sum of the sizes of the lines, J). The residual is at most 1e-8
+      of the energy exchanged, except in one trajectory of a thousand. A map with energies takes some ten times longer.
 
     - `refine`: how many times to halve the intervals of all axes, but only where neighbours differ in verdict or attractor. An
-      axis of n values becomes one of `(n - 1) * 2**refine + 1`; places that are not computed take what the place before them
-      on the coarser grid has, and the variable `computed` says which these are. What lies between the coarse grid's
-      places, and touches none, is missed.
-    - `audit`: the share of the places not computed that are computed all the same, at random, to count how many of them are
-      wrong: the attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its interval of 95 %, `audit_rate_low` and
+      axis of n values becomes one of `(n - 1) * 2**refine + 1`. Points that are not computed take the result of the point
+      before them on the coarser grid; the variable `computed` says which points were computed. A region between the points of
+      the coarse grid, which contains none of them, is missed.
+    - `audit`: the share of points not computed that are computed in the end all the same, at random, to count how many results
+      are wrong: attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its 95 % interval, `audit_rate_low` and
       `audit_rate_high`.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
     tangential speed on its attractor in m/s; 0 for sliding), `decided_at` (s), `contact_events` and `last_event` (s).
-    With an axis p, `p_crit_low` and `p_crit_high` over the others are the two kicks on it between which the limit cycle
-    first appears, proved to slide and proved to end on it, and `p_crit` is their middle, NaN where undecided kicks lie
-    between; `critical_perturbation` narrows that down. With an axis mu, the attribute `mu_crit` is the critical friction
-    of linear theory. Where no trajectory could be followed, all for the same reason, the attribute `failure` says it.
+    Which attractor captured a trajectory is `attractor`, an index into the table over `attractors`; `chaotic` marks undecided
+    trajectories from which neighbours diverge exponentially. With an axis p, `p_crit_low` and `p_crit_high` over the other axes
+    are the two kicks between which the limit cycle first appears, one proved to slide and one proved to end on a limit cycle,
+    and `p_crit` is their middle, NaN if undecided kicks lie between; `critical_perturbation` narrows that down. With an axis
+    mu, the attribute `mu_crit` is the critical friction of linear theory. If no trajectory could be followed, all for the same
+    reason, the attribute `failure` says why.
 
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes that are empty or
     not increasing, values that the scene refuses, and a `resume` file that belongs to another run.
@@ -126,7 +130,7 @@ def bistability_map(
             verdicts = run(label="map", verdicts=verdicts)
             return map_dataset(scene, method, t_max, grid, verdicts)
         verdicts = not_run(grid.total, bool(energy)) if verdicts is None else verdicts
-        found: dict = {}  # attractors, which another level need not find anew
+        found: dict = {}  # attractors, which finer levels need not find again
 
         def level(places: np.ndarray, what: str) -> None:
             run(label=f"map, {what}", verdicts=verdicts, places=places, attractors=found)

@@ -1,7 +1,7 @@
 """Batches of trajectories cut into blocks of one size, so that a scene is compiled once for any number of trajectories.
 
-A block is a number of rows of trajectories side by side. Those of a row belong to one *group* and share what is worked
-out once for it; blocks run in threads, one per core.
+A block consists of rows. The trajectories of a row belong to one *group* and share the data worked out for it. Blocks run in
+threads, one per core or device.
 """
 
 import os
@@ -12,18 +12,18 @@ import numpy as np
 
 from .flattened import Flattened
 
-# Trajectories that a block holds: few enough that they stay in a core's cache, enough to outweigh the start of each kernel.
+# Trajectories in a block: few enough to stay in a core's cache, and enough to outweigh the start of each kernel.
 BLOCK_ON_CPU = 64
 LARGE_BLOCK_ON_CPU = 512
-# Of several contacts each trajectory is more work, and a block that is filled up with copies costs as much as a full one.
+# With several contacts each trajectory is more work, and a block padded with copies costs as much as a full one.
 BLOCK_OF_SEVERAL = 16
 BLOCK_ELSEWHERE = 65536
-# Trajectories from which on it pays to compile the larger block.
+# The number of trajectories from which it pays to compile the larger block.
 MANY = 8192
 
 
 def workers() -> int:
-    # A block is too small for XLA to split among cores; blocks side by side use them all. Elsewhere each device has one.
+    # XLA does not split such a small block among cores, so there is a block for each core; elsewhere one for each device.
     if jax.default_backend() != "cpu":
         return len(jax.local_devices())
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
@@ -39,11 +39,11 @@ def in_blocks(
     in_place: bool = False,
     size: int | None = None,
 ) -> Flattened:
-    """`function(shared, trajectories)` of all trajectories, in blocks of one size: a scene is compiled once for any map.
+    """`function(shared, trajectories)` of all trajectories, in blocks of one size.
 
-    `group` says which row of `shared` is each trajectory's. In a block, `shared` has an axis of rows,
-    `trajectories` one more. With `in_place` the results, of the same form, take the place of `trajectories`. `size` is how many
-    a block holds on a CPU, unless it is to be chosen here.
+    `group` is the row of `shared` of each trajectory. In a block, `shared` has an axis of rows, and `trajectories` one more
+    axis, of length `width`. With `in_place` the results, of the same form, replace `trajectories`. `size` is the number of
+    trajectories in a block on a CPU; chosen here unless given.
     """
     slots, filled = _side_by_side(group, width)
     if jax.default_backend() != "cpu":
@@ -53,17 +53,17 @@ def in_blocks(
     rows, devices = max(1, size // width), jax.local_devices()
 
     def run(start: int, numbers: np.ndarray | None) -> Flattened:
-        # The last block is filled up with copies of its first row.
+        # The last block is padded with copies of its first row.
         chosen = np.arange(start, start + rows)
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
         place = slots[np.where(chosen < len(slots), chosen, start)]
         device = devices[start // rows % len(devices)] if len(devices) > 1 else None
-        with jax.enable_x64(True), jax.default_device(device):  # these settings are a thread's own
+        with jax.enable_x64(True), jax.default_device(device):  # each thread has its own settings
             own = Flattened(shared.numbers[group[place[:, 0]]], shared.form)
             result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
             part = np.asarray(result.numbers)
         numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers
-        # Into place at once, so that parts are not kept beside the whole.
+        # Written into the result at once, so that the parts do not take memory as well.
         numbers[place[real]] = part[real]
         return Flattened(numbers, result.form)
 
@@ -74,9 +74,8 @@ def in_blocks(
 
 
 def _side_by_side(group: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `width` trajectories of one group each, as places in `group`; what is left over repeats the row's first.
-
-    Second, which of the places are not such repetitions.
+    """Rows of `width` trajectories of the same group, as indices into `group`, padded with the first of the row; and which
+    entries are not padding.
     """
     order = np.argsort(group, kind="stable")
     _, first, count = np.unique(group[order], return_index=True, return_counts=True)

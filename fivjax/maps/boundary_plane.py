@@ -1,9 +1,10 @@
-r"""A plane of the Poincaré section through the saddle on the boundary: what slides, what squeals, how a critical kick comes in.
+r"""A plane of the Poincaré section through the saddle on the boundary: verdicts, the stable manifold, and nearly critical
+kicks.
 
 The plane is spanned by the saddle's unstable direction and its slowest stable one, right eigenvectors $r$ of the return map's
-derivative; with the left ones $l$ a state $x$ of the section has the coordinates $l · (x - x_s)$ in it, in sizes of the saddle.
-Where verdicts change along the unstable direction is the trace of the stable manifold; at the saddle it is tangent to the
-stable direction.
+derivative. With the left eigenvectors $l$, a state $x$ of the section has the coordinates $l · (x - x_s)$, relative to the size
+of the saddle. The stable manifold meets the plane where verdicts change along the unstable direction; at the saddle this curve
+is tangent to the stable direction.
 """
 
 from typing import TYPE_CHECKING
@@ -26,11 +27,11 @@ from .threshold import critical_perturbation
 if TYPE_CHECKING:
     import xarray as xr
 
-# How far beside the critical kick the two shown are, relative to it.
+# Relative distance of the two kicks shown from the critical one.
 BESIDE = 1e-7
-# A crossing is shown while less than this share of its distance from the saddle leads out of the plane.
+# A crossing is shown if the part of its distance from the saddle normal to the plane is less than this share.
 FLAT = 0.5
-# Rounds in which the manifold is narrowed down, and states inside a bracket.
+# Rounds of narrowing down the manifold, and states inside a bracket in each.
 ROUNDS, INSIDE = 2, 15
 
 
@@ -42,18 +43,19 @@ def boundary_section(
 
         fj.plot.boundary_section(fj.boundary_section(scene))
 
-    **Arguments:** `scene`, whose load is a `Pulse`; `reach`, half the width of the plane, in sizes of the saddle; `points`,
-    states on either axis; `p_range`, where the critical kick is looked for.
+    **Arguments:** `scene`, whose load is a `Pulse`; `reach`, half the width of the plane, relative to the size of the saddle;
+    `points`, the number of states on each axis; `p_range`, the range in which the critical kick is sought.
 
     **Returns:** a dataset with
 
-    - `verdict` over `stable` and `unstable`, the coordinates in the plane, in sizes of the saddle, which is at zero;
-    - `manifold` over `stable`, where verdicts change, NaN where they do not;
-    - `path` over `side` ("slides", "squeals"), `crossing` and `direction` ("unstable", "stable"): where the motion after a kick
-      just below and just above the critical one crosses the section, projected onto the plane; NaN far from it;
+    - `verdict` over `stable` and `unstable`, the coordinates in the plane, relative to the size of the saddle, which is at
+      zero;
+    - `manifold` over `stable`: the coordinate `unstable` at which verdicts change, NaN where they do not;
+    - `path` over `side` ("slides", "squeals"), `crossing` and `direction` ("unstable", "stable"): crossings of the section by
+      the motions after kicks just below and just above the critical one, projected onto the plane; NaN far from it;
     - the attributes `p_crit` and `multiplier`, the saddle's unstable one.
 
-    **Raises:** `ValueError` where no critical kick lands on the stable manifold of a saddle cycle.
+    **Raises:** `ValueError` if no critical kick lands on the stable manifold of a saddle cycle.
 
     **Example:**
 
@@ -107,24 +109,24 @@ def boundary_section(
 
 
 def _directions(saddle: Saddle, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unstable and the slowest stable direction (rows), of length one, and the rows that give a state's shares in them."""
+    """The unstable and the slowest stable direction (rows), of length one, and the rows that give a state's coordinates."""
     scaled = weights[:, None] * saddle.closed.jacobian / weights
     values, right = np.linalg.eig(scaled)
     order = np.argsort(-np.abs(values))[:2]
     chosen = right[:, order]
-    # Of a complex pair the real part will do: the plane is only looked at.
+    # Of a complex pair the real part is enough, because the plane only serves for a picture.
     basis = np.real(chosen / np.linalg.norm(chosen, axis=0))
     basis = basis / np.linalg.norm(basis, axis=0)
     unstable = saddle.left / (saddle.left @ basis[:, 0])
     beside = basis[:, 1] - (unstable @ basis[:, 1]) * basis[:, 0]
     beside = beside / np.linalg.norm(beside)
-    # The second row knows nothing of the first direction.
+    # The second row is orthogonal to the first direction.
     second = beside - (beside @ basis[:, 0]) * unstable
     return np.stack([basis[:, 0], beside]), np.stack([unstable, second / (second @ beside)])
 
 
 def _path(path: Crossings, weights: np.ndarray, origin: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The crossings in the plane's coordinates, in order; not numbers while they are far from the plane."""
+    """The crossings in the plane's coordinates, in order; NaN while they are far from the plane."""
     away = weights * path.y[: path.count] - origin
     inside = away @ left.T
     beside = np.linalg.norm(away - inside @ right, axis=-1)
@@ -132,7 +134,9 @@ def _path(path: Crossings, weights: np.ndarray, origin: np.ndarray, left: np.nda
 
 
 def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
-    """Where each row of verdicts changes between sliding and a limit cycle, narrowed down; the change closest to zero."""
+    """The coordinate at which each row of verdicts changes between sliding and a limit cycle, narrowed down; if there are
+    several changes, the one closest to zero.
+    """
     low, high = np.full((2, len(axis)), np.nan)
     for row, values in enumerate(verdict):
         flips = np.flatnonzero(_changes(values))
@@ -152,7 +156,7 @@ def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
 
 
 def _changes(verdict: np.ndarray) -> np.ndarray:
-    """Between which neighbours of the last axis a verdict changes from sliding to a limit cycle, or back."""
+    """Between which neighbours on the last axis the verdict changes from sliding to a limit cycle, or back."""
     pair = {int(Verdict.SLIDING), int(Verdict.LIMIT_CYCLE)}
     decided = np.isin(verdict, list(pair))
     return (verdict[..., 1:] != verdict[..., :-1]) & decided[..., 1:] & decided[..., :-1]

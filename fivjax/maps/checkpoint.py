@@ -1,9 +1,9 @@
-"""What a long run has finished, kept in one file while it goes on.
+"""The finished jobs of a long run, kept in one file while the run goes on.
 
-A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is
-written anew as a whole and appears under its name only then (`io.datasets.save`), so at any instant, also that of a power
-cut, the file is some earlier state of the run. A job is in it as a whole or not at all; so what a resumed run adds is, bit for
-bit, what the interrupted one would have found.
+A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is always
+written as a whole under another name and then renamed (`io.datasets.save`), so at any instant, even after a power failure, the
+file is some earlier state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the
+results of one that was not interrupted.
 """
 
 import json
@@ -21,14 +21,14 @@ from .results import Verdicts, by_name, worth_keeping
 from .trajectories import Places
 
 KIND = "fivjax checkpoint"
-# How often what is finished is written, s: seldom enough to cost nothing, often enough to lose little.
+# Time between writes, s: long enough to cost nothing, short enough to lose little.
 KEEP_EVERY = 2.0
 
 
 class Checkpoint:
-    """The file of a run: what an earlier one has left in it, and how more is kept there.
+    """The file of a run: reads the results of an earlier run, and writes new ones.
 
-    `run` describes the run in plain Python values (what `json` can hold).
+    `run` describes the run in plain Python values (that `json` can hold).
 
     **Raises:** as `recall`.
     """
@@ -46,7 +46,7 @@ class Checkpoint:
         self._written, self._new = time.monotonic(), False
 
     def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
-        """Keep what a job has come to, if it is time."""
+        """Keep the results of a job; they are written if it is time."""
         if found:
             self.found[int(places[0])] = found
         self._new = True
@@ -54,10 +54,10 @@ class Checkpoint:
             self.flush(verdicts)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def flush(self, verdicts: Verdicts) -> None:
-        """Write what is not written yet."""
+        """Write results that are not written yet."""
         if not self._new:
             return
         found = json.dumps({place: to_bytes(part).hex() for place, part in self.found.items()}).encode()
@@ -68,12 +68,12 @@ class Checkpoint:
 
 
 def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
-    """The results kept in a checkpoint, by name; None where there is no such file yet.
+    """The results kept in a checkpoint, by name; None if there is no such file yet.
 
-    `run` describes the run in plain Python values (what `json` can hold).
+    `run` describes the run in plain Python values (that `json` can hold).
 
     **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, and
-    the checkpoint of another run, with the first difference.
+    the checkpoint of another run, naming the first difference.
     """
     path = check_writable(path)
     if not path.exists():
@@ -91,9 +91,9 @@ def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
 
 
 def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
-    """Refuse what was kept of another run, with the first difference.
+    """Refuse the results of another run.
 
-    **Raises:** `ValueError`.
+    **Raises:** `ValueError`, naming the first difference.
     """
     ours = json.loads(json.dumps(run))
     for name in [*ours, *theirs]:
@@ -105,8 +105,8 @@ def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
 
 
 def keep(path: str | Path, run: dict, results: dict[str, np.ndarray]) -> None:
-    """Write the checkpoint; where the disk does not take it, say so and leave the earlier one."""
-    # Attractors are no values of trajectories.
+    """Write the checkpoint; if the disk does not take it, warn and leave the earlier one."""
+    # All results are over trajectories, except for the attractors, which are bytes.
     over = {name: "byte" if name == "found" else "trajectory" for name in results}
     dataset = xr.Dataset({name: (over[name], values) for name, values in results.items()})
     dataset.attrs.update(kind=KIND, run=json.dumps(run))

@@ -1,4 +1,4 @@
-"""What can be said of one trajectory by now: whether it has come to a known torus, and its verdict."""
+"""The verdict on one trajectory, as far as it can be proved at a given time; and its distance to a known torus."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,29 +12,31 @@ from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .progress import Progress, Setting
 
-# Steps between two looks at how near a trajectory is to a known torus: one or two cycles for the fastest method.
+# Steps between two comparisons of a trajectory with a known torus: one or two cycles for the fastest method.
 STEPS_PER_LOOK = 8
-# A deviation from equilibrium this much larger than the equilibrium itself, or than the belt's motion, has no bound.
+# A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
 GROWTH = 1e9
 
 
 def distance_to_torus(setting: Setting, now: Progress) -> Float[Array, ""]:
-    """Of the trajectory's last crossing to the known torus."""
+    """The distance of the trajectory's last crossing from the known torus, relative to its size."""
     return attractors.distance_to(setting.attractor, setting.scene.structure.weights * now.crossing)
 
 
 def look(
     setting: Setting, now: Progress, distance: Float[Array, ""], reached: Bool[Array, ""]
 ) -> tuple[Progress, Bool[Array, ""]]:
-    """A look at the trajectory's `distance` to the known torus, and whether it has `reached` it by now."""
+    """The trajectory with its `distance` to the known torus noted, and whether it has reached the torus by now."""
     crossing = setting.scene.structure.weights * now.crossing
     approach, reached_now = attractors.approached(now.approach, crossing, distance)
     return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
 
 
 def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: Bool[Array, ""]) -> Progress:
-    """The trajectory with the verdict, if it can be proved by now; it has been followed since the time `began` (s) and has
-    `reached` its known torus, or not. Cycles are known, and have captured it, elsewhere (`rounds`).
+    """The trajectory with its verdict, if one can be proved by now.
+
+    `began` is the time (s) at which the present round of steps began; `reached` says whether it has reached the known torus.
+    Capture by cycles is tested elsewhere (`rounds`).
     """
     scene, mechanics, modes = setting.scene, setting.mechanics, setting.modes
     structure = scene.structure
@@ -43,7 +45,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
     belt = weights[velocity] * jnp.abs(scene.belt_speed)
     yardstick = jnp.max(jnp.abs(weights * equilibrium)) + (jnp.max(belt) if mechanics.several else belt)
     grown = jnp.max(jnp.abs(weights * now.y)) > GROWTH * yardstick
-    # That several contacts jam is not proved.
+    # There is no proof that several contacts stick for ever.
     jammed = jnp.asarray(False)
     if setting.drift is not None:
         jammed = sticks_forever(setting.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
@@ -74,8 +76,8 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
 
 
 def _may_slide_on(setting: Setting, now: Progress) -> bool:
-    """Whether a motion that grows slowly may skip to its next event: where the sliding of one contact is linear, computed
-    exactly, and nobody asks where its energy goes on the way.
+    """Whether a motion that grows slowly may skip the time to its next event: with one contact, constant friction, an exact
+    method, and without an energy ledger.
     """
     mechanics = setting.mechanics
     return not mechanics.several and mechanics.friction.constant and np.isinf(setting.method.dt) and now.energy is None

@@ -1,4 +1,4 @@
-"""Critical kicks to rounding, with their kind and their derivatives, proved on either side anew."""
+"""Critical kicks to rounding, with kind and derivatives, and with trajectories on both sides that prove them."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from ..verdicts.verdict import Verdict
 from .crossing import Crossing
 
 KINDS = ("none", "manifold", "grazing")
-# Relative distance from a critical kick at which either side is proved.
+# Relative distance of the two proving trajectories from a critical kick.
 BESIDE = 1e-9
 
 NO_CHANGE = "no change from sliding to a limit cycle lies in the range"
@@ -21,16 +21,16 @@ NOT_PROVED = "the verdicts on either side contradict what Newton's method found:
 
 
 def differentiable(scene: Scene) -> tuple[str, ...]:
-    """Names of the parameters that a critical kick is differentiated in: all numbers but p itself."""
+    """Names of the parameters by which a critical kick is differentiated: all scalar ones but p itself."""
     return tuple(name for name, value in scene.parameters.items() if np.ndim(value) == 0 and name != "p")
 
 
 def with_derivatives(
     scene: Scene, verdicts, columns: dict[str, np.ndarray], found: Crossing
 ) -> tuple[Crossing, dict[str, np.ndarray]]:
-    """The crossings by Newton's method where it finds them, and kind, derivatives and reasons for each row.
+    """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
 
-    `verdicts` are those of rows at their own values of p, as a function of columns, kicks and a label.
+    `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p.
     """
     names, rows = differentiable(scene), len(found.middle)
     kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
@@ -38,7 +38,7 @@ def with_derivatives(
     middle, low, high = found.middle.copy(), found.low.copy(), found.high.copy()
     left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
     why[left] = NO_SADDLE
-    # What passes no saddle, or one that is not the border, may just touch another contact mode.
+    # A motion that passes no saddle, or one that is not on the boundary, may just touch another contact mode.
     for name, method in ((KINDS[1], critical_kick), (KINDS[2], grazing_kick)):
         critical: dict[int, Critical | GrazingKick] = {}
         for row in left:

@@ -1,4 +1,4 @@
-"""Where verdicts along kicks change from sliding to limit cycle: what is proved on either side, and what is not."""
+"""Where verdicts over kicks change from sliding to limit cycle: the proved kicks on both sides, and undecided ones between."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from ..verdicts.verdict import Verdict
 
-# The kick that is none.
+# The value of p that is no kick.
 NO_KICK = 1.0
 
 
@@ -16,7 +16,7 @@ class Crossing(NamedTuple):
     low: np.ndarray  # largest kick proved to slide below it
     high: np.ndarray  # smallest kick proved to end on a limit cycle above it
     middle: np.ndarray  # between the two; NaN where trajectories in between are undecided
-    changes: np.ndarray  # changes between decided neighbours that were seen at all
+    changes: np.ndarray  # the number of changes between decided neighbours
 
     @property
     def brackets(self) -> np.ndarray:
@@ -24,16 +24,17 @@ class Crossing(NamedTuple):
 
 
 def with_ends(inner: np.ndarray) -> np.ndarray:
-    """Verdicts inside brackets (rows, kicks) between those at their ends, which are proved: sliding and limit cycle."""
+    """Verdicts inside brackets (rows, kicks), with the proved ones of their ends added: sliding and limit cycle."""
     ends = np.broadcast_to([[Verdict.SLIDING, Verdict.LIMIT_CYCLE]], (len(inner), 2))
     return np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
 
 
 def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> Crossing:
-    """The first crossing of each row of `verdicts` (rows, kicks) at `kicks`, one row for all or one for each.
+    """The first crossing of each row of `verdicts` (rows, kicks) at `kicks` (one row for all, or one for each).
 
-    Where a row ends on the limit cycle from its first kick on, that kick is `high` and the middle. An undecided kick of
-    `NO_KICK` before it stands for the same: no kick at all is no motion, and only a stable equilibrium is proved to slide.
+    If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle. The same holds if only an
+    undecided kick of `NO_KICK` comes before it: without a kick there is no motion, and an unstable equilibrium is not proved to
+    slide.
     """
     kicks = np.broadcast_to(kicks, verdicts.shape)
     low, high, middle = (np.full(len(verdicts), np.nan) for _ in range(3))

@@ -1,4 +1,4 @@
-"""The dataset of a map: verdicts, attractors and what the run was, labelled."""
+"""The labelled dataset of a map: verdicts, attractors and the settings of the run."""
 
 import json
 
@@ -20,7 +20,7 @@ from .trajectories import Grid
 
 
 def time_limit(t_max: float | None) -> dict[str, float]:
-    """The attribute that says it, where one was given."""
+    """The attribute for a time limit, if one was given."""
     return {} if t_max is None else {"t_max": t_max}
 
 
@@ -34,7 +34,7 @@ def map_dataset(
 ) -> xr.Dataset:
     """The labelled dataset of a grid of trajectories.
 
-    `source` is of each the one whose result it takes, where not all were computed.
+    `source`, if not all trajectories were computed: for each one the trajectory whose result it takes.
     """
     axes, shape = grid.axes, grid.shape
     place, table = attractor_table(grid.groups, verdicts)

@@ -1,7 +1,7 @@
-"""Many trajectories, each followed until its verdict is known: jobs, who runs them, progress, and what is kept on the way.
+"""Many trajectories, each followed until its verdict is known: jobs, executors, progress, and results kept on disk.
 
-A trajectory (`progress`, `conclusion`) is one of a group that shares its mechanics (`sharing`); some groups are a job (`plan`,
-`jobs`), whose trajectories are followed in blocks of one size, round by round (`rounds`).
+A trajectory (`progress`, `conclusion`) belongs to a group that shares its mechanics (`sharing`); several groups make a job
+(`plan`, `jobs`), whose trajectories are followed in blocks of one size, round by round (`rounds`).
 """
 
 import contextvars
@@ -30,21 +30,21 @@ from .results import Verdicts, counted, not_run
 from .sharing import grouped
 from .trajectories import Places
 
-# Steps that a trajectory may take: 10⁵ cycles with their events, and some hours of work for a map of them.
+# The most steps of a trajectory: enough for 10⁵ cycles with their events; a map of such trajectories takes hours.
 MOST_STEPS = 2**21
 
 
 class Keeper(Protocol):
-    """What keeps results on disk while a run goes on."""
+    """An object that keeps results on disk while a run goes on."""
 
-    found: dict[int, dict[bytes, Attractors]]  # by earlier jobs, each by its first place
+    found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
 
     def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
-        """Keep what the job of these places has come to; `verdicts` are those of all trajectories."""
+        """Keep the results of the job with these trajectories; `verdicts` are those of all trajectories."""
         ...
 
     def flush(self, verdicts: Verdicts) -> None:
-        """Keep what is not kept yet."""
+        """Keep results that are not kept yet."""
         ...
 
 
@@ -68,21 +68,17 @@ def run_to_verdict(
 ) -> Verdicts:
     """Follow one trajectory for each row of `values` (a `Grid`, or equally long columns by name) until its verdict.
 
-    `energy` asks for the ledger of each at its end.
+    - `energy`: whether to keep the energy ledger of each trajectory.
+    - `states`: names in `values` that are initial displacements or velocities instead of parameters, with their indices in the
+      state; all other coordinates begin at the sliding equilibrium.
+    - `attractors`: those found in an earlier run over the same parameters; new ones are added.
+    - `executor`: runs the jobs; unless given, threads of this process do, as many at a time as `memory` (bytes) allows.
+    - `places`: indices of the trajectories to run, all unless given.
+    - `verdicts`: results of an earlier run; missing ones are added. A job with any missing result is run as a whole.
+    - `keeper`: gets the results of each job.
 
-    `states` are names of `values` that are no parameters but displacements or velocities at the beginning, with their places in
-    the state; others begin at the sliding equilibrium.
-
-    `attractors` has those that were found in an earlier run over the same parameters, and gets the new ones.
-
-    `executor` runs the jobs; unless given, threads of this process do, and `memory` bounds how many run at a
-    time.
-
-    `places` are those that are to be run, all unless given. `verdicts` has those of all that an earlier run has left, and gets
-    the others: a job of which any is missing is run as a whole. `keeper` is handed what each job comes to.
-
-    Interrupted by the user, it returns what is decided by then, of jobs in other processes what the finished ones have decided;
-    the rest is `Verdict.NOT_RUN`.
+    Interrupted by the user, it returns the verdicts known by then (of jobs in other processes, those of finished jobs); all
+    other trajectories have `Verdict.NOT_RUN`.
     """
     plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
     verdicts = not_run(plan.trajectories.total, energy) if verdicts is None else verdicts
@@ -92,7 +88,7 @@ def run_to_verdict(
     at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
     with stop_requests() as requested, _Bar(label, total, total - int(pending.sum()), progress) as bar:
         try:
-            # By another run of the same trajectories, or by jobs that share a group.
+            # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
             needed_later = places is not None or bool(plan.parts[-1])
             for part in plan.parts:
                 _follow(plan, part, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested)
@@ -121,7 +117,7 @@ def _follow(
     bar: "_Bar",
     requested: list[int],
 ) -> None:
-    """Has the jobs of a part done whose results are missing, and adds to the attractors what its jobs have found."""
+    """Run the jobs of one part of the plan whose results are missing, and add the attractors that they find."""
     missing = [number for number in part if np.any(verdicts.pending[plan.jobs[number]])]
     found: dict[int, dict[bytes, Attractors]] = {}
     if keeper is not None and keeper.found:
@@ -146,7 +142,7 @@ def _follow(
             bar.ended(len(places))
 
     def given_up(number: int) -> None:
-        # Not kept: with more memory, or another machine, the job may well be done.
+        # Not kept on disk: with more memory, or on another machine, the job may succeed.
         verdicts.verdict[plan.jobs[number]] = Verdict.WORKER_LOST
         bar.ended(len(plan.jobs[number]))
 
@@ -167,7 +163,7 @@ def _follow(
             mine = Workers(threads)
 
             def here(number: int):
-                # Of a job that is interrupted nothing is kept to go on from, so that all results are those of whole jobs.
+                # Results of an interrupted job are returned but not kept on disk, so that all results kept are of whole jobs.
                 partly = functools.partial(write, number)
                 return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report, partly)
 
@@ -185,14 +181,14 @@ def _follow(
 
 
 class _Bar:
-    """A bar of trajectories that have ended, which several threads may move."""
+    """A progress bar of trajectories that have ended; several threads may update it."""
 
     def __init__(self, label: str, total: int, already: int, shown: bool | None):
         self.label, self.reports, self.lock = label, 0, threading.Lock()
         self.bar = tqdm(
             total=total,
             initial=already,
-            # Nothing moves until the first round is compiled, which takes longer than many a map.
+            # Nothing moves until the first round is compiled, which may take longer than the map.
             desc=f"{label}, compiling …",
             unit=" trajectories",
             disable=None if shown is None else not shown,
@@ -205,9 +201,9 @@ class _Bar:
         self.bar.close()
 
     def ended(self, count: int) -> None:
-        """So many more have ended."""
+        """Count so many more trajectories as ended."""
         with self.lock:
             self.reports += 1
-            if self.reports == 2 or (self.reports == 1 and count):  # the first one comes before anything was followed
+            if self.reports == 2 or (self.reports == 1 and count):  # the first report comes before any step
                 self.bar.set_description(self.label, refresh=False)
             self.bar.update(count)

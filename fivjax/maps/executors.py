@@ -1,14 +1,14 @@
-"""Where jobs run: any executor in the manner of `concurrent.futures`, and how to have another when its workers die.
+"""Executors of jobs: any in the manner of `concurrent.futures`, and how a new one is made when its workers die.
 
-What is taken for an executor:
+An executor is
 
-- anything with `submit(function, *arguments)` that gives futures with `add_done_callback` and `result`: thread and process
-  pools, loky, `mpi4py.futures`, and what `client.get_executor()` of Dask gives;
+- any object with `submit(function, *arguments)` that returns futures with `add_done_callback` and `result`: thread and process
+  pools, loky, `mpi4py.futures`, and the result of Dask's `client.get_executor()`;
 - a Dask `Client`, recognised by its `get_executor`;
-- a class or a function that makes one without arguments. fivjax then shuts it down, and calls the function anew when the
-  workers of the earlier one have died and taken it with them (`BrokenProcessPool`).
+- a class or a function that makes one without arguments. fivjax then shuts it down at the end, and calls the function again if
+  the workers have died and broken the executor (`BrokenProcessPool`).
 
-A `concurrent.futures.ProcessPoolExecutor` that broke is made anew from what it was made with.
+A broken `concurrent.futures.ProcessPoolExecutor` is made anew with the same arguments.
 """
 
 import contextlib
@@ -22,13 +22,13 @@ from ..foundation import arguments
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Jobs that are handed out before the first is back, where the number of workers is not known.
+# The most jobs handed out at a time, if the number of workers is not known.
 HANDED_OUT = 512
 MOST_BREAKS = 32
 
 
 def with_workers(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, with `Workers` in place of what a user gives it as `executor`, until it ends."""
+    """`function`, which gets `Workers` in place of the user's `executor`; they are closed when it ends."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -43,7 +43,7 @@ def with_workers(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check_executor(executor) -> None:
-    """Refuse what no job can be handed to, and pools whose workers are copies of this process.
+    """Refuse objects that take no jobs, and pools whose workers are forked from this process.
 
     **Raises:** `TypeError`, `ValueError`.
     """
@@ -63,7 +63,7 @@ def check_executor(executor) -> None:
 
 
 class Workers:
-    """An executor of one of the kinds above, as something that jobs are submitted to and that can be had anew."""
+    """An executor of one of the kinds above, which can be replaced when it breaks."""
 
     def __init__(self, executor):
         self._made_here = _makes_one(executor)
@@ -73,7 +73,7 @@ class Workers:
 
     @property
     def side_by_side(self) -> int | None:
-        """How many jobs run at a time, in the order in which they were submitted; None where that is not known."""
+        """The number of jobs that run at a time, in the order in which they were submitted; None if that is not known."""
         return getattr(self._executor, "_max_workers", None)
 
     def submit(self, function, *given):
@@ -81,9 +81,9 @@ class Workers:
         return self._executor.submit(function, *given)
 
     def renew(self) -> None:
-        """Another executor in place of one whose workers have died.
+        """Replace an executor whose workers have died.
 
-        **Raises:** `RuntimeError` where there is no way to have one, and where all workers die before any job is done.
+        **Raises:** `RuntimeError` if a new one cannot be made, or if executors keep breaking before any job is done.
         """
         self._breaks += 1
         if self._breaks > MOST_BREAKS:
@@ -105,20 +105,20 @@ class Workers:
             )
 
     def progressed(self) -> None:
-        """A job is done: the workers can do them."""
+        """Note that a job is done, so the workers are able to do jobs."""
         self._breaks = 0
 
     def take_back(self, futures) -> None:
-        """Nobody waits for these any more."""
+        """Cancel futures that are no longer needed."""
         for future in futures:
             future.cancel()
             self._left_running |= not future.done()
 
     def close(self) -> None:
-        """Ends an executor that was made here, and what it still runs."""
+        """Shut down an executor that was made here, with the jobs that it still runs."""
         if not self._made_here:
             return
-        # Else the program would wait at its end for work that nobody wants.
+        # Otherwise the program would wait at its end for results that are not needed.
         processes = dict(getattr(self._executor, "_processes", None) or {}) if self._left_running else {}
         with contextlib.suppress(TypeError):
             self._executor.shutdown(wait=False, cancel_futures=True)
@@ -127,14 +127,14 @@ class Workers:
 
 
 def _makes_one(executor) -> bool:
-    # Of a class the methods are there, and need an object of it.
+    # A class has the methods, too, but they need an instance.
     return isinstance(executor, type) or not (hasattr(executor, "submit") or hasattr(executor, "get_executor"))
 
 
 def _adopted(executor):
-    """What jobs are submitted to.
+    """The object to which jobs are submitted.
 
-    **Raises:** `TypeError`, `ValueError` for what a function has made that is no executor.
+    **Raises:** `TypeError` or `ValueError` if a function has made an object that is no executor.
     """
     if hasattr(executor, "get_executor"):
         return _OfDask(executor)
@@ -148,39 +148,39 @@ def _adopted(executor):
 
 
 class _OfDask:
-    """A Dask `Client`, used directly: a future of its `get_executor` never ends when its result is lost and its job is not
-    tried again.
+    """A Dask `Client`, used directly, because a future of its `get_executor` never ends if its result was lost with a worker
+    and the job is not tried again.
     """
 
     def __init__(self, client):
         self._client = client
 
     def submit(self, function, *given):
-        # Not pure: a job that was lost and comes again is not the same task to Dask.
+        # Not pure, so that a job which was lost and is submitted again is a new task for Dask.
         return self._client.submit(function, *given, pure=False)
 
 
 def _like(broken: ProcessPoolExecutor) -> Executor:
-    # What it was made with is in no public attribute.
+    # The arguments it was made with are in no public attributes.
     names = {"max_workers": "_max_workers", "mp_context": "_mp_context", "initializer": "_initializer"}
     names |= {"initargs": "_initargs", "max_tasks_per_child": "_max_tasks_per_child"}
     return ProcessPoolExecutor(**{name: getattr(broken, own) for name, own in names.items() if hasattr(broken, own)})
 
 
 def is_loss(error: BaseException) -> bool:
-    """Whether a job that ended so was lost with its worker, as opposed to having failed."""
+    """Whether the error means that the job was lost with its worker, as opposed to having failed."""
     return isinstance(error, ConnectionError) or bool(
         {"BrokenExecutor", "CancelledError", "KilledWorker", "CommClosedError"} & _kinds(error)
     )
 
 
 def is_broken(error: BaseException) -> bool:
-    """Whether the executor was lost as well."""
+    """Whether the error means that the executor is broken as well."""
     return "BrokenExecutor" in _kinds(error)
 
 
 def is_proof(error: BaseException) -> bool:
-    """Whether the executor itself has tried the job on several workers, which died (Dask)."""
+    """Whether the error means that the executor has tried the job on several workers, all of which died (Dask)."""
     return "KilledWorker" in _kinds(error)
 
 

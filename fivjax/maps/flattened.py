@@ -1,4 +1,4 @@
-"""A tree of arrays as one array of numbers, one row per trajectory: calls that take few arrays start faster."""
+"""A tree of arrays as one array of numbers, with one row per trajectory: calls with few arrays start faster."""
 
 import math
 
@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-# Rows that are copied at a time.
+# Number of rows copied at a time.
 MOVED_AT_ONCE = 4096
 
 
 class Flattened(eqx.Module):
-    """The leaves of a tree side by side; they are real, complex, whole or truth values, which double precision holds."""
+    """The leaves of a tree side by side, in double precision: real, complex, integer or boolean values."""
 
     numbers: Float[Array, "*rows m"]
-    form: tuple = eqx.field(static=True)  # the tree's structure, and of each leaf its shape in one row and its type
+    form: tuple = eqx.field(static=True)  # the tree's structure, and the shape in one row and the type of each leaf
 
     @property
     def tree(self) -> PyTree:
-        """The tree again; of a NumPy array, its real leaves are views: what is written there is written here."""
+        """The tree again. For a NumPy array its real leaves are views: writing to them changes this array."""
         structure, shapes, types = self.form
         leaves, start, rows = [], 0, self.numbers.shape[:-1]
         for shape, kind in zip(shapes, types, strict=True):
@@ -35,18 +35,18 @@ class Flattened(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
     def compacted(self, rows: Int[np.ndarray, " r"]) -> "Flattened":
-        """Only these rows, in rising order, moved to the array's beginning in place: there is never a second array."""
+        """Only these rows, in rising order, moved in place to the beginning of the array, without a second array."""
         if len(rows) == len(self.numbers):
             return self
         for start in range(0, len(rows), MOVED_AT_ONCE):
             chosen = rows[start : start + MOVED_AT_ONCE]
-            # None of them lies before the place that it comes to, so nothing is written over that is still wanted.
+            # No row moves to a higher index, so no row that is still needed is overwritten.
             self.numbers[start : start + len(chosen)] = self.numbers[chosen]
         return Flattened(self.numbers[: len(rows)], self.form)
 
 
 def flatten(tree: PyTree, row_axes: int = 1) -> Flattened:
-    """A tree whose leaves have this many leading axes in common."""
+    """The flattened form of a tree whose leaves have `row_axes` leading axes in common."""
     leaves, structure = jax.tree.flatten(tree)
     xp = np if all(isinstance(leaf, np.ndarray) for leaf in leaves) else jnp
 

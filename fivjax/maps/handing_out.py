@@ -1,8 +1,8 @@
-"""Jobs handed out to workers that may die, and handed out anew until each is done or proved to kill whoever runs it.
+"""Jobs handed out to workers that may die, until each job is done or proved to kill its worker.
 
-Who runs a job that dies with its worker is not known where several run side by side: a broken pool names no culprit. So a job
-that was lost is first run again behind all others. One that is lost `MOST_LOSSES` times waits until all else is done, and then
-runs alone; if its worker dies `MOST_LOSSES` times again, it is the job's own doing.
+If several jobs run at a time, a broken pool does not tell which of them killed a worker. So a lost job is first run again after
+all others. A job that is lost `MOST_LOSSES` times waits until all others are done, and then runs alone; if its worker dies
+`MOST_LOSSES` times again, the job is the cause and is given up.
 """
 
 import queue
@@ -13,7 +13,7 @@ from typing import Any
 from .executors import HANDED_OUT, Workers, is_broken, is_loss, is_proof
 
 MOST_LOSSES = 3
-# How often a request to stop is looked for while nothing comes back, s.
+# Time between two checks for a request to stop, while no result arrives, s.
 LOOK_EVERY = 0.2
 
 
@@ -25,15 +25,15 @@ def hand_out(
     given_up: Callable[[int], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Has all jobs (numbers) done: `submit` hands one out and gives its future, `done` gets its result, in any order.
+    """Run all jobs (numbers): `submit` hands one out and returns its future, `done` gets its result, in any order.
 
-    `given_up` is told of jobs that kill their workers.
+    `given_up` is called for jobs that kill their workers.
 
-    **Raises:** `KeyboardInterrupt` once `stop()` is true, or where a worker was interrupted; `RuntimeError` where workers
-    cannot be had; and what a job raises.
+    **Raises:** `KeyboardInterrupt` once `stop()` is true, or if a worker was interrupted; `RuntimeError` if there are no
+    workers any more; and anything that a job raises.
     """
     waiting, suspects = deque(jobs), deque()
-    # Lost side by side with others, and lost alone.
+    # How often each job was lost while others ran, and while it ran alone.
     lost, lost_alone = Counter(), Counter()
     under_way: dict[Any, int] = {}  # futures, in the order in which they were handed out
     alone: int | None = None  # the job that runs alone
@@ -53,7 +53,7 @@ def hand_out(
                     if not under_way:
                         workers.renew()
                         continue
-                    break  # those that are under way will say the same
+                    break  # the futures under way will report the same error
                 chosen.popleft()
                 under_way[future] = number
                 future.add_done_callback(back.put)
@@ -79,13 +79,13 @@ def hand_out(
                 continue
             gone = [(future, number)]
             if is_broken(error):
-                # What was finished before the workers died is still to be heard of.
+                # Jobs that were finished before the workers died still report their results.
                 gone += [one for one in under_way.items() if not _finished(one[0])]
                 for one, _ in gone[1:]:
                     del under_way[one]
                 workers.renew()
             for one, number in gone:
-                # In a queue that is served in order, only the first ones had begun.
+                # Jobs begin in order, so only the first ones were running.
                 blamed = MOST_LOSSES if is_proof(error) else int(one in running)
                 if number == alone:
                     lost_alone[number] += blamed

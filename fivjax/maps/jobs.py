@@ -1,7 +1,7 @@
-"""A map as independent jobs: each a pure function from what it holds to its results, for any process on any machine.
+"""A map as independent jobs: each is a pure function from its data to its results, for any process on any machine.
 
-A job runs some trajectories of a map. What they come to follows from the job alone: not from who runs it, nor from what runs
-beside it. A job is run as a whole or not at all, so an interrupted map is gone on with by its missing jobs.
+A job runs some trajectories of a map. Its results follow from the job alone, not from the worker or from other jobs. A job is
+run as a whole or not at all, so an interrupted map continues with its missing jobs.
 """
 
 from collections.abc import Callable
@@ -23,22 +23,22 @@ from .sharing import Batch
 
 
 class Task(NamedTuple):
-    """What all jobs of a run have in common."""
+    """The data that all jobs of a run have in common."""
 
-    scene: Scene  # with NumPy's arrays: JAX's lose their precision where they are unpickled
+    scene: Scene  # with NumPy arrays, because JAX arrays lose double precision when they are unpickled
     method: AbstractStepper | Windowed
-    names: tuple[str, ...]  # parameters that make groups
-    history: tuple[str, ...]  # those of the load's history
-    states: dict[str, int]  # displacements and velocities at the beginning, with their places in the state
+    names: tuple[str, ...]  # parameters that differ between groups
+    history: tuple[str, ...]  # parameters of the kick
+    states: dict[str, int]  # initial displacements and velocities, with their indices in the state
     t_max: float | None
     max_steps: int
     energy: bool
-    width: int  # trajectories of a group side by side
-    many: bool  # so many in all jobs that code which runs faster repays what it takes to compile
+    width: int  # trajectories of a group in a row of a block
+    many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
 
 
 class Job(NamedTuple):
-    """Some trajectories of a run, and the attractors of their groups as far as they are known."""
+    """Some trajectories of a run, and the known attractors of their groups."""
 
     task: Task
     values: dict[str, np.ndarray]
@@ -46,7 +46,7 @@ class Job(NamedTuple):
 
 
 class Done(NamedTuple):
-    """What a job comes to: its trajectories' ends, and attractors that were not known to it."""
+    """The results of a job: verdicts of its trajectories, and attractors that it has found."""
 
     verdicts: Verdicts
     found: dict[bytes, Attractors]
@@ -61,8 +61,8 @@ def run_job(
 ) -> Done:
     """The results of a job.
 
-    Where it runs, it may use `threads`; `report` is told how many trajectories have ended, and may end it by an exception:
-    `interrupted` is then handed what is decided by then.
+    It may use `threads` of the process it runs in. `report` gets the number of trajectories that have ended and may stop the
+    job by an exception; `interrupted` then gets the verdicts known by then.
     """
     if threads is None:
         with ThreadPoolExecutor(max_workers=1) as one:

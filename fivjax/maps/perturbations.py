@@ -1,8 +1,8 @@
-r"""What may be smallest about a perturbation of steady sliding: an initial state, or a history of the load.
+r"""Perturbations of steady sliding whose smallest size is sought: initial states, and histories of the load.
 
-Both are vectors $u$ with a norm, and both move, as long as the contact slides under constant friction, the two signals that end
-sliding linearly: a signal's change at the time $t$ is $κ(t) · u$. No $u$ smaller than the margin over $\sup_t |κ(t)|_*$, of the
-dual norm, ever ends it: such a perturbation is proved to slide for ever. The supremum is bounded between instants, too.
+Both are vectors $u$ with a norm. While the contact slides under constant friction, both change the two quantities that end
+sliding (normal force and slip speed) linearly: the change at the time $t$ is $κ(t) · u$. So no $u$ with a norm below the margin
+over $\sup_t |κ(t)|_*$, in the dual norm, ever ends sliding. The supremum is bounded between instants, too.
 """
 
 from typing import NamedTuple, Protocol
@@ -22,9 +22,9 @@ from ..steppers.core import follow
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 
-# Instants in a period of the fastest mode, while a history lasts and afterwards.
+# Instants per period of the fastest mode, during a history and afterwards.
 FINE, COARSE = 1500, 128
-# Instants that are looked at together, and histories that are followed together.
+# Instants evaluated at a time, and histories followed at a time.
 CHUNK, SIDE_BY_SIDE = 4096, 64
 MOST_INSTANTS = 2_000_000
 
@@ -32,38 +32,40 @@ Vectors = Float[np.ndarray, "k m"]
 
 
 class Certificate(NamedTuple):
-    """A norm below which every perturbation slides for ever, and the shapes (of norm one) that come closest to ending that."""
+    """A norm below which every perturbation slides for ever, and the shapes (of norm one) that come closest to ending
+    sliding.
+    """
 
     size: float
     shapes: Vectors
 
 
 class StableSliding(NamedTuple):
-    """Sliding in modal coordinates, of one scene."""
+    """The sliding motion of one scene in modal coordinates."""
 
     modes: SlidingModes
     linear: LinearSliding
-    shift: Complex[np.ndarray, " k"]  # of the equilibrium by the load, in modal coordinates
-    signals: tuple[tuple[np.ndarray, float], ...]  # shares of modes in slip and in pressing, and the margin of each
+    shift: Complex[np.ndarray, " k"]  # shift of the equilibrium by the load, in modal coordinates
+    signals: tuple[tuple[np.ndarray, float], ...]  # shares of the modes in slip and in pressing, and their margins
 
 
 class Perturbation(Protocol):
-    """A kind of perturbation, as a search for the smallest one wants it."""
+    """A kind of perturbation, with the functions that a search for the smallest one needs."""
 
     sliding: StableSliding
 
     def norm(self, u: Vectors) -> Float[np.ndarray, " k"]: ...
 
     def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """The vector of norm one whose product with a gradient is largest."""
+        """The vector of norm one with the largest scalar product with a gradient."""
         ...
 
     def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
-        """Deviations from sliding when all is over but the motion."""
+        """Deviations from sliding at the end of the perturbation."""
         ...
 
     def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
-        """The gradient in u from that in the state."""
+        """The gradient by u, from the gradient by the state."""
         ...
 
     def certificate(self) -> Certificate: ...
@@ -72,7 +74,7 @@ class Perturbation(Protocol):
 def stable_sliding(scene: Scene) -> StableSliding:
     """Sliding in modal coordinates, without the leading axis of groups.
 
-    **Raises:** `ValueError` where steady sliding does not exist or is not stable.
+    **Raises:** `ValueError` if steady sliding does not exist or is not stable.
     """
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], _linear(scene))
     modes = sliding_modes(batch)
@@ -102,7 +104,7 @@ class InitialStates:
         energy = np.zeros((2 * len(free), 2 * len(free)))
         energy[: len(free), : len(free)] = np.asarray(scene.structure.stiffness)[np.ix_(free, free)]
         energy[len(free) :, len(free) :] = np.asarray(scene.structure.mass)[np.ix_(free, free)]
-        # Half of z · energy z is the energy; `root` times a unit vector is a state of one joule.
+        # The energy is half of z · energy z; `root` times a unit vector is a state with an energy of one joule.
         self.energy = 0.5 * energy
         self.root = np.linalg.inv(np.linalg.cholesky(self.energy)).T
 
@@ -125,7 +127,7 @@ class InitialStates:
     def certificate(self) -> Certificate:
         modes = self.sliding.modes
         to_modal, rates = np.asarray(modes.to_modal) @ self.root, np.asarray(modes.eigenvalues)
-        # How fast the energy may grow, whatever the state: what can happen between two instants.
+        # A bound on the growth rate of the energy for any state, and so on changes between two instants.
         inner = np.linalg.solve(self.root, np.asarray(self.sliding.linear.matrix) @ self.root)
         growth = max(float(np.max(np.linalg.eigvalsh(0.5 * (inner + inner.T)))), 0.0)
         step = 2 * np.pi / (COARSE * np.max(np.abs(rates)))
@@ -140,7 +142,7 @@ class InitialStates:
 
 
 class Histories:
-    """Factors on the load in equal pieces of a time, less one; the norm is the largest size of any."""
+    """Factors on the load, minus one, in equal pieces of a time; the norm is the largest absolute value."""
 
     def __init__(self, scene: Scene, pieces: int, time: float):
         self.scene, self.pieces, self.time = scene, pieces, time
@@ -155,7 +157,7 @@ class Histories:
     def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
         found = []
         for start in range(0, len(u), SIDE_BY_SIDE):
-            # Filled up with copies, so that one size is compiled.
+            # Padded with copies, so that one size is compiled.
             rows = np.minimum(np.arange(start, start + SIDE_BY_SIDE), len(u) - 1)
             found.append(np.asarray(_after(self.scene, EventExact(), jnp.asarray(u[rows]), self.time)))
         return np.concatenate(found)[: len(u)]
@@ -172,11 +174,11 @@ class Histories:
         for row, (shares, margin) in enumerate(self.sliding.signals):
             own = np.asarray(shares) * self.sliding.shift
             steady = float(np.real(np.sum(own)))
-            # The load presses by itself while it lasts.
+            # The direct effect of the load on the normal force, while it lasts.
             direct = margin - steady if row == 1 else 0.0
 
             def response(t, own=own, jump=direct + steady):
-                """Of the signal to a load that is twice as high from t = 0 on."""
+                """The response to a load that is doubled at t = 0."""
                 return jump - np.real(np.exp(np.multiply.outer(t, rates)) @ own)
 
             def bending(t, own=own):
@@ -202,7 +204,7 @@ class Histories:
         return Certificate(float(size), np.where(shapes == 0, 1.0, shapes))
 
     def _of_pieces(self, of, piece: int, edges: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """What each piece of the history so far adds to a signal during one of them, from its response to a step."""
+        """The contribution of each piece of the history so far during one piece, from the response to a step."""
         since = edges[piece] + inside[:, None] - edges[: piece + 1]
         before = np.arange(piece + 1) < piece
         ended = np.where(before, of(np.where(before, since - self.time / self.pieces, 0.0)), 0.0)
@@ -210,8 +212,8 @@ class Histories:
 
 
 def _peak(sizes: np.ndarray, bends: np.ndarray, crude: float, step: float) -> float:
-    """A bound on a signal between instants, too: it leaves its chord by what its second derivative allows, which in turn leaves
-    its own by what a crude bound on the fourth does.
+    """A bound between instants, too: the distance from the chord is bounded by the second derivative, whose values between
+    instants are bounded in the same way by a crude bound on the fourth.
     """
     chord = step**2 / 8
     return float(np.max(sizes)) + chord * (float(np.max(bends)) + chord * crude)
@@ -222,7 +224,7 @@ def _sum_of_sizes(rows: np.ndarray) -> np.ndarray:
 
 
 def _later(rows: np.ndarray, rates: np.ndarray, step: float, begin: float, norm) -> tuple[np.ndarray, np.ndarray]:
-    """A row of signals and its norm at even instants from `begin` on, up to where what is left is smaller than what was."""
+    """Responses and their norms at equally spaced instants from `begin` on, until later ones must be smaller than these."""
     whole = float(np.sum(norm(np.abs(rows)) * np.exp(rates.real * begin)))
     sizes, vectors, most, count = [], [], 0.0, 0
     while not count or np.max(np.exp(rates.real * step * count)) * whole >= most:
@@ -239,7 +241,7 @@ def _later(rows: np.ndarray, rates: np.ndarray, step: float, begin: float, norm)
 
 
 def _highest(sizes: np.ndarray) -> list[int]:
-    """Where a norm is largest, before that and after that."""
+    """The indices at which a norm is largest: in all, in the first half up to that index, and well after it."""
     top = int(np.argmax(sizes))
     parts = ((0, len(sizes)), (0, top // 2), (min(top + top // 2 + 1, len(sizes)), len(sizes)))
     return [low + int(np.argmax(sizes[low:high])) for low, high in parts if high > low]
@@ -256,13 +258,13 @@ def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
 
 
 def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
-    """The state after a history of the load, from steady sliding on."""
+    """The state after a history of the load that began in steady sliding."""
     mechanics, n = mechanics_about_sliding(scene), scene.structure.size
     stepper = for_derivatives(stepper, mechanics)
 
     def piece(carry, factor):
         y, contact = carry
-        # Loads are deviations, too.
+        # Loads are deviations from the final load.
         more, part = factor * scene.load.final, time / len(factors)
         after = follow(stepper, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
         return (after.y, after.contact), None

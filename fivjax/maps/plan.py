@@ -1,6 +1,6 @@
-"""A run of many trajectories planned: cut into jobs, and which of them wait for others' attractors.
+"""The plan of a run of many trajectories: its jobs, and which of them need the attractors of others first.
 
-The plan follows from the trajectories alone, never from who runs it: so results are the same, bit for bit, on any executor.
+The plan follows from the trajectories alone, not from the executor, so results are the same, bit for bit, on any executor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,27 +17,25 @@ from .jobs import Task
 from .sharing import HISTORY, bytes_per_trajectory, in_bulk
 from .trajectories import Grid, Listed, Places
 
-# Trajectories of a group that stand side by side in a block: enough to fill a vector unit and to make matrix products pay.
+# Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.
 SIDE_BY_SIDE = 16
-# What a trajectory that shares nothing costs, in trajectories that stand side by side.
+# The cost of a trajectory in a row of its own, relative to one in a full row.
 COST_OF_STANDING_ALONE = 4
-# Trajectories of a job, at most, where they are followed in bulk and where each takes longer: some seconds of work, because
-# an interrupt loses as much; and enough that few groups are in several jobs.
+# The most trajectories of a job, with `Windowed` and with other steppers: some seconds of work, because an interrupt loses as
+# much; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
-# Memory that a job may take, bytes: trajectories that share little take much.
+# Memory that a job may take, bytes: trajectories in small groups take much.
 OF_A_JOB = 2.5e8
 
 
 class Plan(NamedTuple):
-    """What is to be done, in parts one after the other, whose jobs are independent."""
+    """A run in parts that follow one another; the jobs of a part are independent."""
 
     task: Task
     trajectories: Grid | Listed
     jobs: Sequence[Places]
-    parts: tuple[
-        list[int], ...
-    ]  # numbers of jobs; where several share a group, all but the first are in the second part
-    memory: float  # that the largest job takes, bytes
+    parts: tuple[list[int], ...]  # numbers of jobs; if several share a group, all but the first are in the second part
+    memory: float  # of the largest job, bytes
 
 
 def planned(
@@ -74,7 +72,7 @@ def planned(
         t_max=None if t_max is None else float(t_max),
         max_steps=int(max_steps),
         energy=energy,
-        # The same in all jobs, because products of other shapes round differently.
+        # The same in all jobs, because matrix products of other shapes round differently.
         width=SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1,
         many=total >= MANY,
     )
@@ -84,6 +82,6 @@ def planned(
 
 
 def in_a_job(method: AbstractStepper | Windowed, each: float) -> int:
-    """Trajectories that a job has at most, of which each takes so many bytes."""
+    """The most trajectories of a job, if each takes `each` bytes."""
     by_time = IN_A_JOB if isinstance(method, Windowed) else IN_A_LONG_JOB
     return max(1, min(by_time, int(OF_A_JOB // each)))

@@ -1,7 +1,7 @@
-"""One trajectory on its way to a verdict: where it begins, and one step of it.
+"""One trajectory on its way to a verdict: its beginning, and one step.
 
-Everything here is written for one trajectory; `rounds` makes many of it. States are deviations from the sliding
-equilibrium under the final load: crossing states, kicks and events are then as exact as they are small.
+Everything here is written for one trajectory; `rounds` follows many. States are deviations from the sliding equilibrium under
+the final load, so that rounding errors are relative to the deviation and not to the total displacement.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ from ..verdicts.sliding_proof import SlidingModes
 from ..verdicts.sticking_proof import StickingDrift
 from ..verdicts.verdict import Verdict
 
-# The longest advance that a ledger is asked to enter, s.
+# The longest advance with an energy ledger, s.
 LONGEST_ENTRY = 1.0
 
 
@@ -33,41 +33,41 @@ class Progress(eqx.Module):
     """One trajectory on its way to a verdict."""
 
     t: Float[Array, ""]
-    skipped: Float[Array, ""]  # the part of it that nothing was known to happen in, s
-    y: State  # as a deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
+    skipped: Float[Array, ""]  # the part of it that was skipped because sliding was certain, s
+    y: State  # deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
     contact: Contact
     crossing: State  # the last crossing of the section under the final load; NaN before the first
     events: Int[Array, ""]  # status changes so far
-    last_event: Float[Array, ""]  # when the last of them was, s; NaN before the first
+    last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
     approach: Approach
     verdict: Int[Array, ""]
-    energy: "EnergyRecord | None" = None  # where its energy went, when asked for
+    energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
 
 
 class Setting(eqx.Module):
-    """What a trajectory is followed with."""
+    """The data with which a trajectory is followed."""
 
     scene: Scene
     method: AbstractStepper | Windowed
     mechanics: Mechanics  # see `mechanics_about_sliding`
-    prepared: Any  # the method's own, see `AbstractStepper.prepare`
+    prepared: Any  # see `AbstractStepper.prepare`
     modes: SlidingModes
-    drift: StickingDrift | None  # of several contacts, none
+    drift: StickingDrift | None  # None with several contacts
     attractor: Attractor
 
 
 class EnergyRecord(eqx.Module):
-    """Where the energy of one trajectory went."""
+    """The energy ledger of one trajectory, and the energy of the vibration after the kick."""
 
     ledger: Ledger
-    vibration: Float[Array, ""]  # vibration energy when the load had jumped for the last time, J; NaN before
+    vibration: Float[Array, ""]  # energy of the vibration just after the last jump of the load, J; NaN before
 
 
 def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Progress:
-    """A trajectory at the sliding equilibrium of its scene, just before anything happens."""
+    """A trajectory at the sliding equilibrium of its scene, before the kick."""
     q, _ = steady_sliding(scene, scene.load.force)
     equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
-    # As a number an equilibrium is off by a rounding. Without that, an unstable one that nothing kicks would never be left.
+    # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
     y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
     verdict = jnp.where(
         ~modes.linear.solvable,
@@ -90,7 +90,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
 
 
 def placed(now: Progress, scene: Scene, shared, places: tuple[int, ...], values) -> Progress:
-    """The trajectory with values of its own (not deviations) at these places of its initial state; NaN leaves them."""
+    """The trajectory with total values (not deviations) at these indices of its initial state; NaN leaves an entry as it is."""
     if not places:
         return now
     equilibrium, at = shared.modes.linear.equilibrium, jnp.array(places)
@@ -103,8 +103,8 @@ def placed(now: Progress, scene: Scene, shared, places: tuple[int, ...], values)
 
 
 def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array, ""]) -> Progress:
-    """The trajectory at rest under so many times its final load, which jumps to its final value now, after all kicks; not a
-    number, and the trajectory stays as it is.
+    """The trajectory released from rest under `load` times its final load, at a time after all kicks; if `load` is NaN, the
+    trajectory as it is.
     """
     q, _ = steady_sliding(scene, load * scene.load.final)
     deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
@@ -114,29 +114,31 @@ def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
-    """The end of a step from `t`: at most `dt` on, never across a jump of the load, and exactly on it when one is reached."""
+    """The end of a step from `t` (s): at most `dt` (s) later, never beyond a jump of the load, and exactly at a jump that is
+    reached.
+    """
     ahead = load.jumps > t
     jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
-    # Equal steps up to the jump; the allowance keeps rounding from adding one more, vanishingly short.
+    # Equal steps up to the jump. The 1e-6 keeps rounding from adding another step of vanishing length.
     steps = jnp.ceil((jump - t) / dt - 1e-6)
     return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
 
 
 def step(setting: Setting, now: Progress) -> Progress:
-    """One step further, which ends at the next event at the latest."""
+    """The trajectory after one more step, which ends at the next event at the latest."""
     scene, method = setting.scene, setting.method
-    # At rest an exact stepper would go on for ever, and work over an endless time is not to be had.
+    # At rest an exact stepper would take an infinite step, over which work cannot be integrated.
     longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
-    # Exact steppers end on the section; `Windowed` reads the crossing off its samples, which is good enough on the way.
+    # Exact steppers end on the section. `Windowed` interpolates crossings from its samples, which is good enough here.
     at_section = not isinstance(method, Windowed)
     after = method.advance(setting.prepared, now.contact, load, now.y, t - now.t, at_section)
     y, contact, h, rise = after.y, after.contact, after.h, after.rise
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
     changed = jnp.any(changed) if setting.mechanics.several else changed
-    # What comes back under the kick's load says nothing of the motion after it.
+    # Crossings during the kick do not count for the motion after it.
     crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
     return Progress(
         t=t,

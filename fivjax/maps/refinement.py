@@ -1,4 +1,4 @@
-"""Adaptive maps: a coarse grid, halved again and again where neighbours differ, and checked at random elsewhere."""
+"""Adaptive maps: a coarse grid that is refined where neighbours differ, and checked at random elsewhere."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,22 +10,22 @@ from ..verdicts.verdict import Verdict
 from .results import Verdicts
 from .shares import wilson
 
-# Limit cycles of neighbours whose amplitudes differ by more than this factor are taken for different attractors.
+# If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors.
 JUMP = 1.1
 
-# Runs trajectories, by their places on the fine grid, and writes what they come to into the verdicts of the whole grid.
+# A function that runs trajectories, by their indices on the fine grid, and writes their results into those of the whole grid.
 Run = Callable[[Int[np.ndarray, " r"], str], None]
 
 
 class Audit(NamedTuple):
-    """Cells that were not to be computed, and were: how many, and how many of them had another verdict than was assumed."""
+    """Points that need not have been computed but were: their number, and how many had another verdict than was assumed."""
 
     cells: int
     wrong: int
 
 
 def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
-    """An axis with each of its intervals halved so many times."""
+    """An axis with each of its intervals halved `halvings` times."""
     parts = 2**halvings
     share = np.arange(parts) / parts
     inside = values[:-1, None] + share * np.diff(values)[:, None]
@@ -35,12 +35,12 @@ def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, "
 def refined(
     shape: tuple[int, ...], halvings: int, audit: float, verdicts: Verdicts, run: Run
 ) -> tuple[Int[np.ndarray, " cells"], Audit]:
-    """Computes some places of a grid of this shape; returns of each place the one whose result it takes, and the audit.
+    """Compute some points of a grid of this shape. Returns, for each point, the point whose result it takes; and the audit.
 
-    The coarse grid is every `2**halvings`-th value of each axis. In each halving those of the new places are computed that
-    lie in a cell, or next to one, at whose corners the verdict or the attractor differs. The others take what the corner before
-    them has; a computed place takes its own. Of those that are never computed, a share `audit` is computed in the end, and
-    counted. After an interrupt nothing more is computed, and the finer places are their own.
+    The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
+    cell, or next to one, with corners of different verdict or attractor. Other points take the result of the corner before
+    them; a computed point takes its own. Of the points that were never computed, a share `audit` is computed in the end and
+    compared. After an interrupt nothing more is computed, and the finer points take their own (missing) results.
     """
     places = np.arange(np.prod(shape)).reshape(shape)
     source = places.ravel().copy()
@@ -49,7 +49,7 @@ def refined(
         return tuple(slice(None, None, step) for _ in shape)
 
     def compute(which: np.ndarray, what: str) -> bool:
-        """Whether they were all followed to their ends: an interrupt leaves some."""
+        """Compute these points; whether all were followed to their end, which an interrupt prevents."""
         if which.size:
             run(which, what)
         return not np.any(verdicts.pending[which])
@@ -88,7 +88,7 @@ def audit_note(audit: Audit) -> dict[str, float | int]:
 
 
 def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:
-    """Of which cells the corners differ."""
+    """Which cells have corners that differ."""
     verdict, kind = verdicts.verdict[corners], verdicts.attractor_kind[corners]
     size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
     low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
@@ -97,7 +97,7 @@ def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.nd
 
 
 def _over_corners(combine, values: np.ndarray) -> np.ndarray:
-    """Corner values of each cell combined, along each axis that has more than one value."""
+    """The values at the corners of each cell combined, along each axis that has more than one value."""
     for axis, length in enumerate(values.shape):
         if length > 1:
             first, second = (np.take(values, np.arange(k, length - 1 + k), axis=axis) for k in (0, 1))
@@ -106,18 +106,18 @@ def _over_corners(combine, values: np.ndarray) -> np.ndarray:
 
 
 def _near_differences(differ: Bool[np.ndarray, "*cells"], shape: tuple[int, ...]) -> Bool[np.ndarray, "*grid"]:
-    """The places of the halved grid that lie in such a cell, or in one beside it."""
+    """The points of the halved grid that lie in a cell with differing corners, or in a neighbouring cell."""
     for axis, length in enumerate(shape):
         if length == 1:
             continue
-        # A ring of cells more: what differs between corners may end a little beyond them.
+        # Neighbouring cells, too: a boundary between corners may leave the cell.
         aside = np.zeros_like(np.take(differ, [0], axis=axis))
         padded = np.concatenate([aside, aside, differ, aside, aside], axis=axis)
         count = differ.shape[axis]
         ringed = np.zeros_like(np.concatenate([differ, aside, aside], axis=axis))
         for k in range(3):
             ringed |= np.take(padded, np.arange(k, k + count + 2), axis=axis)
-        # Place 2i is the corner between cells i - 1 and i, place 2i + 1 the middle of cell i.
+        # Point 2i is the corner between cells i - 1 and i, point 2i + 1 the middle of cell i.
         corner = np.take(ringed, np.arange(count + 1), axis=axis) | np.take(ringed, np.arange(1, count + 2), axis=axis)
         middle = np.take(ringed, np.arange(1, count + 1), axis=axis)
         halved = np.zeros((*differ.shape[:axis], length, *differ.shape[axis + 1 :]), bool)

@@ -1,4 +1,4 @@
-"""What is known of many trajectories at their ends, as arrays."""
+"""The results of many trajectories, as arrays."""
 
 from typing import NamedTuple
 
@@ -8,10 +8,10 @@ from ..simulation.energy import exchanged
 from ..verdicts.verdict import Verdict
 from .progress import Progress
 
-# `attractor_kind` of a trajectory that nothing has captured, and of one whose neighbours, besides, part exponentially.
+# `attractor_kind` of a trajectory that no attractor has captured, and of such a one whose neighbours diverge exponentially.
 NO_ATTRACTOR, CHAOTIC = -1, 2
 
-# What a ledger leaves of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
+# The energies of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
 ENERGIES = (
     "stick_work",
     "slide_work",
@@ -27,13 +27,13 @@ ENERGIES = (
 
 
 class Verdicts(NamedTuple):
-    """What is known of each trajectory at its end; arrays over trajectories."""
+    """The result of each trajectory; arrays over trajectories."""
 
     verdict: np.ndarray
     amplitude: np.ndarray  # m/s
-    attractor_kind: np.ndarray  # of the one that captured it: 0 periodic, 1 torus; else `NO_ATTRACTOR` or `CHAOTIC`
+    attractor_kind: np.ndarray  # of the attractor: 0 periodic, 1 torus; else `NO_ATTRACTOR` or `CHAOTIC`
     attractor_period: np.ndarray  # s
-    attractor_multiplier: np.ndarray  # the largest
+    attractor_multiplier: np.ndarray  # size of the largest
     decided_at: np.ndarray  # s
     events: np.ndarray
     last_event: np.ndarray  # s
@@ -41,12 +41,12 @@ class Verdicts(NamedTuple):
 
     @property
     def pending(self) -> np.ndarray:
-        """Which trajectories have not been followed to their end."""
+        """Which trajectories have not been run."""
         return self.verdict == Verdict.NOT_RUN
 
 
 def not_run(total: int, energy: bool) -> Verdicts:
-    """So many trajectories of which nothing is known yet."""
+    """Results of `total` trajectories that have not been run."""
     return Verdicts(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
         amplitude=np.full(total, np.nan),
@@ -61,13 +61,13 @@ def not_run(total: int, energy: bool) -> Verdicts:
 
 
 def by_name(verdicts: Verdicts) -> dict[str, np.ndarray]:
-    """The same, terms of the ledger beside the rest."""
+    """All arrays by name, including the terms of the ledger."""
     parts = verdicts._asdict()
     return {**parts.pop("energy"), **parts}
 
 
 def worth_keeping(verdict: np.ndarray) -> np.ndarray:
-    """The verdicts as they are kept: what was lost with its worker is run again, because others may have better ones."""
+    """The verdicts to keep on disk. Trajectories lost with their worker count as not run: another worker may succeed."""
     return np.where(verdict == Verdict.WORKER_LOST, Verdict.NOT_RUN, verdict).astype(np.int8)
 
 
@@ -82,7 +82,7 @@ class Ended(NamedTuple):
 
 
 def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -> None:
-    """Write what is known of trajectories at their ends to their places."""
+    """Write the results of trajectories that have ended at their indices."""
     verdict = ended.verdict
     verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, ended.amplitude)
     verdicts.attractor_kind[index] = ended.kind
@@ -98,7 +98,7 @@ def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -
         terms["kick_energy"] = now.energy.vibration
         for name, values in verdicts.energy.items():
             values[index] = terms[name]
-    # Last, and in one go: a trajectory with a verdict is complete, whenever an interrupt comes.
+    # Last and at once, so that a trajectory with a verdict is complete even after an interrupt.
     verdicts.verdict[index] = verdict
 
 

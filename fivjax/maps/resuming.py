@@ -1,4 +1,4 @@
-"""Where a map keeps what is finished, and what makes it the same map when it is resumed."""
+"""Where a map keeps its finished jobs, and the description by which a resumed map is recognised."""
 
 from importlib import metadata
 from pathlib import Path
@@ -19,9 +19,10 @@ from .trajectories import Grid
 def keeper_at(
     path: str | Path | None, scene: Scene, method: AbstractStepper, grid: Grid, limits: dict, energy: bool = False
 ) -> Checkpoint | Store | None:
-    """What keeps the results of a map at this path (none without one); `limits` are its other arguments that tell in results.
+    """The object that keeps the results of a map at this path; None without a path. `limits`: other arguments of the map that
+    affect its results.
 
-    **Raises:** `TypeError` for what is no path; `ValueError` for what is there already and is not of this map.
+    **Raises:** `TypeError` for an object that is no path; `ValueError` for a file or folder that belongs to another map.
     """
     if path is None:
         return None

@@ -1,7 +1,7 @@
 """The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
 
-The programs here know nothing of a map's axes: all maps of structures of one size and friction of one kind share them. Where
-the trajectories of a map are followed in windows, so are these motions; derivatives, which a window does not have, are then
+The programs here do not depend on a map's axes: all maps of structures of one size and friction of one kind share them. If the
+trajectories of a map are followed by `Windowed`, so are these motions; derivatives, which it does not have, are then central
 differences.
 """
 
@@ -27,15 +27,16 @@ from .flattened import Flattened, flatten
 from .sharing import Batch
 from .windowed_returns import KEPT, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
 
-# States in a block: few, because often there are few.
+# Number of states in a block: small, because often there are few states.
 BLOCK = 32
 DERIVED_BLOCK = 16
-# Of central differences, relative to a state's size: the third root of rounding; and crossings that they are taken over.
+# Step of central differences, relative to a state's size: about the cube root of the rounding unit; and the most crossings over
+# which a difference is taken.
 STEP, DIFFERENCED = 5e-6, 16
 
 
 class Section(NamedTuple):
-    """States on the section or on the way to it, in rows; deviations from the sliding equilibrium."""
+    """States on the section, or on the way to it, in rows: deviations from the sliding equilibrium, with contact modes."""
 
     y: Float[np.ndarray, "m 2n"]
     status: Int[np.ndarray, "m *contacts"]
@@ -45,18 +46,18 @@ class Section(NamedTuple):
         return Section(*(part[chosen] for part in self))
 
     def put(self, chosen, rows: "Section") -> None:
-        """Writes these rows to the chosen places."""
+        """Write these rows at the chosen indices."""
         for whole, part in zip(self, rows, strict=True):
             whole[chosen] = part
 
 
 class Images(NamedTuple):
-    """Where the return map leads from several states; NaN where the section is not met."""
+    """The images of several states under the return map; NaN where the section is not reached."""
 
     at: Section
     events: Int[np.ndarray, " m"]  # contact events on the way
     time: Float[np.ndarray, " m"]  # s
-    path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN where there were fewer
+    path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN if there were fewer
 
 
 class ReturnMaps:
@@ -70,15 +71,15 @@ class ReturnMaps:
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)
-        # Which way friction points where the contact slides on the section: the belt is the faster one there.
+        # The direction of friction if the contact slides on the section, where the belt is faster.
         self.sliding = np.sign(np.asarray(tree.mechanics.belt_speed))
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
-        # Of several contacts, places of all of them.
+        # With several contacts, arrays of indices.
         self.tangential, self.normal = contact_coordinates(self.structure)
 
     @property
     def section(self) -> Float[np.ndarray, " n"]:
-        """The row of velocities that is zero on the section."""
+        """The weights of the velocities whose sum is zero on the section."""
         row = np.zeros(self.structure.size)
         row[self.tangential] = section_weights(len(self.structure.contacts))
         return row
@@ -90,7 +91,7 @@ class ReturnMaps:
         return _images(self._exactly(_returned, self.block, group, at, crossings))
 
     def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
-        """The next `count` states on the section from each row: the last with its contact mode, and all of them."""
+        """The next `count` states on the section from each row: the last one with its contact mode; and all of them."""
         states = []
         while count > 0:
             part = min(count, KEPT)
@@ -102,7 +103,7 @@ class ReturnMaps:
     def derived(
         self, group, at: Section, crossings
     ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
-        """The same crossing, the time that it takes (s), and the derivative there, in what a row's contact mode leaves free."""
+        """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
         if self.windows is not None:
             return self._differences(group, at, crossings)
         (*section, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
@@ -115,7 +116,9 @@ class ReturnMaps:
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 
     def _differences(self, group, at: Section, crossings):
-        """Of many crossings, the product over some at a time: differences of a long way are not small."""
+        """The derivative over many crossings, as a product over a few at a time: over a long time differences do not stay
+        small.
+        """
         left, here = np.broadcast_to(crossings, len(group)).copy(), Section(*(np.array(part) for part in at))
         time = np.zeros(len(group))
         derivatives = np.zeros((*at.y.shape, at.y.shape[1]))
@@ -130,7 +133,7 @@ class ReturnMaps:
         return here, time, derivatives
 
     def _differences_of_few(self, group, at: Section, crossings):
-        """By central differences: the same program as everything else; neighbourhoods are checked by the map itself."""
+        """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
         count, size = at.y.shape
         free = np.zeros((count, size), bool)
         for own, status in zip(free, at.status, strict=True):
@@ -153,7 +156,7 @@ class ReturnMaps:
         return base, image.time[:count], derivatives
 
     def peaks_and_ends(self, group, at: Section, crossings) -> tuple[Float[np.ndarray, " m"], Section]:
-        """`peaks`, and where the motions are then."""
+        """`peaks`, and the states at the end."""
         if self.windows is None:
             return self.peaks(group, at, crossings), self.returns(group, at, crossings).at
         *found, peak = self._in_windows(group, at, crossings, peaks=True)

@@ -1,7 +1,7 @@
-"""What trajectories of one structure share, worked out once for all of them.
+"""The data that trajectories of one structure share, worked out once for all of them.
 
-Trajectories that differ in the history of their load only make a *group*: they have the same mechanics, the same
-matrices of their stepper, the same proofs and the same attractor.
+Trajectories that differ only in their kick or their initial state make a *group*: they have the same mechanics, the same
+matrices of their stepper, the same proofs and the same attractors.
 """
 
 from collections.abc import Sequence
@@ -28,46 +28,46 @@ from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 from .flattened import Flattened, flatten
 
-# Parameters that trajectories of one group may differ in: the load's history, which leaves the mechanics alone.
+# Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
 HISTORY = ("p", "duration", "start")
-# Groups that are worked out at a time, so that one size is compiled.
+# Number of groups worked out at a time, so that one size is compiled.
 GROUPS_AT_A_TIME = 64
 
 
 class Shared(eqx.Module):
-    """What the trajectories of a group have in common."""
+    """The data that the trajectories of a group have in common."""
 
-    values: Float[Array, " k"]  # the parameters that are not history
+    values: Float[Array, " k"]  # the parameters that are not those of the kick
     mechanics: Mechanics
-    prepared: Any  # the stepper's own, see `AbstractStepper.prepare`
+    prepared: Any  # see `AbstractStepper.prepare`
     modes: SlidingModes
-    drift: StickingDrift | None  # of several contacts, none
+    drift: StickingDrift | None  # None with several contacts
     attractor: Attractor
     longest_return: Float[Array, ""]  # of the section's return map, s
 
 
 class Batch(NamedTuple):
-    """What all trajectories of a run have in common, and how they are computed."""
+    """The data that all trajectories of a run have in common, and how they are computed."""
 
     scene: Scene
     method: AbstractStepper | Windowed
-    names: tuple[str, ...]  # parameters that make groups
-    history: tuple[str, ...]  # those of the load's history
-    states: tuple[int, ...]  # places of the initial state that trajectories begin with values of their own for
+    names: tuple[str, ...]  # parameters that differ between groups
+    history: tuple[str, ...]  # parameters of the kick
+    states: tuple[int, ...]  # indices of the initial state for which trajectories have values of their own
     energy: bool
-    width: int  # trajectories of a group side by side
-    many: bool  # so many that code which runs faster repays what it takes to compile
+    width: int  # trajectories of a group in a row of a block
+    many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
     pool: ThreadPoolExecutor
 
 
 def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
-    """The stepper that does the same for many trajectories in less time, where there is one."""
+    """The stepper that gives the same motion of many trajectories in less time, if there is one."""
     one = len(scene.structure.contacts) == 1
     return Windowed() if method == EventExact() and scene.friction.constant and one else method
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
-    """Memory for one trajectory where `sharing` make a group, its part of a step's intermediate results included."""
+    """Memory for one trajectory, in bytes, if `sharing` of them make a group; with its part of intermediate results."""
     n = scene.structure.size
     m = 2 * (n - 1)
     own = 8 * ((3 + attractors.SEEN) * 2 * n + 60)
@@ -78,9 +78,7 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
 
 
 def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows of parameters that are neither history nor initial `states`, and the row that each trajectory belongs
-    to.
-    """
+    """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
     own = [column for name, column in values.items() if name not in HISTORY and name not in states]
     if not own:
         count = len(next(iter(values.values())))
@@ -93,14 +91,14 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
     """`Shared` of each row of `distinct`, as one array."""
     size, parts = GROUPS_AT_A_TIME, []
     for start in range(0, len(distinct), size):
-        # Filled up with copies, so that one size is compiled.
+        # Padded with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
         part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
     modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
     for start in range(0, len(distinct), size):
-        # One by one into place, because they are large: they are never there twice.
+        # Written into the result one by one, because they are large and should not be in memory twice.
         mechanics, prepared, _, drifts, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)

@@ -1,12 +1,12 @@
-r"""The smallest kick that leads to squeal, between a bound below which every kick is proved to slide and one that was found.
+r"""The smallest kick found that leads to squeal, and a bound below which every kick is proved to slide.
 
 While the contact slides under constant friction the motion is linear. With $A$ its state matrix and $z_∞$ the shift of the
 equilibrium by the load itself, the deviation during a kick is $(p - 1)(1 - e^{At}) z_∞$, and after one of duration $d$ it is
-$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speed and pressing force stay positive, and both
-are affine in the deviation. So with $P(d)$ a bound on a signal over all the future after a kick of $p - 1 = 1$ (the bound that
-verdicts use, `envelope_peak`), every kick with $p - 1$ below the least ratio of margin to $P(d)$, over all durations, slides
-for ever. Between two durations $h$ apart $P$ is at most the larger one plus $h L / 2$, with $L$ a bound on the signal's
-derivative.
+$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speed and normal force stay positive, and both
+are affine in the deviation. Let $P(d)$ be a bound on the change of one of them over the whole future after a kick with
+$p - 1 = 1$ (the bound that verdicts use, `envelope_peak`). Then every kick with $p - 1$ below the least ratio of margin to
+$P(d)$, over all durations, slides for ever. Between two durations $h$ apart, $P$ is at most the larger value plus $h L / 2$,
+with $L$ a bound on the derivative.
 """
 
 from collections.abc import Sequence
@@ -27,17 +27,17 @@ from .perturbations import stable_sliding
 from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
 from .threshold import critical_perturbation
 
-# Durations at which the bound is evaluated, and from which the smallest kick is sought.
+# Number of durations at which the bound is evaluated, and of those tried as starts of the search.
 GRID, STARTS = 4096, 24
-# Of the starts that lead furthest down.
+# Number of searches, from the starts with the smallest p_crit.
 DESCENTS = 4
-# Steps of the search about the best start; derivatives of p_crit that count as zero, relative to p - 1 per duration.
+# Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
 OVER = ("p", "duration", "start", "state", "history")
 
 
 class SmallestKick(NamedTuple):
-    """The smallest kick found, and the bound below which every one is proved to slide.
+    """The smallest kick found, and a bound below which every kick is proved to slide.
 
     **Example:**
 
@@ -47,14 +47,14 @@ class SmallestKick(NamedTuple):
     """
 
     p: float  # of the smallest kick found that leads to a limit cycle
-    duration: float  # s
-    certified: float  # every p above 1 and below this slides, whatever the duration within its bounds
-    proved_low: float  # the same duration with this p was proved to slide, and
-    proved_high: float  # with this p to end on a limit cycle
+    duration: float  # of that kick, s
+    certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
+    proved_low: float  # a kick of the same duration with this p was proved to slide,
+    proved_high: float  # and one with this p to end on a limit cycle
 
     @property
     def ratio(self) -> float:
-        """The certified bound's share of what was found, as excesses over 1: one would close the gap."""
+        """The ratio of the certified p - 1 to that found; 1 if there were no gap."""
         return (self.certified - 1.0) / (self.p - 1.0)
 
     def __str__(self) -> str:
@@ -105,18 +105,20 @@ def smallest_kick(
     **Arguments:**
 
     - `scene`, whose load is a `Pulse` and whose friction is constant.
-    - `over`: what of the kick is free: "p" always, "duration", and "start", which changes nothing, because steady sliding
-      waits as it is. Or "state": the deviation from steady sliding of a contact that slides, without a kick, in the norm of its
-      energy. Or "history": a load that keeps one value in each of some equal pieces of time, and its final one after them.
-    - `bounds`: by name; p from 1 to 5 and durations up to twice the scene's unless given. A history lasts as long as the
-      longest duration, the scene's own unless given.
-    - `p_step`: how finely p is scanned, as in `critical_perturbation`. A window of kicks narrower than it is not seen.
-    - `pieces`: of a history.
+    - `over`: the free parameters of the kick: "p" always, "duration", and "start" (which has no effect, because steady sliding
+      does not change with time). Or "state": a deviation from steady sliding of a sliding contact, without a kick; its size is
+      the square root of its energy. Or "history": a load that is constant in each of `pieces` equal pieces of time, and has its
+      final value afterwards.
+    - `bounds`: by name; unless given, p from 1 to 5 and durations up to twice the scene's. A history lasts as long as the
+      longest duration in the bounds, unless given that of the scene.
+    - `p_step`: the distance of the scanned values of p, as in `critical_perturbation`. A narrower interval of kicks that squeal
+      is missed.
+    - `pieces`: the number of pieces of a history.
 
-    **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it says the gap.
+    **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it shows the gap.
 
-    **Raises:** `ValueError` for a load without a pulse, friction that varies with speed, sliding that is not stable, and
-    names or bounds that make no sense; `NoSquealingKick` where nothing that was tried leads to a limit cycle.
+    **Raises:** `ValueError` for a load without a pulse, friction that varies with slip speed, sliding that is not stable, and
+    invalid names or bounds; `NoSquealingKick` if nothing that was tried leads to a limit cycle.
 
     **Example:**
 
@@ -190,7 +192,7 @@ def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], piec
 
 
 def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:
-    """From a critical kick down to a duration at which p_crit is smallest, or to an end of the durations."""
+    """From a critical kick to the duration at which p_crit has a local minimum, or to a bound of the durations."""
     saddle: Saddle | None = None
 
     def critical(d: float, near: float):
@@ -214,7 +216,7 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
                 break
             continue
         turned = following.d_p["duration"] * slope < 0
-        # Beyond the lowest, the slopes on both sides say where it is.
+        # Beyond the minimum: the slopes on both sides tell where it is.
         share = abs(slope) / (abs(slope) + abs(following.d_p["duration"]))
         step = abs(d - duration) * (1 - share if turned else 1.0)
         duration, here = d, following
@@ -222,7 +224,7 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
 
 
 def _nominated(scene: Scene, shortest: float, longest: float) -> np.ndarray:
-    """Durations to start from: those after which linear sliding swings furthest, and as many evenly between the bounds."""
+    """Durations to start from: those after which linear sliding comes closest to its end, and as many evenly spaced ones."""
     durations = np.linspace(shortest, longest, GRID)
     reached = _excess_by_duration(scene, durations)
     lowest = np.flatnonzero((reached[1:-1] <= reached[:-2]) & (reached[1:-1] < reached[2:])) + 1
@@ -232,11 +234,11 @@ def _nominated(scene: Scene, shortest: float, longest: float) -> np.ndarray:
 
 
 def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
-    """The p - 1 at which linear sliding ends after a kick, without what may happen between two durations."""
+    """The p - 1 at which linear sliding ends after a kick, at these durations (without a bound between them)."""
     sliding = stable_sliding(scene)
     modes = sliding.modes
     shapes = 1 - np.exp(np.outer(durations, modes.eigenvalues))
-    # A kick without duration moves nothing.
+    # A kick of zero duration causes no motion.
     with np.errstate(divide="ignore"):
         reached = [
             margin / _peaks(shapes * (shares * sliding.shift), modes.envelope) for shares, margin in sliding.signals
@@ -246,18 +248,18 @@ def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
 
 @in_double_precision
 def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
-    """A p - 1 below which no kick of a duration between these (s) has any contact event: it slides for ever."""
+    """A p - 1 below which no kick with a duration between these (s) has any contact event: it slides for ever."""
     sliding = stable_sliding(scene)
     rates, modal, envelope = sliding.modes.eigenvalues, sliding.shift, sliding.modes.envelope
     least = np.inf
     for row, (shares, margin) in enumerate(sliding.signals):
         steady = float(np.real(np.sum(shares * modal)))
-        # The load presses by itself while it lasts: in the end, as much more as there is more of it.
+        # The direct effect of the load on the normal force: in the static limit, the force is proportional to the load.
         direct = margin - steady if row == 1 else 0.0
         slope = float(_peaks(shares * rates * modal, envelope)[0])
         during = np.linspace(0.0, longest, GRID)
         response = direct + steady - np.real(np.exp(np.outer(during, rates)) @ (shares * modal))
-        # For p above 1 only what falls ends the contact.
+        # For p above 1 only a decrease ends sliding.
         peak = np.max(-response) + 0.5 * slope * (during[1] - during[0])
         after = np.linspace(shortest, longest, GRID if longest > shortest else 1)
         kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)

@@ -1,8 +1,9 @@
-r"""The smallest perturbation of a kind that leads to a limit cycle, between a certified bound and one that was found.
+r"""The smallest perturbation of a kind found that leads to a limit cycle, and a certified bound below it.
 
-Along a ray, verdicts say where the first one squeals. There the motion lands on the saddle's stable manifold, whose normal,
-carried back to the perturbation, says in which direction the manifold comes closer: the shape that is steepest in the norm. The
-search goes there as far as it gains, from the best of the shapes that linear sliding nominates.
+Along a ray of perturbations, verdicts tell the smallest size that squeals. There the motion lands on the saddle's stable
+manifold. The normal of the manifold, transformed back to the perturbation, gives the shape in whose direction the manifold is
+closest, in the norm. The search goes in this direction as long as the size falls, from the best of the shapes that linear
+sliding suggests.
 """
 
 from typing import NamedTuple
@@ -16,10 +17,10 @@ from .crossing import Crossing, first_crossings, with_ends
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .states import verdicts_from
 
-# How far above the certified bound a ray is looked along at first, and at how many sizes; then around where it was, and inside
-# a bracket.
+# The largest size scanned along a ray at first, relative to the certified bound, and the number of sizes; later the number of
+# sizes around the last crossing; and the number inside a bracket.
 FARTHEST, SCANNED, AROUND, INSIDE = 4.0, 60, 16, 15
-# Relative widths of brackets while searching, and of the last one.
+# Relative widths of brackets during the search, and at its end.
 ROUGH, EXACT = 1e-5, 1e-8
 SHARES = np.array([1.0, 0.5, 0.25, 0.1, 0.04, 0.015])
 MOST_STEPS, GAINED = 12, 1e-6
@@ -28,8 +29,8 @@ MOST_STEPS, GAINED = 12, 1e-6
 class SmallestPerturbation(NamedTuple):
     """The smallest initial state, or load history, found that leads to a limit cycle, and a certified bound below it.
 
-    Sizes are norms: of an initial state the square root of the energy of its deviation from steady sliding (√J), of a history
-    the largest share by which the load leaves its final value.
+    Sizes are norms: for an initial state the square root of the energy of its deviation from steady sliding (√J), for a history
+    the largest deviation of the load from its final value, as a share of it.
 
     **Example:**
 
@@ -39,16 +40,16 @@ class SmallestPerturbation(NamedTuple):
     """
 
     over: str  # "state" or "history"
-    size: float  # of the smallest found that leads to a limit cycle
-    certified: float  # every smaller one slides for ever
-    proved_low: float  # the same shape with this size was proved to slide, and
-    proved_high: float  # with this size to end on a limit cycle
+    size: float  # of the smallest one found that leads to a limit cycle
+    certified: float  # every one smaller than this slides for ever
+    proved_low: float  # the same shape with this size was proved to slide,
+    proved_high: float  # and with this size to end on a limit cycle
     values: np.ndarray  # displacements (m) and velocities (m/s), the `y0` of `simulate`; or the factor p of each piece
-    trajectories: int  # that the search took
+    trajectories: int  # the number that the search took
 
     @property
     def ratio(self) -> float:
-        """The certified bound's share of what was found: one would close the gap."""
+        """The ratio of the certified size to that found; 1 if there were no gap."""
         return self.certified / self.size
 
     def __str__(self) -> str:
@@ -62,7 +63,7 @@ class SmallestPerturbation(NamedTuple):
 
 
 class NoSquealingKick(ValueError):
-    """No kick, state or history in the bounds leads to a limit cycle.
+    """No kick, state or history that was tried within the bounds leads to a limit cycle.
 
     **Example:**
 
@@ -81,12 +82,14 @@ def smallest_state(scene: Scene) -> SmallestPerturbation:
 
 
 def smallest_history(scene: Scene, pieces: int, time: float) -> SmallestPerturbation:
-    """The history of the load, in equal pieces of a time (s), that leaves the final load least and leads to a limit cycle."""
+    """The history of the load, in equal pieces of a time (s), with the least deviation from the final load that leads to a
+    limit cycle.
+    """
     return _smallest(scene, "history", Histories(scene, pieces, time), 1.0)
 
 
 class _Rays:
-    """Where perturbations along rays squeal first."""
+    """The smallest sizes along rays of perturbations that squeal."""
 
     def __init__(self, scene: Scene, kind: Perturbation):
         self.scene, self.kind = scene, kind
@@ -99,7 +102,7 @@ class _Rays:
         return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
 
     def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> Crossing:
-        """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to a relative width."""
+        """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to the relative width `width`."""
         found = first_crossings(sizes, self._along(shapes, sizes))
         while True:
             wide = np.flatnonzero(found.high - found.low > width * found.high)
@@ -110,7 +113,7 @@ class _Rays:
             stuck = now.high - now.low >= 0.9 * (found.high[wide] - found.low[wide])
             for whole, part in zip(found, now, strict=True):
                 whole[wide] = part
-            # Undecided ones keep the two apart.
+            # Undecided trajectories prevent further narrowing.
             found.low[wide[stuck]] = np.nan
 
     def _along(self, shapes: Vectors, sizes: np.ndarray) -> np.ndarray:

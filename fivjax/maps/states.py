@@ -1,4 +1,4 @@
-"""Verdicts on initial states: their names among a map's axes, and trajectories that start there under the final load."""
+"""Verdicts on initial states: their names as axes of a map, and trajectories from given states under the final load."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from .engine import run_to_verdict
 
 
 def state_places(structure: Structure) -> dict[str, int]:
-    """The place in the state of each displacement and, with a `d` before its name, velocity."""
+    """The index in the state of each displacement and, with a `d` in front of its name, of each velocity."""
     names = structure.coordinates
     return {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
 

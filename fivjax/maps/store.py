@@ -1,10 +1,11 @@
-"""What a long run has finished, kept in a folder of chunks (Zarr) while it goes on: for maps of many million trajectories.
+"""The finished jobs of a long run, kept in a folder of chunks (Zarr) while the run goes on: for maps of many million
+trajectories.
 
 The folder is a Zarr group that `xarray.open_zarr` reads at any time: one array per result over the map's axes, in which
-trajectories that have not been run have the verdict `NOT_RUN`. Chunks are the tiles that jobs are made of. Only the process
-that hands the jobs out writes, so a chunk has one writer; a file lock keeps a second process out. A job's verdicts are
-written last, after everything else of it is on the disk: what has a verdict is whole, whenever the process is killed. A
-chunk that cannot be read is taken for one that was not run.
+trajectories that have not been run have the verdict `NOT_RUN`. A chunk is the part of the grid that one job computes. Only the
+process that hands out the jobs writes, so a chunk has one writer; a file lock keeps other processes out. The verdicts of a job
+are written last, after all its other results are on the disk: a chunk with verdicts is complete, even if the process is killed.
+A chunk that cannot be read counts as not run.
 """
 
 import contextlib
@@ -26,7 +27,7 @@ from .results import Verdicts, by_name, not_run, worth_keeping
 from .trajectories import Grid, Places, Tiles
 
 KIND = "fivjax store"
-# The folder in it with attractors that later jobs need.
+# The subfolder for attractors that later jobs need.
 FOUND = "attractors"
 
 
@@ -36,10 +37,10 @@ def is_store(path: str | Path) -> bool:
 
 
 class Store:
-    """The folder of a run: what an earlier one has left in it, and how more is kept there.
+    """The folder of a run: reads the results of an earlier run, and writes new ones.
 
     **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a folder that is no store, the store
-    of another run (with the first difference), and one that another process is writing; `ImportError` without Zarr.
+    of another run (naming the first difference), and one that another process is writing; `ImportError` without Zarr.
     """
 
     def __init__(self, path: str | Path, run: dict, grid: Grid, tile: tuple[int, ...], energy: bool):
@@ -59,7 +60,7 @@ class Store:
             self.arrays = {name: group[name] for name in fields}
             self.verdicts = self._recalled(not_run(grid.total, energy))
             for file in sorted((self.path / FOUND).glob("*.npz")):
-                with contextlib.suppress(Exception):  # half a file, after a power cut
+                with contextlib.suppress(Exception):  # an incomplete file, after a power failure
                     self.found[int(file.stem)] = from_bytes(file.read_bytes())
         except BaseException:
             self._lock.close()
@@ -71,7 +72,7 @@ class Store:
             places = self.tiles[number]
             try:
                 parts = {name: np.asarray(array[at]).ravel() for name, array in self.arrays.items()}
-            except Exception:  # whatever a broken chunk makes of its decoder
+            except Exception:  # a damaged chunk may raise any error in its decoder
                 continue
             for name, values in by_name(verdicts).items():
                 values[places] = parts[name]
@@ -85,14 +86,14 @@ class Store:
                 yield number
 
     def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
-        """Keep what the job of these places has come to."""
+        """Keep the results of the job with these trajectories."""
         if found:
             folder = self.path / FOUND
             folder.mkdir(exist_ok=True)
             _write(folder / f"{int(places[0])}.npz", to_bytes(found))
         fields = by_name(verdicts)
         numbers = self.tiles.holding(places)
-        for name in sorted(fields, key=lambda name: name == "verdict"):  # that one last
+        for name in sorted(fields, key=lambda name: name == "verdict"):  # verdicts last
             for number in numbers:
                 at, own = self.tiles.slices(int(number)), self.tiles[int(number)]
                 values = worth_keeping(fields[name][own]) if name == "verdict" else fields[name][own]
@@ -101,15 +102,15 @@ class Store:
 
     def _on_disk(self, name: str, number: int) -> None:
         chunk = self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
-        # A chunk that holds nothing but the fill value has no file.
+        # A chunk that contains only the fill value has no file.
         if chunk.exists():
             _sync(chunk)
 
     def flush(self, verdicts: Verdicts) -> None:
-        """Everything is kept already."""
+        """Nothing to do: every job is written at once."""
 
     def close(self) -> None:
-        """Let other processes write."""
+        """Release the lock, so that other processes may write."""
         self._lock.close()
 
 
@@ -122,7 +123,7 @@ def _zarr():
 
 
 def _create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
-    """An empty store, which appears under its name as a whole."""
+    """Create an empty store; it appears under its name only when it is whole."""
     zarr = _zarr()
     part = Path(tempfile.mkdtemp(dir=check_writable(path).parent, prefix=".fivjax."))
     try:
@@ -139,7 +140,7 @@ def _create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: di
                 dimension_names=tuple(grid.axes),
             )
         with warnings.catch_warnings():
-            # It warns that other programs may not know of it, and xarray that it is slow without it.
+            # Zarr warns that consolidated metadata is not supported everywhere; without it, xarray warns that opening is slow.
             warnings.simplefilter("ignore", UserWarning)
             zarr.consolidate_metadata(part)
         mask = os.umask(0)
@@ -163,7 +164,7 @@ def _refuse_other(path: Path, run: dict) -> None:
 
 
 def _locked(path: Path):
-    """A lock on the store, which ends with the process at the latest."""
+    """A lock on the store, which the operating system releases at the latest when the process ends."""
     file = open(path / ".lock", "a")  # noqa: SIM115
     try:
         import fcntl

@@ -1,4 +1,4 @@
-"""Critical kicks: the smallest that lead to the limit cycle, scanned for and narrowed down in batches."""
+"""Critical kicks: the smallest that lead to a limit cycle, found by a scan and narrowed down in batches."""
 
 import functools
 import json
@@ -24,7 +24,7 @@ from .datasets import time_limit
 from .engine import run_to_verdict
 from .executors import with_workers
 
-# Points inside a bracket that are tried at once: more of them means fewer rounds, and the rounds are what takes time.
+# Points inside a bracket that are tried at once: with more points there are fewer rounds, and rounds take the time.
 POINTS_PER_ROUND = 15
 
 
@@ -45,45 +45,46 @@ def critical_perturbation(
     executor=None,
     **axis,
 ) -> xr.Dataset:
-    """The smallest kick that leads to the limit cycle, along one or several axes; all of them bracketed in batch.
+    """The smallest kick that leads to a limit cycle, over one or several parameters; all of them bracketed in one batch.
 
         fj.critical_perturbation(scene, mu=np.linspace(0.05, 0.228, 40))          # Fig. 10
         fj.critical_perturbation(scene, belt_speed=[0.5, 1, 1.5, 3, 5, 10, 100])  # Table 2
 
-    The range of p is scanned at a distance of `p_step`, then the first change from sliding to limit cycle is narrowed
-    down. The boundary has islands (sliding above a limit cycle); a change narrower than the scan is not seen.
+    The range of p is scanned in steps of `p_step`, then the first change from sliding to limit cycle is narrowed down. The
+    boundary may have islands (sliding above a limit cycle); those narrower than the steps are missed.
 
     **Arguments:**
 
     - `scene`: a scene whose load is a `Pulse`.
     - `**axis`: values of any numeric parameters but p, by name.
-    - `p_range`, `p_step`: where to look, and how finely.
-    - `tolerance`: the width of the bracket at which to stop.
+    - `p_range`, `p_step`: the range of p, and the steps of the scan.
+    - `tolerance`: the width of the bracket at which narrowing stops.
     - `method`, `t_max`, `memory`, `progress`, `executor`: as in `bistability_map`.
     - `energy`: whether to add the energies of the critical kick.
-    - `derivatives`: whether to compute p_crit to rounding, and differentiate it in every parameter.
+    - `derivatives`: whether to compute p_crit to rounding, and its derivatives by every parameter.
 
     **Returns:** a dataset over the axes with
 
-    - `p_crit_low`, `p_crit_high`: the largest kick proved to slide below the first change and the smallest proved to end on
+    - `p_crit_low`, `p_crit_high`: the largest kick proved to slide below the first change, and the smallest proved to end on
       a limit cycle above it, each by a trajectory of its own when the change was narrowed down;
-    - `p_crit`: their middle. It is NaN where no change lies in the range, where undecided trajectories keep the two further
-      apart than the tolerance, and where a trajectory run again contradicts the scan. Where the limit cycle is reached
-      from the lower end of the range on, it is that end, and `p_crit_low` is NaN;
-    - `p_crit_error`: half the distance of the two, plus the change of `p_crit` from a step twice as long to the method's;
-    - `crossings`: the changes that the scan saw, and `only_crossing`: whether there was at most one, and no undecided
+    - `p_crit`: their middle. It is NaN if there is no change in the range, if undecided trajectories keep the two further
+      apart than the tolerance, and if a trajectory that was run again contradicts the scan. If already the lower end of the
+      range leads to a limit cycle, `p_crit` is that end, and `p_crit_low` is NaN;
+    - `p_crit_error`: half the distance of the two; for methods with a fixed step plus the change of `p_crit` when the step is
+      doubled;
+    - `crossings`: the number of changes in the scan; `only_crossing`: whether there was at most one, and no undecided
       trajectory that might hide another.
 
-    With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J: what the sliding
-    state survives. Little of it comes from the load (`kick_work`, which may be negative); most is fed by the contact.
+    With `energy`, `critical_energy` is the energy of the vibration when the critical kick ends, in J. Little of it is work of
+    the load (`kick_work`, which may be negative); most comes from the contact.
 
-    With `derivatives`, p_crit is found to rounding by Newton's method where the bracket's motion passes a saddle cycle, or
-    just touches another contact mode, and proved anew 1e-9 on either side; then there are also
+    With `derivatives`, p_crit is found to rounding by Newton's method if the motion passes a saddle cycle or just touches
+    another contact mode, and is proved by trajectories at a relative distance of 1e-9 on both sides. Then there are also
 
-    - `kind`: "manifold" where the critical kick lands on the stable manifold of a saddle cycle, "grazing" where its motion
-      just touches sticking, lifting off or landing (with static friction above kinetic, such a touch may squeal), else "none";
-    - `d_p_crit` over `parameter`, per unit of each; NaN where there is none, and `why_none` says why in a sentence;
-    - `newton_trajectories`: how many trajectories Newton's method took.
+    - `kind`: "manifold" if the critical kick lands on the stable manifold of a saddle cycle, "grazing" if its motion just
+      touches sticking, lifting off or landing (with static friction above kinetic, such a touch may squeal), else "none";
+    - `d_p_crit` over `parameter`, per unit of each; NaN if there is no derivative, and `why_none` says why in a sentence;
+    - `newton_trajectories`: the number of trajectories that Newton's method took.
 
     **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
 
@@ -107,7 +108,7 @@ def critical_perturbation(
     if "p" in axis:
         raise ValueError("Argument `p` is what is sought; limit it with `p_range` instead.")
     if not axis:
-        # Any parameter will do that is one number.
+        # Any scalar parameter serves as the axis.
         name = "belt_speed" if np.ndim(scene.belt_speed) == 0 else "force"
         axis = {name: np.asarray(scene.parameters[name])[None]}
     if not isinstance(p_range, tuple | list) or len(p_range) != 2:
@@ -124,7 +125,7 @@ def critical_perturbation(
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
 
-    # Of the rows, which are the same in the scan and in all that follows.
+    # Attractors of the rows, which are the same in the scan and in all later runs.
     run = functools.partial(
         run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={}, executor=executor
     )
@@ -134,7 +135,7 @@ def critical_perturbation(
     fine, contradicted = _narrowed(run, method, columns, *_to_narrow(scan, verdicts, seen), tolerance)
     stepping = np.zeros(math.prod(shape))
     if isinstance(method, WhereSwitched):
-        # Event errors are first order in the step: the last halving changes the result by as much as is still missing.
+        # Errors are first order in the step, so halving it changes the result by as much as the remaining error.
         coarse_method = WhereSwitched(method.solver, 2 * method.dt)
         around = np.maximum(fine.brackets + p_step * np.array([-1.0, 1.0]), 0.0)
         unknown = np.full(around.shape, Verdict.UNDECIDED)
@@ -143,7 +144,7 @@ def critical_perturbation(
     answers = {}
     if derivatives:
         fine, answers = with_derivatives(scene, functools.partial(_verdicts, run, method), columns, fine)
-    # From the lower end on there is nothing to slide below.
+    # If the lower end of the range already squeals, there is no kick that slides.
     width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
     dataset = xr.Dataset(
         {
@@ -175,7 +176,7 @@ def critical_perturbation(
 
 
 def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The vibration's energy at the end of each kick, and the work that the kick did on the way."""
+    """The energy of the vibration at the end of each kick, and the work of the kick, in J."""
     known = np.flatnonzero(np.isfinite(columns["p"]))
     start, duration = (np.asarray(columns.get(name, scene.parameters[name])) for name in ("start", "duration"))
     energies = {name: np.full(len(columns["p"]), np.nan) for name in ("critical_energy", "kick_work")}
@@ -193,15 +194,15 @@ def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarr
 
 
 def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label: str) -> np.ndarray:
-    """Verdicts for every row of the columns at its own values of p (rows, kicks)."""
+    """Verdicts for each row of the columns at its own values of p (rows, kicks)."""
     values = {name: np.repeat(column, p.shape[1]) for name, column in columns.items()}
     found = run(values={**values, "p": p.ravel()}, method=method, label=label)
     return found.verdict.reshape(p.shape)
 
 
 def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> tuple[np.ndarray, np.ndarray]:
-    """The brackets (rows, 2) to be narrowed, and the verdicts of the scan at their ends; where the limit cycle is reached
-    from the first kick on, the first step.
+    """The brackets (rows, 2) to be narrowed, and the verdicts of the scan at their ends. If already the first kick leads to a
+    limit cycle, the bracket is the first step.
     """
     from_the_start = np.isnan(seen.low) & np.isfinite(seen.middle)
     brackets = np.where(from_the_start[:, None], scan[:2], seen.brackets)
@@ -220,9 +221,9 @@ def _narrowed(
 ) -> tuple[Crossing, np.ndarray]:
     """The crossings inside brackets, narrowed to the tolerance or to where undecided trajectories stop the narrowing.
 
-    The ends that a bracket begins with are run again, so that both ends of what is returned are verdicts of trajectories
-    of the narrowing. Second, where one of those contradicts the verdicts `at_ends` (rows, 2): of two verdicts of the same
-    kick one is false, so no crossing is stated there.
+    The first ends of each bracket are run again, so that both ends of the returned crossing are verdicts of trajectories from
+    the narrowing. Second result: which rows have a verdict that contradicts `at_ends` (rows, 2). Of two different verdicts on
+    the same kick one is false, so no crossing is stated there.
     """
     nothing = np.full(len(brackets), np.nan)
     found = Crossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))

@@ -1,4 +1,4 @@
-"""What accuracy costs: methods, steps and precisions measured on a scene of the user's."""
+"""The cost of accuracy: methods, steps and precisions measured on the user's scene."""
 
 import itertools
 import json
@@ -29,7 +29,7 @@ from ..verdicts.verdict import Verdict
 from .bistability import bistability_map
 from .threshold import critical_perturbation
 
-# Accuracies of the state that a recommendation is given for.
+# Accuracies of the state for which a method is recommended.
 WANTED = (1e-1, 1e-2, 1e-3, 1e-6, 1e-9)
 REPEATS = 3
 
@@ -54,27 +54,28 @@ def tradeoff(
     boundary: bool = True,
     progress: bool | None = None,
 ) -> xr.Dataset:
-    """What each method costs on a scene, and how wrong it is there.
+    """The cost of each method on a scene, and its errors there.
 
     **Arguments:**
 
     - `scene`: the scene; its load must be a `Pulse` for `boundary`.
-    - `methods`: steppers by the name they are to have in the table, `default_methods()` unless given.
+    - `methods`: steppers by their names in the table, `default_methods()` unless given.
     - `t1`: time after which states are compared, in s: long enough for several contact events.
-    - `trajectories`: trajectories that run side by side when cost is measured.
-    - `p`: kicks of the map whose verdicts are compared, 24 around the critical one unless given.
-    - `precisions`: "float64", "float32". Maps always compute in double precision, so `p_crit` and verdicts have only that.
-    - `boundary`: whether to compare p_crit and verdicts too, which takes most of the time.
+    - `trajectories`: number of trajectories in the batch whose cost is measured.
+    - `p`: kicks for which verdicts are compared, 24 around the critical one unless given.
+    - `precisions`: "float64", "float32". Maps always compute in double precision, so `p_crit` and verdicts are only given for
+      that.
+    - `boundary`: whether to compare p_crit and verdicts, too, which takes most of the time.
 
     **Returns:** a dataset over `stepper` and `precision`: `cost` (s per trajectory-cycle: one trajectory over one period of the
-    least stable sliding mode, on this machine, compilation left out), `state_error` (of the worst coordinate relative to
-    the largest of its kind), `p_crit_error`, `wrong_verdicts` and `undecided` (shares of the map). All errors are against
-    `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is what parts of the work cost, in units of
-    the event-exact end state alone. The attribute `recommendation` names, for each accuracy of the state, the method
-    that reaches it for the least.
+    least stable sliding mode, on this machine, without compilation), `state_error` (of the worst coordinate, relative to
+    the largest displacement or velocity), `p_crit_error`, `wrong_verdicts` and `undecided` (shares of the kicks). The reference
+    is `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is the cost of parts of the work, relative to
+    that of the event-exact end state alone. The attribute `recommendation` names, for each accuracy of the state, the cheapest
+    method that reaches it.
 
-    **Raises:** `TypeError` or `ValueError` for methods that are none, times and counts that are not positive, and a load
-    without a pulse where the boundary is asked for.
+    **Raises:** `TypeError` or `ValueError` for objects that are no methods, times and counts that are not positive, and a load
+    without a pulse if `boundary` is true.
 
     **Example:**
 
@@ -117,7 +118,7 @@ def tradeoff(
 
 
 def recommend(dataset: xr.Dataset, accuracy: float) -> str:
-    """The method of a `tradeoff` that reaches an accuracy of the state for the least cost; "" where none does."""
+    """The cheapest method of a `tradeoff` that reaches an accuracy of the state; "" if none does."""
     arguments.real_number("accuracy", accuracy, above=0)
     good = dataset["cost"].where(dataset["state_error"] <= accuracy)
     if not bool(good.notnull().any()):
@@ -172,7 +173,7 @@ def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
 
 
 def _frequency(scene: Scene) -> float:
-    """Of the least stable sliding mode, in Hz; 1 where none vibrates."""
+    """The frequency of the least stable sliding mode, in Hz; 1 if none vibrates."""
     values = eigenvalues(scene)
     vibrating = values[values.imag > 0]
     return float(vibrating[np.argmax(vibrating.real)].imag / (2 * np.pi)) if len(vibrating) else 1.0
@@ -197,14 +198,14 @@ def _end_state(scene: Scene, method: AbstractStepper, t1: float) -> np.ndarray:
 
 
 def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:
-    """Relative to the largest displacement and the largest velocity; infinite for a run that failed."""
+    """The error of a state relative to the largest displacement and velocity; infinite for a run that failed."""
     scale = np.repeat([np.abs(reference[:n]).max(), np.abs(reference[n:]).max()], n)
     error = np.max(np.abs(state - reference) / scale)
     return float(error) if np.isfinite(error) else np.inf
 
 
 def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -> float:
-    """Wall time for `trajectories` trajectories that differ a little in their kick, or are copies where there is none."""
+    """Wall time (s) of `trajectories` trajectories that differ a little in their kick, or are copies if there is no kick."""
     if isinstance(scene.load, Pulse):
         kicks = np.asarray(scene.load.p) * np.linspace(0.99, 1.01, trajectories)
         run = jax.jit(jax.vmap(lambda p: _run(scene, method, t1, p)[0][-1]))
@@ -219,7 +220,9 @@ def _cost(scene: Scene, method: AbstractStepper, t1: float, trajectories: int) -
 
 
 def _timed(function: Callable) -> float:
-    """The shortest of a few calls, the first one (which compiles) left out; on a shared machine the others are disturbed."""
+    """The shortest time (s) of a few calls, because other programs disturb some; the first call, which compiles, is left
+    out.
+    """
     jax.block_until_ready(function())
     walls = []
     for _ in range(REPEATS):
@@ -230,7 +233,7 @@ def _timed(function: Callable) -> float:
 
 
 def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStepper], dict[str, float]]:
-    """How wrong a method is about p_crit, and about the verdicts of a row of kicks; none of it where there is no p_crit."""
+    """A function that gives a method's errors in p_crit and in the verdicts of a row of kicks; none if there is no p_crit."""
     now = np.asarray(scene.belt_speed)[None]
     found = critical_perturbation(scene, belt_speed=now, p_step=0.05, tolerance=1e-7, progress=False)
     p_crit = float(found["p_crit"][0])
@@ -255,7 +258,7 @@ def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStep
 
 
 def _parts(scene: Scene, t1: float) -> dict[str, float]:
-    """What parts of the work cost by the event-exact method, in units of the plain end state."""
+    """The cost of parts of the work with the event-exact method, relative to that of the end state alone."""
     method = EventExact()
 
     def cost(scene: Scene, rows: int = 1, ledger: bool = False) -> float:
@@ -266,7 +269,7 @@ def _parts(scene: Scene, t1: float) -> dict[str, float]:
     found = {"end state alone": 1.0, "stored output, 1000 rows": cost(scene, rows=1000) / plain}
     found["energy ledger"] = cost(scene, ledger=True) / plain
     if isinstance(scene.friction, Coulomb):
-        # As good as constant, so that the motion is the same and only its treatment differs.
+        # Practically constant, so that the motion is the same but is computed as with friction that varies.
         mu = scene.friction.mu
         falling = Scene(
             scene.structure,

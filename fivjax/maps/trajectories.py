@@ -1,7 +1,6 @@
-"""Which trajectories a run has, and how they are cut into jobs: by what they are alone, never by who computes them.
+"""The trajectories of a run, and how they are divided into jobs, which does not depend on the executor.
 
-Trajectories of a group (`sharing`) share what is worked out once, their attractors above all, so a job has whole groups
-where they are small enough.
+Trajectories of a group (`sharing`) share data, above all their attractors, so a job has whole groups if these are small enough.
 """
 
 import math
@@ -12,7 +11,7 @@ from jaxtyping import Int
 
 from .sharing import HISTORY, grouped
 
-# Trajectories by their places in a run; several are one job.
+# Indices of trajectories in a run; those of one job, for instance.
 Places = Int[np.ndarray, " r"]
 
 
@@ -37,19 +36,21 @@ class Grid(Mapping):
         return len(self.axes)
 
     def columns(self, places: Places) -> dict[str, np.ndarray]:
-        """Their values, by name."""
+        """The values of these trajectories, by name."""
         index = np.unravel_index(places, self.shape)
         return {name: values[own] for (name, values), own in zip(self.axes.items(), index, strict=True)}
 
     def groups(self, places: Places) -> Int[np.ndarray, " r"]:
-        """The group that each belongs to."""
+        """The group of each of these trajectories."""
         if not self.across:
             return np.zeros(len(places), int)
         index = np.unravel_index(places, self.shape)
         return np.ravel_multi_index([index[k] for k in self.across], [self.shape[k] for k in self.across])
 
     def tile(self, most: int) -> tuple[int, ...]:
-        """The shape of equal tiles of at most so many trajectories, of whole groups where these are small enough."""
+        """The shape of the equal parts of the grid that make jobs: at most `most` trajectories, whole groups if these are small
+        enough.
+        """
         shape, left = [1] * len(self.shape), max(most, 1)
         inside_groups = [k for k in range(len(self.shape)) if k not in self.across]
         for k in (*reversed(inside_groups), *reversed(self.across)):
@@ -59,7 +60,7 @@ class Grid(Mapping):
         return tuple(shape)
 
     def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
-        """These places (all, unless given) cut into jobs; each tile is in one of them."""
+        """These trajectories (all, unless given) divided into jobs; a part of the grid is never in two of them."""
         tile = self.tile(most)
         if places is None:
             return Tiles(self.shape, tile)
@@ -79,21 +80,21 @@ class Listed:
         self.group_count = len(distinct)
 
     def columns(self, places: Places) -> dict[str, np.ndarray]:
-        """Their values, by name."""
+        """The values of these trajectories, by name."""
         return {name: column[places] for name, column in self.values.items()}
 
     def groups(self, places: Places) -> Int[np.ndarray, " r"]:
-        """The group that each belongs to."""
+        """The group of each of these trajectories."""
         return self._group[places]
 
     def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
-        """These places (all, unless given) cut into jobs, group by group."""
+        """These trajectories (all, unless given) divided into jobs, group by group."""
         places = np.arange(self.total) if places is None else places
         return cut(self._group[places], places, most)
 
 
 class Tiles(Sequence):
-    """The places of each tile of a grid, tile by tile."""
+    """The equal parts ("tiles") of a grid, each as the indices of its trajectories."""
 
     def __init__(self, shape: tuple[int, ...], tile: tuple[int, ...]):
         self.shape, self.tile = shape, tile
@@ -103,7 +104,7 @@ class Tiles(Sequence):
         return math.prod(self.parts)
 
     def slices(self, number: int) -> tuple[slice, ...]:
-        """Where a tile lies on the grid."""
+        """The position of a part on the grid."""
         if not 0 <= number < len(self):
             raise IndexError(number)
         at = np.unravel_index(number, self.parts)
@@ -117,7 +118,7 @@ class Tiles(Sequence):
         return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
 
     def holding(self, places: Places) -> Int[np.ndarray, " t"]:
-        """The numbers of the tiles that these places lie in."""
+        """The numbers of the parts in which these trajectories lie."""
         index = np.unravel_index(places, self.shape)
         return np.unique(
             np.ravel_multi_index([i // part for i, part in zip(index, self.tile, strict=True)], self.parts)
@@ -125,7 +126,7 @@ class Tiles(Sequence):
 
 
 def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
-    """Places in jobs of whole units, at most so many in one; a larger unit makes several jobs."""
+    """Jobs of whole units with at most `most` trajectories each; a larger unit makes several jobs."""
     order = np.argsort(unit, kind="stable")
     _, counts = np.unique(unit, return_counts=True)
     ends, filled, at = [0], 0, 0

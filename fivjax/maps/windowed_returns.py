@@ -1,4 +1,4 @@
-"""The return map of the Poincaré section by windows: motions of several groups side by side, for constant friction."""
+"""The return map of the Poincaré section by `Windowed`, for many motions of several groups, under constant friction."""
 
 import functools
 
@@ -12,29 +12,30 @@ from ..foundation.kept_programs import kept
 from ..steppers.windowed import Windowed
 from .flattened import Flattened, flatten
 
-# Motions of one group in a row.
+# Number of motions of one group in a row.
 SIDE_BY_SIDE = 8
-# States on the section that are kept of a motion, the last ones.
+# Number of states on the section that are kept of a motion, the last ones.
 KEPT = 16
 
 
 def no_path(y: Float[Array, "*rows state"]) -> Float[Array, "*rows kept state"]:
-    """The states on the section of a motion that has not met it yet."""
+    """The path of a motion that has not reached the section yet."""
     return jnp.full((*y.shape[:-1], KEPT, y.shape[-1]), jnp.nan, y.dtype)
 
 
 def with_newest(
     path: Float[Array, "*rows kept state"], y: Float[Array, "*rows state"], crossed: Bool[Array, "*rows"]
 ) -> Float[Array, "*rows kept state"]:
-    """The path, with this state where the motion has `crossed` the section in it."""
+    """The path, with this state added if the motion has `crossed` the section there."""
     longer = jnp.concatenate([path[..., 1:, :], y[..., None, :]], axis=-2)
     return jnp.where(crossed[..., None, None], longer, path)
 
 
 @kept
 def moved_in_windows(shared: Flattened, rows: Flattened) -> Flattened:
-    """From states of the section to the crossing asked for of each: the state there, contact mode, events and time (s) on the
-    way, the path, the largest tangential speed (m/s; 0 unless asked for). Not a number where the section is not met.
+    """The motions from states of the section to the crossing asked for: the state there, its contact mode, the number of
+    events, the time (s), the path, and the largest tangential speed (m/s; 0 unless asked for). NaN where the section is not
+    reached.
     """
     windows, longest = shared.tree
     y, status, direction, crossings, peaks = rows.tree
