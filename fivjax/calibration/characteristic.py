@@ -1,6 +1,6 @@
-r"""Measured poles and mode shapes in a scene's own characteristic equation: residuals that lead to the right period from afar.
+r"""Measured poles and mode shapes in a scene's characteristic equation: residuals for parameters that are far from the answer.
 
-That equation is linear in springs and dampers, so there is no neighbouring period to fall into.
+The equation is linear in springs and dampers, so these residuals have no false minima a period away.
 """
 
 import jax
@@ -13,7 +13,7 @@ from ..model.scene import Scene
 from ..model.sliding import sliding_coordinates
 from .misfit import finite
 
-# Errors that coarse residuals are measured in: shapes are known to some per cent, poles ten times better.
+# The units of coarse residuals: mode shapes are known to some per cent, poles ten times better.
 COARSE_SHAPE = 0.03
 COARSE_POLE = 3e-3
 
@@ -21,9 +21,10 @@ COARSE_POLE = 3e-3
 def characteristic_residual(
     scene: Scene, poles: Complex[Array, " j"], shapes: Complex[Array, "j k"], channels: tuple[Channel, ...]
 ) -> Float[Array, " c"]:
-    r"""Measured poles and shapes in $(λ^2 - A_{22}λ - A_{21})\,φ = 0$, relative to $λ^2 φ$; and its determinant.
+    r"""Residuals of measured poles and shapes in $(λ^2 - A_{22}λ - A_{21})\,φ = 0$, relative to $λ^2 φ$; and of its
+    determinant.
 
-    Poles that are NaN were not measured and add nothing.
+    Poles that are NaN were not measured and contribute zero.
     """
     matrix = linear_sliding(scene).matrix
     m = matrix.shape[0] // 2
@@ -35,7 +36,7 @@ def characteristic_residual(
         return jnp.eye(m) * pole**2 - matrix[m:, m:] * pole - matrix[m:, :m]
 
     def determinant(pole):
-        # How far the pole is from the scene's nearest one: others that were measured too are divided out.
+        # A measure of the distance from the scene's nearest pole: the other measured poles are divided out.
         apart = jnp.abs(pole - poles)
         apart = jnp.prod(jnp.where((apart == 0) | ~found, 1.0, jnp.maximum(apart, 1e-3 * jnp.abs(pole))))
         scale = (2 * jnp.abs(pole)) ** m * jnp.abs(pole) ** (m - jnp.sum(found))

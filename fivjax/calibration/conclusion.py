@@ -1,4 +1,4 @@
-"""From the end of a search to its result: uncertainties, what is told, and whether the model fits at all."""
+"""The result of a search: uncertainties, which parameters are identifiable, and whether the model fits."""
 
 import jax
 import jax.numpy as jnp
@@ -16,22 +16,22 @@ from .problem import Problem
 from .result import FITTED, Calibration, FitOutcome
 from .search import Search
 
-# A signal counts if a fit explains more than so much energy per fitted number, in units of the noise.
+# There is a signal if a fit explains more than this energy per fitted number, in units of the noise variance.
 SIGNIFICANT = 25.0
-# A model that leaves more than this share of the signal's energy does not fit.
+# A model does not fit if it leaves more than this share of the signal's energy.
 MOST_LEFT = 0.1
-# Disturbances of a cycle that grow by more than this a period: it would not last.
+# A cycle whose disturbances grow by more than this factor in a period is unstable.
 UNSTABLE = 1.001
 
 
 def concluded(search: Search, blocks: list[Averaged], identifiable_within: float) -> Calibration:
     """The result of a search."""
     problem, best, size = search.problem, search.best, search.problem.size
-    # Without the rows of the regularisation, which is let go by then.
+    # Without the rows of the regularisation, which is no longer active.
     found, jacobian = best.at.residual[:-size], best.at.jacobian[:-size]
     u = jnp.asarray(best.x[:size])
     estimates, slope = map(np.asarray, _values_and_slopes(problem.parameters, u))
-    # In whole parameters, so that singular values compare: a change of 100 %, or of a millisecond of offset.
+    # Relative to the parameters, so that singular values are comparable: a change of 100 %, or of one millisecond of offset.
     whole = np.where(estimates == 0, problem.parameters.size, np.abs(estimates))
     scales = np.concatenate([whole / slope, np.ones(len(best.x) - size)])
     deviations, correlation, singular = covariance_of(jacobian * scales)
@@ -41,10 +41,10 @@ def concluded(search: Search, blocks: list[Averaged], identifiable_within: float
     outcome = _outcome(search, left, means, models, found)
     identified = (deviations[:size] <= identifiable_within) & (outcome in FITTED)
     if outcome is not FitOutcome.CONVERGED:
-        # Deviations are those of a right model about a minimum; elsewhere they would promise what nobody knows.
+        # Standard deviations hold for a right model at a minimum; elsewhere they are unknown.
         deviations = np.full_like(deviations, np.inf)
     elif left.smaller:
-        # The noise is no larger than what is left.
+        # The estimated noise was larger than the residuals, so it is reduced to their size.
         deviations = deviations * np.sqrt(left.misfit)
     offsets, at = [], size
     for moved, offset in zip(problem.moved, problem.offsets(best.x), strict=True):
@@ -71,7 +71,7 @@ def concluded(search: Search, blocks: list[Averaged], identifiable_within: float
 
 
 def not_tried(problem: Problem, recordings, blocks: list[Averaged], outcome: FitOutcome) -> Calibration:
-    """The result of a fit that would mean nothing: no parameter is told."""
+    """The result where a fit would make no sense: no parameter has a value."""
     size, nan = problem.size, float("nan")
     return Calibration(
         scene=problem.scene,
@@ -108,7 +108,7 @@ def _outcome(search: Search, left: WhatIsLeft, means, models, found) -> FitOutco
 def _left(search: Search, found: np.ndarray, means, models) -> WhatIsLeft:
     misfits = search.problem.misfits
     freedom = max(len(found) - len(search.best.x) - sum(m.projected for m in misfits), 1)
-    # A limit cycle is compared by its first harmonics; its waveform keeps all the others.
+    # A limit cycle is compared by its first harmonics, so its waveform has all higher ones as residuals: left out here.
     pairs = zip(misfits, means, models, strict=True)
     waveforms = [
         (measured - model) / np.asarray(m.sigma) for m, measured, model in pairs if not isinstance(m, CycleMisfit)
@@ -119,7 +119,7 @@ def _left(search: Search, found: np.ndarray, means, models) -> WhatIsLeft:
 
 
 def _has_signal(search: Search, means, models) -> bool:
-    """Whether any recording holds more than noise, or explains more energy than fitting noise would."""
+    """Whether any recording has more than noise in it, or a fit explains more energy than fitting noise would."""
     for mine, measured, model in zip(search.problem.misfits, means, models, strict=True):
         if isinstance(mine, CycleMisfit):
             scaled = np.asarray(mine.whitening @ mine.measured)
@@ -135,13 +135,13 @@ def _has_signal(search: Search, means, models) -> bool:
 
 
 def _share_left(search: Search, means, models) -> float:
-    """Share of the signal's energy, without the noise's, that the fit leaves; of the recording where it is largest."""
+    """The share of the signal's energy (without that of the noise) that the fit leaves, for the recording with the largest."""
     shares = [0.0]
     for mine, measured, model in zip(search.problem.misfits, means, models, strict=True):
         sigma = np.asarray(mine.sigma)
         noise = 0.0
         if isinstance(mine, CycleMisfit):
-            # Harmonics that no fit has are no part of its signal.
+            # Only the fitted harmonics count as signal.
             measured = np.asarray(mine.harmonic_part)
         else:
             noise = measured.shape[0] * measured.shape[1]

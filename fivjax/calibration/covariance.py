@@ -1,17 +1,17 @@
-"""How far the data tell the parameters: standard deviations, correlations, and which are told only in combination."""
+"""Standard deviations and correlations of parameters, and which are identifiable only in combination."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Parameters with a larger correlation are told in combination: one may move far if the other follows.
+# Parameters with a larger correlation are identifiable only in combination: one may change much if the other follows.
 TOGETHER = 0.9
 
 
 def covariance_of(jacobian: Float[np.ndarray, "r j"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    r"""Standard deviations, correlations and singular values from $(J^T J)^{-1}$; infinite deviations along directions that
-    change nothing."""
+    r"""Standard deviations, correlations and singular values from $(J^T J)^{-1}$; the deviations are infinite for parameters
+    that have a share in a direction along which the residuals do not change."""
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    # What is below rounding is nothing. Parameters with no share in such a direction keep their own deviation.
+    # Singular values below rounding count as zero. Parameters without a share in such a direction keep their deviation.
     kept = np.maximum(singular, max(1e-12 * singular[0], 1e-100))
     shares = np.where(np.abs(directions) < 1e-9, 0.0, directions)
     covariance = (shares / kept[:, None] ** 2).T @ shares
@@ -23,7 +23,7 @@ def covariance_of(jacobian: Float[np.ndarray, "r j"]) -> tuple[np.ndarray, np.nd
 
 
 def combinations(names: tuple[str, ...], correlation: Float[np.ndarray, "k k"]) -> list[tuple[tuple[str, ...], float]]:
-    """Groups of parameters whose correlations exceed `TOGETHER`, with the largest (by size) of each group."""
+    """Groups of parameters whose correlations exceed `TOGETHER`, with the largest correlation (by size) of each group."""
     alike = np.abs(correlation) >= TOGETHER
     reach = np.linalg.matrix_power(alike.astype(float) + np.eye(len(names)), len(names)) > 0
     groups = []

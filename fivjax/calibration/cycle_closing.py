@@ -1,4 +1,4 @@
-"""Newton's method for the cycles of a fit: each is closed at every step, from where it was at the last one."""
+"""Newton's method for the limit cycles of a fit: in every step each is closed, starting from the one of the step before."""
 
 import equinox as eqx
 import jax
@@ -10,17 +10,17 @@ from ..contact import Contact, Status
 from ..model.structure import Structure
 from .shooting import Cycle
 
-# A cycle is closed when its next correction is this small, relative to its size: the one after that is rounding.
+# A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
 CLOSED = 1e-7
 
 
 def is_closed(correction: float) -> bool:
-    """Whether a correction of this relative size is the last."""
+    """Whether a correction of this relative size is the last one needed."""
     return correction <= CLOSED
 
 
 def predicted(tangential: int, moved: Float[Array, " j"], about) -> tuple[Cycle, ...]:
-    """The cycles `about` a point when the parameters have `moved` from there, to first order."""
+    """The cycles of a point, from those of the point `about`, to first order in the change `moved` of the parameters."""
     return tuple(
         cycle.at(cycle.unknowns(tangential) + follow @ moved, tangential)
         for cycle, follow in zip(about.cycles, about.follow, strict=True)
@@ -28,18 +28,20 @@ def predicted(tangential: int, moved: Float[Array, " j"], about) -> tuple[Cycle,
 
 
 def corrected(structure: Structure, cycle: Cycle, step, gap, contact: Contact) -> tuple[Cycle, Float[Array, ""]]:
-    """The cycle after a step of Newton's method, and how large that was; or one period later, where its mode changed."""
+    """The cycle after a step of Newton's method, and the relative size of the step; or its state one period later, if the
+    contact mode has changed.
+    """
     n = len(step) // 2
     held = cycle.contact.status != Status.DETACH
     constrained = jnp.array([structure.normal, n + structure.normal])
-    # On the belt the normal coordinate is zero, not only but for rounding.
+    # On the belt the normal coordinate is exactly zero.
     step = jnp.where(held, step.at[constrained].set(-cycle.y[constrained]), step)
     sizes = [jnp.full(n, jnp.max(jnp.abs(part))) for part in (cycle.y[:n], cycle.y[n:])]
     sizes = jnp.concatenate(sizes).at[n + structure.tangential].set(cycle.period)
     better = cycle.at(cycle.unknowns(structure.tangential) + step, structure.tangential)
     changed = contact.status != cycle.contact.status
     later = Cycle(cycle.y + gap, contact, cycle.period)
-    # A period that went astray is none.
+    # A period that has changed by a factor of two is no longer a guess.
     astray = (better.period < 0.5 * cycle.period) | (better.period > 2 * cycle.period)
     better = eqx.tree_at(lambda c: c.period, better, jnp.where(astray, jnp.nan, better.period))
     chosen = jax.tree.map(lambda a, b: jnp.where(changed, a, b), later, better)
@@ -48,12 +50,12 @@ def corrected(structure: Structure, cycle: Cycle, step, gap, contact: Contact) -
 
 
 def growth_of_disturbances(system: Float[np.ndarray, "state state"], where: int) -> float:
-    """The largest factor by which a disturbance of a cycle grows from one return to the next (its Floquet multipliers)."""
+    """The largest factor by which a disturbance of a cycle grows from one return to the next: the largest multiplier's size."""
     rest = np.delete(np.arange(len(system)), where)
-    # A disturbed state comes back later; the period is what brings the tangential velocity back.
+    # A disturbed motion returns after another time: the one at which the tangential velocity has its value again.
     period = system[:, where]
     carried = (system + np.eye(len(system)))[:, rest]
     with np.errstate(all="ignore"):
         returned = (carried - np.outer(period, carried[where] / period[where]))[rest]
-    # Where no cycle was closed, none lasts.
+    # Where no cycle was closed, it counts as unstable.
     return float(np.max(np.abs(np.linalg.eigvals(returned)))) if np.all(np.isfinite(returned)) else np.inf

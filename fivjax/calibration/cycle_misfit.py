@@ -1,6 +1,6 @@
 """A measured limit cycle beside that of a scene: frequency, harmonics, and fractions of time in the statuses.
 
-Both are exact. The recording's come from all of its samples with the errors that its noise makes (`harmonics`); the scene's
+Those of the recording are fitted to all of its samples, with errors from its noise (`harmonics`); those of the scene are exact,
 from one closed period (`shooting`).
 """
 
@@ -18,20 +18,20 @@ from .noise import noise_of_means
 from .shooting import Cycle, around, settled
 
 MOST_HARMONICS = 8
-# Blocks per period: many, because landings are short; the least and the most.
+# The smallest and the largest number of blocks per period: many, because contact after a landing may be short.
 CYCLE_BLOCKS = (28, 48)
-# A recording need not hold more periods than these for its lines to be told apart.
+# The number of periods that is enough to resolve the lines of the spectrum.
 CYCLE_PERIODS = 30
-# Errors of a guess: of the frequency, relative; of lines, as shares of the largest; of fractions of time, of it all.
+# Units of residuals for rough guesses: of the frequency, relative; of lines, as shares of the largest; of fractions of time.
 ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
-# What sampling folds down of lines far up, onto fitted lines, relative to the largest, and onto the frequency, relative.
+# Errors by aliasing of high lines: in the fitted lines, relative to the largest; and in the frequency, relative.
 FOLDED, FOLDED_FREQUENCY = 1e-4, 1e-7
-# What lies about the fundamental without being part of it, relative: from here on a vibration beats.
+# A vibration beats if the sidebands of its fundamental are larger than this, relative to it.
 BEATS = 0.01
 
 
 class CycleMisfit(AbstractMisfit):
-    """A limit cycle by its harmonics and, where they were measured, its fractions of time in the statuses."""
+    """A limit cycle, compared by its harmonics and, if they were measured, its fractions of time in the statuses."""
 
     means: Float[Array, "B k"]
     sigma: Float[Array, " k"]
@@ -43,20 +43,20 @@ class CycleMisfit(AbstractMisfit):
     ]  # sticking, detached; value and standard deviation, which is infinite if not measured
     method: AbstractStepper
     width: Float[Array, ""]  # of a block, s
-    fundamental: Float[Array, "2"]  # of the first channel at the first block's middle, as measured: cosine and sine
-    harmonic_part: Float[Array, "B k"]  # of the means, as measured
-    beating: Float[Array, ""]  # size of what lies between the harmonics, relative
+    fundamental: Float[Array, "2"]  # measured, of the first channel, at the first block's middle: cosine and sine
+    harmonic_part: Float[Array, "B k"]  # the harmonics in the measured means
+    beating: Float[Array, ""]  # relative size of the sidebands
     count: int = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
 
     @property
     def frequency(self) -> Float[Array, ""]:
-        """As measured, Hz."""
+        """The measured frequency, in Hz."""
         return self.measured[0]
 
     def settled(self, scene: Scene) -> Cycle:
-        """The limit cycle that the scene settles on, nearly."""
+        """A guess of the limit cycle on which the scene settles."""
         return settled(scene.replace(**self.known), self.method, self.frequency)
 
     def compared(self, scene, own: Cycle, share):
@@ -74,7 +74,7 @@ class CycleMisfit(AbstractMisfit):
         return Compared(residual, self._in_time(lines, own.period), after.y - own.y, after.contact)
 
     def _averaged(self, lines, period):
-        """Lines of the channels' means over blocks."""
+        """Fourier coefficients of the channels' means over blocks."""
         orders = jnp.arange(1, self.count + 1)
         columns = []
         for quantity, coordinate in self.channels:
@@ -83,7 +83,7 @@ class CycleMisfit(AbstractMisfit):
         return jnp.stack(columns, axis=1)
 
     def _in_time(self, lines, period):
-        """These lines over the blocks of the recording, in step with it."""
+        """The waveform of these coefficients over the blocks of the recording, in phase with it."""
         orders = jnp.arange(1, self.count + 1)
         phase = jnp.angle(self.fundamental[0] - 1j * self.fundamental[1]) - jnp.angle(lines[0, 0])
         turns = 2 * jnp.pi * self.width / period * jnp.arange(self.means.shape[0])[:, None] + phase
@@ -91,7 +91,7 @@ class CycleMisfit(AbstractMisfit):
 
 
 def _referred(frequency, found):
-    """`harmonics.referred`, to be differentiated."""
+    """`harmonics.referred`, written so that JAX can differentiate it."""
     size = jnp.sqrt(found[0, 0].real ** 2 + found[0, 0].imag ** 2)
     turned = found * (found[0, 0].conj() / size) ** jnp.arange(1, found.shape[0] + 1)[:, None]
     rest = turned.ravel()[1:]
@@ -109,7 +109,7 @@ def misfit_of_cycle(recording: Recording, blocks: Averaged, method: AbstractStep
     frequency = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma).frequency
     left, lines = without_lines(blocks.means, width, frequency, count)
     if recording.noise is None:
-        # Sparse samples leave no clean differences; then what the harmonics leave is the better bound.
+        # With few samples per period, differences contain signal; then the residuals of the harmonics are the better bound.
         sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / max(len(left) - 2 * count - 1, 1)))
     measured = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma)
     fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
@@ -134,7 +134,7 @@ def misfit_of_cycle(recording: Recording, blocks: Averaged, method: AbstractStep
 
 
 def cycle_rate(recording: Recording, scene: Scene) -> float:
-    """Blocks per second for a limit cycle, so many to a period that what averaging folds down lies between its lines."""
+    """Blocks per second for a limit cycle: a number per period for which aliases of averaging lie between its lines."""
     blocks = averaged(recording, 16 * sliding_frequencies(scene, recording).max())
     width = float(blocks.edges[1] - blocks.edges[0])
     frequency = fitted_harmonics(
@@ -146,10 +146,10 @@ def cycle_rate(recording: Recording, scene: Scene) -> float:
 
 
 def _folded(per_period: float) -> float:
-    """How much of the lines around each multiple of the block rate is taken for fitted lines, in units of a flat spectrum.
+    """How much of the lines around each multiple of the block rate appears in the fitted lines, in units of a flat spectrum.
 
-    Averaging leaves a share h/(m r) of what lies next to m times the rate of r blocks per period, for the line h; the
-    taper keeps out what is folded down far enough from it.
+    Averaging over r blocks per period leaves, in the line h, a share h/(m r) of the lines near m times the block rate; the
+    taper suppresses aliases far enough from the line.
     """
     m = np.arange(1, 13)
     aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
@@ -160,6 +160,8 @@ def _folded(per_period: float) -> float:
 
 
 def _searched(scene: Scene, recording: Recording) -> tuple[float, float]:
-    """The fundamental is sought where the sliding modes are: a start 30 % off in a spring is 16 % off in frequency."""
+    """The range (Hz) in which the fundamental is sought: around the sliding modes, because a guess with a spring wrong by 30 %
+    has a frequency wrong by 16 %.
+    """
     modes = sliding_frequencies(scene, recording)
     return 0.6 * modes.min(), 1.6 * modes.max()

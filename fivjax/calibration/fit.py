@@ -1,10 +1,10 @@
 r"""Parameters of a scene from recordings, with uncertainties.
 
-Least squares in steps that keep each start from ending a period beside the truth (`search`), with forward-mode Jacobians,
-exact through contact events. The covariance is $(J^T J)^{-1}$ at the end, J the Jacobian of the residuals in units of a
-noise that the fit does not know (`noise`). Its singular values say which combinations of parameters the data tell: a
-parameter whose standard deviation exceeds a stated share of itself is reported as *not identifiable*, not as a number.
-Where what is left is not noise (`goodness_of_fit`), no parameter has a standard deviation.
+Least squares, in stages that keep a fit from ending in a false minimum a period away (`search`), with forward-mode Jacobians
+that are exact through contact events. The covariance is $(J^T J)^{-1}$ at the end, with J the Jacobian of the residuals in
+units of a noise that is known independently of the fit (`noise`). Its singular values say which combinations of parameters are
+identifiable: a parameter whose standard deviation exceeds a given share of it is reported as *not identifiable*, without a
+number. If the residuals are not noise (`goodness_of_fit`), no parameter has a standard deviation.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ from .search import Search
 from .time_offsets import slid_throughout
 from .waveform_misfit import misfit_of_waveform
 
-# Scenes looked at for one that vibrates much as the limit cycle that was measured.
+# The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
 SCREENED = 32
 # Blocks per period of the highest sliding mode of the scene that the fit starts from.
 BLOCKS_PER_PERIOD = 16
@@ -58,21 +58,21 @@ def calibrate(
 
     **Arguments:**
 
-    - `scene`: what was measured, with a first guess of the free parameters; what is not free is taken as known.
-    - `data`: a `Recording`, or several with what is known of each run.
+    - `scene`: the scene that was measured, with a first guess of the free parameters; all others are taken as known.
+    - `data`: a `Recording`, or several, each with the parameters known for its run.
     - `free`: names of parameters, any of `scene.parameters`.
-    - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may be anything).
-    - `starts`: how many, the scene's own first, the others within `spread` (relative) around it, drawn with `seed`; for
-      limit cycles 32 at least, with sliding modes at the measured frequency.
-    - `rate`: blocks per second that recordings are averaged over before they are compared; 16 per period of the scene's
-      highest sliding mode unless given, 28 to 48 per period of a limit cycle. The model is averaged over the
-      same blocks, exactly.
-    - `identifiable_within`: the largest standard deviation, relative to the parameter, that still counts as knowing it.
+    - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may have any value).
+    - `starts`: the number of first guesses: the scene's own, and others within `spread` (relative) around it, drawn with
+      `seed`. For limit cycles there are at least 32, with sliding modes at the measured frequency.
+    - `rate`: recordings are averaged over so many blocks per second before they are compared; unless given, 16 per period of
+      the scene's highest sliding mode, or 28 to 48 per period of a limit cycle. The model is averaged exactly over the same
+      blocks.
+    - `identifiable_within`: the largest standard deviation, relative to the parameter, for which it counts as identifiable.
     - `method`: how to step, `EventExact()` unless given. Gradients of `WhereSwitched` are wrong after contact events.
 
-    **Returns:** a `Calibration`. Uncertainties are standard deviations for noise that is white and equal within a channel, as
-    the recording states it, or else as it is measured where no signal is. Where what is left is not such noise,
-    uncertainties are not known, and the outcome says so.
+    **Returns:** a `Calibration`. Uncertainties are standard deviations for white noise with one level per channel: the level
+    given in the recording, or else estimated from it. If the residuals are not such noise, uncertainties are not known, and the
+    outcome says so.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for names, bounds or channels that do not fit the scene.
 
@@ -111,7 +111,7 @@ def calibrate(
     references = jnp.array([r.offset[0] for r in recordings])
     cycles = all(r.regime == "limit cycle" for r in recordings)
     kicked = any(r.regime == "kick" for r in recordings)
-    # A response to a kick is first taken to slide throughout, which is quick to try and checked afterwards.
+    # A response to a kick is first assumed to slide all the time, which is fast to compute and checked afterwards.
     for uneventful in (True, False) if kicked and scene.friction.constant else (False,):
         misfits = tuple(
             misfit_of_cycle(r, b, method, scene)
@@ -125,7 +125,7 @@ def calibrate(
         if cycles:
             frequencies = [float(cycle.frequency) for cycle in problem.cycles]
             half = max(int(starts), SCREENED) // 2
-            # A limit cycle needs modes that come together, but its frequency may lie some way below theirs.
+            # A limit cycle needs two modes of similar frequency, but its own frequency may be somewhat lower.
             near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
             around = latin_hypercube(parameters, scene, half, float(spread), seed)
             guesses = np.concatenate([near, around[1:]])
@@ -137,7 +137,7 @@ def calibrate(
                 bar.set_postfix_str(stage)
                 bar.update()
         result = concluded(search, blocks, float(identifiable_within))
-        # Noise alone is not explained any better by contact events.
+        # If there is no signal, contact events do not explain it any better.
         if not uneventful or result.outcome is FitOutcome.NO_SIGNAL:
             break
         misfitting = result.outcome in (FitOutcome.STRUCTURE_LEFT, FitOutcome.DOES_NOT_FIT)
@@ -147,7 +147,7 @@ def calibrate(
 
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:
-    """Recording k averaged over blocks, if there are enough of them."""
+    """Recording k averaged over blocks; refused if there are too few."""
     own = _rate(scene, recording) if rate is None else rate
     if round(recording.rate / own) > len(recording.t):
         raise ValueError(
@@ -163,7 +163,7 @@ def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, para
 
 
 def _rate(scene: Scene, recording: Recording) -> float:
-    """Blocks per second that tell what the scene can do."""
+    """Blocks per second that resolve the scene's vibrations."""
     frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
     rate = BLOCKS_PER_PERIOD * float(frequencies.max())
     return cycle_rate(recording, scene) if recording.regime == "limit cycle" else rate

@@ -1,7 +1,7 @@
-"""Is what a fit leaves noise? Its size against the noise that was stated or measured, and its likeness from block to block.
+"""Whether the residuals of a fit are noise: their size relative to the given or estimated noise, and their autocorrelation.
 
-A wrong model shows in either. Both are compared with their own scatter: the mean square of N normal numbers scatters by
-sqrt(2/N), a correlation of N of them by 1/sqrt(N). So long recordings find out small errors of a model.
+A wrong model shows in at least one of them. Both are compared with their own scatter: the mean square of N normal numbers has a
+standard deviation of sqrt(2/N), a correlation of N of them one of 1/sqrt(N). So long recordings reveal small errors of a model.
 """
 
 from typing import NamedTuple
@@ -12,25 +12,25 @@ from scipy.special import gammaincc
 
 from .noise import ESTIMATE_ERROR
 
-# In standard deviations of their own scatter: from here on chance is not the reason.
+# Deviations of more than this many standard deviations are not explained by chance.
 UNLIKELY = 5.0
-# Lags that are looked at together; blocks are so short that a vibration stays in this window for about a period.
+# Number of lags tested together, in blocks; about a period of a vibration.
 LAGS = 16
 IMPROBABLE = 1e-6
 
 
 class WhatIsLeft(NamedTuple):
-    """What a fit leaves, in units of the noise."""
+    """The residuals of a fit, in units of the noise."""
 
     misfit: float  # sum of squares per degree of freedom
-    larger: bool  # than the noise can be
-    smaller: bool  # than the noise is said to be: then it was estimated too large
-    correlation: float  # of neighbouring blocks, the channel and recording where it is the least likely by chance
-    correlated: bool  # so much that it is not white noise
+    larger: bool  # whether they are larger than the noise can be
+    smaller: bool  # whether they are smaller than the noise can be: then it was estimated too large
+    correlation: float  # of neighbouring blocks, in the channel and recording where it is least likely by chance
+    correlated: bool  # whether they are too correlated for white noise
 
     @property
     def is_noise(self) -> bool:
-        """Whether noise alone explains it."""
+        """Whether noise alone explains the residuals."""
         return not (self.larger or self.correlated)
 
     def __str__(self) -> str:
@@ -41,9 +41,11 @@ class WhatIsLeft(NamedTuple):
 
 
 def what_is_left(squares: float, freedom: int, waveforms: list[Float[np.ndarray, "B k"]], stated: bool) -> WhatIsLeft:
-    """Sum of squared residuals with its degrees of freedom, and the waveforms of those recordings that are compared by one."""
+    """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings
+    that are compared by their waveform; `stated`: whether the noise was given.
+    """
     misfit = squares / freedom
-    # The estimate's error is one of a standard deviation, so twice that of a square.
+    # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
     found = [_likeness(column) for left in waveforms for column in left.T]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
@@ -57,14 +59,16 @@ def what_is_left(squares: float, freedom: int, waveforms: list[Float[np.ndarray,
 
 
 def exceeds_noise(means: Float[np.ndarray, "B k"], sigma: Float[np.ndarray, " k"]) -> bool:
-    """Whether what was recorded is anything but white noise of this size around a constant."""
+    """Whether a recording is more than white noise of this size around a constant."""
     scaled = (means - means.mean(axis=0)) / sigma
     found = what_is_left(float(np.sum(scaled**2)), scaled.size - scaled.shape[1], [scaled], stated=False)
     return not found.is_noise
 
 
 def _likeness(left: Float[np.ndarray, " B"]) -> tuple[float, bool]:
-    """Correlation of neighbouring blocks, and whether it, or those of all lags together (Ljung and Box 1978), is no chance."""
+    """The correlation of neighbouring blocks; and whether it, or that of all lags together (Ljung and Box 1978), is
+    significant.
+    """
     count, power = len(left), float(np.sum(left**2))
     if power == 0:
         return 0.0, False

@@ -1,8 +1,8 @@
-r"""Harmonics of a measured limit cycle: its frequency, its Fourier coefficients, and how far noise moves them.
+r"""Harmonics of a measured limit cycle: its frequency and Fourier coefficients, and their errors by noise.
 
-A limit cycle is a Fourier series. `fitted_harmonics` finds its frequency and its coefficients, referred to the phase of the
-first channel's fundamental, with their covariance; `beating` says whether the vibration repeats at all. None of these
-depends on a phase, so a fit to them has no false minima a period apart.
+A limit cycle is a Fourier series. `fitted_harmonics` finds its frequency and its coefficients, relative to the phase of the
+first channel's fundamental, with their covariance; `beating` says whether the vibration is periodic at all. None of these
+depends on a phase, so a fit to them has no false minima a period away.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ REFINEMENTS = 5
 
 
 class Harmonics(NamedTuple):
-    """A signal that repeats, by numbers that know no phase; see `referred`."""
+    """A periodic signal, by numbers that do not depend on its phase; see `referred`."""
 
     frequency: float  # Hz
     values: Float[np.ndarray, " m"]
@@ -32,13 +32,12 @@ def fitted_harmonics(
     r"""Frequency and `count` lines of evenly spaced signals, `dt` s apart, with white noise of `sigma` by channel.
 
     The frequency is sought between `lowest` and `highest` (Hz). Then frequency, means and lines of all channels are
-    fitted together, by least squares with a tapered weight (Gauss–Newton). Where the contact closes, accelerations have
-    lines without end; those above `count`, and what sampling folds down of them between the lines, would leak into the
-    fitted ones, and the taper keeps them out. The covariance is what the noise of every sample makes of every number, to
-    first order.
+    fitted together, by least squares with a tapered weight (Gauss–Newton). By impacts, accelerations have infinitely many
+    lines; those above `count`, and their aliases between the lines, would leak into the fitted ones, which the taper
+    prevents. The covariance is that by the noise of all samples, to first order.
     """
     sigma = np.where(sigma > 0, sigma, 1.0)
-    # From the middle the frequency and the phases do not depend on each other.
+    # With time measured from the middle, errors of the frequency and of the phases are uncorrelated.
     t = dt * (np.arange(len(means)) - 0.5 * (len(means) - 1))
     weight = taper(len(means))
     frequency = _strongest(means / sigma, dt, lowest, highest)
@@ -46,7 +45,7 @@ def fitted_harmonics(
     for _ in range(REFINEMENTS):
         frequency = float(np.clip(frequency + fit.step, lowest, highest))
         fit = _lines(t, means, sigma, weight, frequency, count)
-    # Each number as a sum over samples: first the frequency, then the lines, which follow it.
+    # Each number is a linear function of the samples: first the frequency, then the lines, which depend on it.
     variance = np.sum((fit.to_frequency * sigma) ** 2)
     errors = np.zeros((1 + 2 * count * means.shape[1],) * 2)
     errors[0, 0] = variance
@@ -65,23 +64,25 @@ def fitted_harmonics(
 
 
 class _Lines(NamedTuple):
-    """Lines at one frequency, by weighted least squares, and how they and a better frequency depend on the samples."""
+    """Lines at one frequency, by weighted least squares; a correction of the frequency; and the derivatives of both by the
+    samples.
+    """
 
     found: Complex[np.ndarray, "count k"]
-    step: float  # Gauss–Newton's, of the frequency, Hz
+    step: float  # Gauss–Newton step of the frequency, Hz
     to_frequency: Float[np.ndarray, "B k"]
     to_lines: Float[np.ndarray, "m B"]  # cosines, then sines, of every channel
-    follow: Float[np.ndarray, "m k"]  # by how much less they are where the frequency is higher
+    follow: Float[np.ndarray, "m k"]  # minus the derivative of the lines by the frequency
 
 
 def _lines(t, means, sigma, weight, frequency: float, count: int) -> _Lines:
     waves = _waves(t, frequency, count)
-    # Over several periods the columns are nearly orthogonal, so the normal equations lose nothing.
+    # Over several periods the columns are nearly orthogonal, so the normal equations are well conditioned.
     onto = np.linalg.solve((waves.T * weight) @ waves, waves.T * weight)
     shares = onto @ means
     found = shares[1 : count + 1] - 1j * shares[count + 1 :]
     turning = 2j * np.pi * t[:, None] * np.arange(1, count + 1) * (waves[:, 1 : count + 1] + 1j * waves[:, count + 1 :])
-    # How the signals change with the frequency, other than by what the lines themselves can follow.
+    # The derivative of the signals by the frequency, without the part that a change of the lines can make up for.
     along = (turning @ found).real
     follow = onto @ along
     along = along - waves @ follow
@@ -96,9 +97,9 @@ def referred(
     frequency: float, found: Complex[np.ndarray, "count k"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m j"]]:
     """Frequency (Hz), then the amplitude of the first channel's fundamental, then the real and imaginary parts of all other
-    lines, turned so that this fundamental has phase zero.
+    lines, for a time origin at which this fundamental has phase zero.
 
-    And how these change with the frequency and with the cosines and sines of the lines, channel after channel.
+    Also their derivatives by the frequency and by the cosines and sines of the lines, channel after channel.
     """
     count, channels = found.shape
     orders = np.arange(1, count + 1)[:, None]
@@ -110,7 +111,7 @@ def referred(
     slopes[0, 0] = 1.0
     for k, sine, h in np.ndindex(channels, 2, count):
         change = np.zeros_like(found)
-        # A line's amplitude is its cosine less i times its sine.
+        # The complex amplitude of a line is its cosine minus i times its sine.
         change[h, k] = -1j if sine else 1.0
         relative = change[0, 0] / found[0, 0] if size > 0 else 0.0
         moved = (change - 1j * orders * found * np.imag(relative)) * np.conj(phase) ** orders
@@ -124,11 +125,11 @@ def _in_order(frequency, size, turned):
 
 
 def beating(signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigma: Float[np.ndarray, " k"]) -> float:
-    """How much a vibration beats: the size of what lies about its fundamental without being part of it, relative to that.
+    """How much a vibration beats: the size of the sidebands of its fundamental, relative to it.
 
-    Everything below one and a half times the `frequency` (Hz) that a constant and two harmonics leave, without the noise of
-    `sigma` by channel. Sidebands belong to a vibration whose amplitude or frequency comes and goes. The samples should be
-    dense: impacts have lines without end, and what is folded down from far up looks like sidebands.
+    They are what a constant and two harmonics leave below one and a half times the `frequency` (Hz), without the noise of
+    `sigma` by channel. Sidebands show that amplitude or frequency vary. There should be many samples per period: impacts have
+    infinitely many lines, and their aliases look like sidebands.
     """
     t = dt * (np.arange(len(signals)) - 0.5 * (len(signals) - 1))
     waves, weight = _waves(t, frequency, 2), taper(len(signals))
@@ -147,14 +148,16 @@ def beating(signals: Float[np.ndarray, "T k"], dt: float, frequency: float, sigm
 def without_lines(
     means: Float[np.ndarray, "B k"], dt: float, frequency: float, count: int
 ) -> tuple[Float[np.ndarray, "B k"], Complex[np.ndarray, "count k"]]:
-    """What a constant and `count` harmonics of this frequency (Hz) leave, by least squares; and these, as they begin."""
+    """The residuals of a constant and `count` harmonics of this frequency (Hz), by least squares; and the harmonics, with
+    phases at the first sample.
+    """
     waves = _waves(dt * np.arange(len(means)), frequency, count)
     shares = np.linalg.lstsq(waves, means, rcond=None)[0]
     return means - waves @ shares, shares[1 : count + 1] - 1j * shares[count + 1 :]
 
 
 def taper(count: int) -> Float[np.ndarray, " count"]:
-    """A weight over evenly spaced instants whose spectrum falls off fast: from the fourth line on below a thousandth."""
+    """A weight over evenly spaced instants whose spectrum falls off fast: below a thousandth from the fourth line on."""
     return np.hanning(count) ** 2
 
 
@@ -164,7 +167,7 @@ def _waves(t, frequency: float, count: int) -> Float[np.ndarray, "B wave"]:
 
 
 def _strongest(signals, dt: float, lowest: float, highest: float) -> float:
-    """Where between two frequencies the spectrum is highest, by the parabola through its top."""
+    """The frequency (Hz), between two bounds, at which the spectrum is highest, by a parabola through its maximum."""
     padded = 4 * len(signals)
     spectrum = np.abs(np.fft.rfft(signals * np.hanning(len(signals))[:, None], padded, axis=0)) ** 2
     power, candidates = np.sum(spectrum, axis=1), np.fft.rfftfreq(padded, dt)

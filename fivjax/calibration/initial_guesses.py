@@ -1,4 +1,4 @@
-"""Where fits begin: a scene's own parameters, and others around them."""
+"""First guesses for fits: a scene's own parameters, and others around them."""
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +10,16 @@ from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from .parameters import FreeParameters
 
-# Scenes that are looked at, by their sliding modes alone, for each that is followed to its limit cycle.
+# Number of scenes whose sliding modes are computed, for each one that is followed to its limit cycle.
 TRIED_PER_GUESS = 128
-# How close to the measured frequency two sliding modes are sought: a limit cycle vibrates where modes have come together.
+# Two sliding modes are sought this close to the measured frequency (relative), because limit cycles arise from mode coupling.
 CLOSE = 0.03
 
 
 def latin_hypercube(
     parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int
 ) -> Float[np.ndarray, "s k"]:
-    """Unbounded numbers of the scene's own values, then of others up to `spread` (relative) beside them."""
+    """The scene's own values, then others within `spread` (relative) of them, as unbounded numbers."""
     from scipy.stats import qmc
 
     own = _own_values(parameters, scene)
@@ -30,10 +30,10 @@ def latin_hypercube(
 def near_frequencies(
     parameters: FreeParameters, scene: Scene, frequencies: list[float], count: int, spread: float, seed: int
 ) -> Float[np.ndarray, "s k"]:
-    """The scene's own values, then such around them whose sliding modes lie at the measured frequencies (Hz).
+    """The scene's own values, then values around them whose sliding modes lie at the measured frequencies (Hz).
 
-    A guess that is `spread` too low lies `1/(1 - spread)` below the truth, so that far are they sought. Where fewer than
-    `count` have two modes close to the frequency, those that come closest.
+    A guess that is too low by the share `spread` has to be multiplied by `1/(1 - spread)`, so guesses are drawn up to that
+    factor. If fewer than `count` have two modes close to the frequency, those that come closest are taken.
     """
     from scipy.stats import qmc
 
@@ -45,7 +45,7 @@ def near_frequencies(
     modes = np.abs(np.linalg.eigvals(matrices).imag) / (2 * np.pi)
     apart = np.zeros(len(tried))
     for frequency in frequencies:
-        # Both of a pair of eigenvalues count, so the second nearest mode is the third.
+        # Both eigenvalues of a pair count, so the second nearest mode has index 2.
         away = np.sort(np.abs(modes - frequency), axis=1)[:, min(2, modes.shape[1] - 1)]
         apart = np.maximum(apart, away / frequency)
     order = np.argsort(np.maximum(apart, CLOSE), kind="stable")[: count - 1]
@@ -62,5 +62,5 @@ def _unbounded(parameters: FreeParameters, values: Float[np.ndarray, "s k"]) -> 
 
 @compiled
 def state_matrices(parameters: FreeParameters, scene: Scene, u: Float[Array, "s k"]) -> Float[Array, "s m m"]:
-    """Of steady sliding, at a batch of unbounded parameters."""
+    """State matrices of steady sliding, for a batch of unbounded parameters."""
     return jax.vmap(lambda u: linear_sliding(parameters.scene(scene, u)).matrix)(u)

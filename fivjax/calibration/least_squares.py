@@ -1,9 +1,9 @@
-r"""Nonlinear least squares by SciPy's trust region, with one evaluation for residuals and Jacobian.
+r"""Nonlinear least squares by SciPy's trust region method, with one evaluation for residuals and Jacobian.
 
-It ends where statistics says: where a step gains nothing that counts in units of the noise. A minimum has been reached if
-the residuals have no share left along any combination of the parameters that the data tell (the relative offset of Bates
-and Watts 1981). A combination that changes the residuals by less than the noise when a parameter changes e-fold is not
-told, and where it ends up means nothing.
+It stops by a statistical criterion: when a step has no significant gain in units of the noise. A minimum has been reached if
+the residuals have no component left along any identifiable combination of parameters (the relative offset of Bates and Watts
+1981). A combination is not identifiable if it changes the residuals by less than the noise when a parameter changes by a factor
+of e; its value at the end has no meaning.
 """
 
 from collections.abc import Callable
@@ -12,31 +12,31 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Singular values, in noise per unit of the unknowns, below which a combination is not told.
+# Singular values, in units of the noise per unit of the unknowns, below which a combination is not identifiable.
 TOLD = 1.0
-# No step is longer in any one unknown, a factor of e for most parameters: what lies farther off is refused unseen.
+# The longest step in any one unknown (a factor of e for most parameters); longer ones are refused without evaluation.
 LONGEST_STEP = 1.0
-# A step may end this much farther from the minimum than was asked for, in standard deviations: SciPy looks at gains.
+# A fit may end this many times farther from the minimum than `tolerance`, because SciPy's own criterion is the gain.
 SLACK = 10.0
 
 
 class Evaluated(NamedTuple):
-    """One point: residuals in units of the noise (infinite where there are none), and what else belongs to it."""
+    """The evaluation at one point: residuals in units of the noise (infinite if there are none), Jacobian, and further data."""
 
     residual: Float[np.ndarray, " r"]
     jacobian: Float[np.ndarray, "r j"]
-    about: Any = None  # handed on to the next evaluation
+    about: Any = None  # passed on to the next evaluation
 
     @property
     def cost(self) -> float:
-        """Sum of squares."""
+        """The sum of squares."""
         with np.errstate(invalid="ignore", over="ignore"):
             squares = float(np.sum(self.residual**2))
         return squares if np.isfinite(squares) else np.inf
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended."""
+    """The end of a minimisation."""
 
     x: Float[np.ndarray, " j"]
     at: Evaluated
@@ -51,9 +51,10 @@ def minimise(
     tolerance: float,
     most_evaluations: int,
 ) -> Minimum:
-    """From `x0` to where the residuals have about `tolerance` standard deviations left along what is told.
+    """The minimum reached from `x0`, at which identifiable combinations are within about `tolerance` standard deviations.
 
-    `evaluate` takes a point, and what belongs to the best one before it (`about` at first). Unknowns should be of order one.
+    `evaluate` takes a point, and the `about` of the best point before it (at first the argument `about`). Unknowns should be of
+    order one.
     """
     from scipy.optimize import least_squares
 
@@ -72,7 +73,7 @@ def minimise(
         return tried.residual
 
     def jacobian(moved):
-        # SciPy asks for it only where it stays.
+        # SciPy asks for the Jacobian only at points that it accepts.
         nonlocal best, stayed
         residual(moved)
         best, stayed = tried, last
@@ -95,7 +96,7 @@ def minimise(
         np.zeros_like(x0),
         jacobian,
         method="trf",
-        # A gain relative to all that is left, which is one per degree of freedom where the fit is good.
+        # The gain relative to the sum of squares, which is one per degree of freedom in a good fit.
         ftol=tolerance**2 / freedom,
         xtol=1e-12,
         gtol=None,
@@ -106,6 +107,6 @@ def minimise(
 
 
 def _left(at: Evaluated) -> float:
-    """What residuals have along the combinations that are told."""
+    """The component of the residuals along identifiable combinations."""
     left, singular, _ = np.linalg.svd(at.jacobian, full_matrices=False)
     return float(np.linalg.norm((left.T @ at.residual)[singular > TOLD]))

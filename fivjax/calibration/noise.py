@@ -1,13 +1,14 @@
-"""The noise of a recording: stated by the user, or read off where no signal is. Never off what a fit leaves.
+"""The noise of a recording: given by the user, or estimated from the recording, but never from the residuals of a fit.
 
-What a fit leaves is as large as the fit is bad; measured in units of itself, every fit would look good. So the noise is
-estimated before anything is fitted, in two ways:
+Measured in units of their own size, the residuals of every fit would look good. So the noise is estimated before anything is
+fitted, in two ways:
 
-- third differences of neighbouring samples: nothing is left of a vibration that is sampled many times a period, and the
-  median passes over the jumps of its impacts;
-- the quieter part of the spectrum: nothing is there of a vibration that has lines, however sparse its samples are.
+- third differences of neighbouring samples: they hardly contain a vibration that is sampled many times per period, and their
+  median ignores the jumps of impacts;
+- the quieter part of the spectrum: it contains nothing of a vibration with lines, even if there are few samples per period.
 
-Any signal only adds to either, so the smaller one is taken. Both suppose that the noise is white up to the sampling rate.
+A signal can only add to both estimates, so the smaller one is taken. Both assume noise that is white up to half the sampling
+rate.
 """
 
 import numpy as np
@@ -16,12 +17,13 @@ from jaxtyping import Float
 from ..io.recordings import Averaged, Recording
 from .harmonics import taper
 
-# The part of the spectrum taken for quiet: its lowest quarter, whose upper end is this share of the mean power of white noise.
+# The share of spectral lines that counts as quiet: the lowest quarter; and the power of white noise at its upper end, relative
+# to the mean.
 QUIET = 0.25
 QUIET_POWER = -np.log1p(-QUIET)
-# How well the standard deviation of the noise is known, relative, where it is estimated.
+# Relative error of an estimated standard deviation of the noise.
 ESTIMATE_ERROR = 0.03
-# A recording without any noise would leave rounding to be fitted: the least noise, relative to the signal.
+# The least noise, relative to the signal: without noise, rounding errors would be fitted.
 LEAST_NOISE = 1e-6
 
 
@@ -33,13 +35,13 @@ def noise_of_means(recording: Recording, blocks: Averaged) -> Float[np.ndarray, 
 
 
 def estimated_noise(samples: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " k"]:
-    """Standard deviations of single samples by channel, from where no signal is."""
+    """Standard deviations of single samples by channel, estimated from the recording."""
     return np.maximum(np.minimum(_between_samples(samples), _between_lines(samples)), _rounding(samples))
 
 
 def _between_samples(samples):
     differences = np.abs(np.diff(samples, 3, axis=0))
-    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance; 0.6745 is the median of |normal|.
+    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance; 0.6745 is the median of a normal number's size.
     return np.median(differences, axis=0) / (0.6745 * np.sqrt(20.0))
 
 
@@ -51,6 +53,6 @@ def _between_lines(samples):
 
 
 def _rounding(samples):
-    """What a sensor or a file with few digits adds: samples that lie on a grid are off by up to half its step."""
+    """The rounding of a sensor or file with few digits: samples on a grid have errors of up to half its step."""
     steps = [np.diff(np.unique(column)) for column in samples.T]
     return np.array([step.min() / np.sqrt(12.0) if step.size else 0.0 for step in steps])

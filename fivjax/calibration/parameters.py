@@ -1,4 +1,4 @@
-"""Free parameters of a fit: their names, their bounds, and the unbounded numbers that an optimiser moves."""
+"""Free parameters of a fit: their names, their bounds, and the unbounded numbers that an optimiser changes."""
 
 from collections.abc import Iterable, Mapping
 
@@ -16,10 +16,10 @@ HIGHEST = {"restitution": 1.0}
 
 
 class FreeParameters(eqx.Module):
-    r"""Which parameters are free, and where.
+    r"""The free parameters and their bounds.
 
     Between two bounds $x = l + (h - l) / (1 + e^{-u})$, above one $x = l + e^u$, without any $x = s u$; so the optimiser
-    never leaves the bounds. `scale` says what a large change of a parameter is: its size, or the width of its bounds.
+    never leaves the bounds. `size` is a large change of each parameter: its own size, or the width of its bounds.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -67,7 +67,7 @@ class FreeParameters(eqx.Module):
         found = []
         for k, kind in enumerate(self.kinds):
             if kind == "both":
-                # tanh neither overflows nor loses its derivative to an inf - inf.
+                # tanh does not overflow, and its derivative is not NaN.
                 share = 0.5 * (1.0 + jnp.tanh(0.5 * u[k]))
                 found.append(self.lower[k] + (self.upper[k] - self.lower[k]) * share)
             elif kind == "lower":
@@ -77,7 +77,7 @@ class FreeParameters(eqx.Module):
         return jnp.stack(found)
 
     def unbounded(self, values) -> np.ndarray:
-        """What `values` makes of these are `values`; they are moved inside the bounds first."""
+        """The inverse of `values`; numbers outside the bounds are first moved inside."""
         found = []
         for k, kind in enumerate(self.kinds):
             value = float(values[k])

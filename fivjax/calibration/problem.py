@@ -1,7 +1,7 @@
-"""What one fit compares: a scene with free parameters beside its recordings, as residuals with their Jacobian.
+"""The residuals of one fit: a scene with free parameters compared with its recordings, and the Jacobian.
 
-What is compiled is one function of one point for each kind of residual (`_coarse`, `_compared`), with its whole Jacobian in
-forward mode; it serves every guess, every step and every fit of the same shape. A limit cycle brings unknowns of its own
+For each kind of residual (`_coarse`, `_compared`) one function of one point is compiled, with its whole Jacobian in forward
+mode; it serves every guess, every step and every fit with arrays of the same shapes. A limit cycle has unknowns of its own
 (`cycle_closing`).
 """
 
@@ -22,26 +22,26 @@ from .misfit import OFFSET_UNIT, AbstractMisfit
 from .parameters import FreeParameters
 from .shooting import Cycle
 
-# Far from the answer, each parameter is drawn towards its start by one standard deviation per this factor of e: what coarse
-# residuals do not tell stays where it was.
+# Regularisation towards the start, for coarse residuals: one standard deviation per change by exp(this), so that parameters
+# that these residuals do not determine stay where they are.
 REGULARISATION = 0.7
-# Shares of the recording below this are far from the answer.
+# Fits to less than this share of the recording count as far from the answer.
 WHOLE = 1.0
 MOST_NEWTON_STEPS = 10
 
 
 class Problem(eqx.Module):
-    """Everything that the residuals of one fit need; all but names and shapes are arrays, so it compiles once."""
+    """The data that the residuals of one fit need; everything but names is in arrays, so it is compiled once."""
 
     scene: Scene
     parameters: FreeParameters
     misfits: tuple[AbstractMisfit, ...]
-    references: Float[Array, " r"]  # time offsets that the moved ones are measured from, s
-    moved: tuple[bool, ...] = eqx.field(static=True)
+    references: Float[Array, " r"]  # time offsets from which the unknown ones are measured, s
+    moved: tuple[bool, ...] = eqx.field(static=True)  # which recordings have an unknown offset
 
     @property
     def size(self) -> int:
-        """How many parameters are free; unknown time offsets come after them."""
+        """The number of free parameters; unknown time offsets come after them."""
         return len(self.parameters.names)
 
     def offsets(self, x) -> list:
@@ -58,24 +58,25 @@ class Problem(eqx.Module):
 
     @property
     def cycles(self) -> list[CycleMisfit]:
-        """Those recordings that show a limit cycle."""
+        """The recordings of limit cycles."""
         return [m for m in self.misfits if isinstance(m, CycleMisfit)]
 
     @property
     def frequency_rows(self) -> list[int]:
-        """Which residuals are those of the frequencies of limit cycles, where all recordings are such."""
+        """Indices of the residuals of the frequencies, if all recordings are of limit cycles."""
         lengths = [m.measured.shape[0] + m.fractions.shape[0] for m in self.cycles]
         return [sum(lengths[:k]) for k in range(len(lengths))]
 
     def coarse(self, u: np.ndarray, u0: np.ndarray) -> Evaluated:
-        """Residuals that lead to the right period from afar, with a regularisation towards `u0`."""
+        """Residuals for parameters far from the answer, with a regularisation towards `u0`."""
         residual, jacobian = _coarse(self, jnp.asarray(u), jnp.asarray(u0))
         return Evaluated(np.asarray(residual), np.asarray(jacobian))
 
     def compared(self, x: np.ndarray, x0: np.ndarray, share: float, about: "About | None") -> Evaluated:
-        """The scene beside the first `share` of the recordings, at a point of a fit that set out at `x0`.
+        """The scene compared with the first `share` of the recordings, at a point of a fit that started at `x0`.
 
-        Cycles are closed by Newton's method from where they were (`about`), or from what the scene settles on.
+        Cycles are closed by Newton's method, from those at the point `about` or else from the motion on which the scene
+        settles.
         """
         point, begin, window = jnp.asarray(x), jnp.asarray(x0), jnp.asarray(float(share))
         cycles = ()
@@ -84,7 +85,7 @@ class Problem(eqx.Module):
         for _ in range(MOST_NEWTON_STEPS):
             found = _compared(self, point, begin, window, cycles)
             cycles, correction = found.about.cycles, float(found.correction)
-            # What is not finite will not close any more.
+            # A cycle that is not finite will not close any more.
             if is_closed(correction) or not np.isfinite(correction):
                 break
         residual, jacobian = np.asarray(found.residual), np.asarray(found.jacobian)
@@ -98,19 +99,19 @@ class Problem(eqx.Module):
 
 
 class About(NamedTuple):
-    """What belongs to a point beside its residuals."""
+    """Data of a point beside its residuals."""
 
     x: Float[Array, " j"]
     cycles: tuple[Cycle, ...]
-    follow: tuple[Float[Array, "state j"], ...]  # how the unknowns of each cycle follow the parameters
-    systems: tuple[Float[Array, "state state"], ...]  # how what does not close follows the unknowns
+    follow: tuple[Float[Array, "state j"], ...]  # derivatives of each cycle's unknowns by the parameters
+    systems: tuple[Float[Array, "state state"], ...]  # derivatives of each cycle's closing equations by its unknowns
     models: list[Float[Array, "B k"]]
 
 
 class _Compared(NamedTuple):
     residual: Float[Array, " r"]
     jacobian: Float[Array, "r j"]
-    correction: Float[Array, ""]  # of the cycles, the largest, relative; infinite where one changed its contact mode
+    correction: Float[Array, ""]  # the largest relative correction of a cycle; infinite if one changed its contact mode
     about: About
 
 
@@ -126,7 +127,7 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
             own[k] = cycles[i].at(unknowns[size + i * count : size + (i + 1) * count], tangential)
         scene = problem.at(x[: problem.size])
         found = [m.compared(scene, o, share) for m, o in zip(problem.misfits, own, strict=True)]
-        # Far from the answer the harmonics of a limit cycle alone may not tell a parameter.
+        # Far from the answer, the harmonics of a limit cycle may not determine all parameters.
         towards = jnp.where(share < WHOLE, (x - x0)[: problem.size] / REGULARISATION, 0.0)
         residual = jnp.concatenate([*(one.residual for one in found), towards])
         unclosed = [found[k].unclosed for k in places]
@@ -143,7 +144,8 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
         systems.append(slopes[own])
         solved = jnp.linalg.solve(systems[-1], jnp.concatenate([slopes[own[0], :size], gap[:, None]], axis=1))
         follow.append(-solved[:, :-1])
-        # The parameters move the cycle, too; and to first order the residuals are those of the closed one.
+        # The Jacobian includes the change of the cycle with the parameters; to first order the residuals are those of the
+        # closed cycle.
         towards = slopes[:rows, own[1]]
         jacobian = jacobian + towards @ follow[-1]
         residual = residual - towards @ solved[:, -1]

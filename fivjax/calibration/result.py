@@ -1,4 +1,4 @@
-"""What a calibration found: a fitted scene, how far to trust it, and how the fit ended."""
+"""The result of a calibration: a fitted scene, its uncertainties, and how the fit ended."""
 
 import enum
 
@@ -38,73 +38,75 @@ class FitOutcome(enum.StrEnum):
     )
 
 
-# Outcomes that end at a minimum; of the others no parameter is told.
+# Outcomes at a minimum; in all others no parameter has a value.
 FITTED = (FitOutcome.CONVERGED, FitOutcome.STRUCTURE_LEFT)
 
 
 class Calibration(eqx.Module):
-    """A fitted scene, and how far to trust it.
+    """A fitted scene, its uncertainties, and how the fit ended.
 
-    Parameters that the data do not tell have NaN as value and uncertainty; the scene holds what the fit ended with. Where
-    what is left is not noise, all uncertainties are NaN: they would be those of a right model.
+    Parameters that are not identifiable have NaN as value and uncertainty; the scene has the values at the end of the fit. If
+    the residuals are not noise, all uncertainties are NaN, because they only hold for a right model.
     """
 
     scene: Scene
     names: tuple[str, ...] = eqx.field(static=True)
-    estimates: Float[np.ndarray, " k"]  # all of them, also those that are not identifiable
-    deviations: Float[np.ndarray, " k"]  # standard deviations, in the parameters' own units; infinite if not known
+    estimates: Float[np.ndarray, " k"]  # of all parameters, even those that are not identifiable
+    deviations: Float[np.ndarray, " k"]  # standard deviations, in the parameters' units; infinite if not known
     identified: Bool[np.ndarray, " k"]
     correlation: Float[np.ndarray, "k k"]
     singular_values: Float[
         np.ndarray, " j"
-    ]  # of the Jacobian in units of noise per whole parameter; time offsets included
-    offsets: tuple[tuple[float, float] | None, ...]  # value and standard deviation, s; None where there is none
+    ]  # of the Jacobian, in units of the noise per relative change of a parameter; including time offsets
+    offsets: tuple[tuple[float, float] | None, ...]  # value and standard deviation, s; None for recordings without one
     recordings: tuple[Recording, ...]
     t: tuple[np.ndarray, ...]  # middle of the blocks, s after the recording's first sample
     measured: tuple[np.ndarray, ...]  # block means, (B, k)
     fitted: tuple[np.ndarray, ...]
     noise: tuple[np.ndarray, ...]  # standard deviation of a block mean, by channel
-    left: WhatIsLeft  # of the recordings, beside their noise
+    left: WhatIsLeft  # the residuals, compared with the noise
     evaluations: int
     outcome: FitOutcome = eqx.field(static=True)
 
     @property
     def converged(self) -> bool:
-        """Whether the optimiser arrived."""
+        """Whether the fit ended at a minimum."""
         return self.outcome in FITTED
 
     @property
     def misfit(self) -> float:
-        """Sum of squared residuals per degree of freedom, in units of a noise that the fit does not know; 1 for noise alone."""
+        """Sum of squared residuals per degree of freedom, in units of a noise known independently of the fit; 1 for noise
+        alone.
+        """
         return self.left.misfit
 
     @property
     def values(self) -> dict[str, float]:
-        """The parameters, NaN where they are not identifiable, and all of them where no fit was found."""
+        """The parameters; NaN for those that are not identifiable, and for all if no fit was found."""
         return self._by_name(self.estimates)
 
     @property
     def uncertainty(self) -> dict[str, float]:
-        """Their standard deviations, NaN where they are not identifiable or not known."""
+        """Their standard deviations; NaN if a parameter is not identifiable or the deviation not known."""
         return self._by_name(np.where(np.isfinite(self.deviations), self.deviations, np.nan))
 
     @property
     def identifiable(self) -> dict[str, bool]:
-        """Whether the data tell each parameter."""
+        """Whether each parameter is identifiable."""
         return dict(zip(self.names, map(bool, self.identified), strict=True))
 
     @property
     def residuals(self) -> tuple[np.ndarray, ...]:
-        """Measured less fitted block means, by recording."""
+        """Measured minus fitted block means, by recording."""
         return tuple(m - f for m, f in zip(self.measured, self.fitted, strict=True))
 
     @property
     def combinations(self) -> list[tuple[tuple[str, ...], float]]:
-        """Parameters that the data tell only in combination: groups of names, and the largest correlation of each group."""
+        """Parameters that are identifiable only in combination: groups of names, and the largest correlation of each group."""
         return combinations(self.names, self.correlation) if self.converged else []
 
     def value_text(self, name: str) -> str:
-        """A parameter with its uncertainty, or what stands in place of a number."""
+        """A parameter with its uncertainty as text, or "not identifiable" and the like."""
         if not self.identifiable[name]:
             no_signal = self.outcome is FitOutcome.NO_SIGNAL
             return "not identifiable" if self.converged or no_signal else "not told"
@@ -131,7 +133,7 @@ class Calibration(eqx.Module):
         return "\n".join(said)
 
     def to_dataset(self) -> xr.Dataset:
-        """Parameters with uncertainties, and data and fit of recording r over `t_r` and `channel_r`."""
+        """Parameters with uncertainties, and the data and the fit of recording r over `t_r` and `channel_r`."""
         dataset = xr.Dataset(
             {
                 "value": ("parameter", np.array(list(self.values.values()))),

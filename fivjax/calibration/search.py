@@ -1,12 +1,12 @@
-"""The search for the best fit: from first guesses far off to the minimum, through windows that grow.
+"""The search for the best fit: from first guesses far from the answer to the minimum, over growing windows of the recordings.
 
-1. Guesses are improved by coarse residuals, which know no phase.
+1. Guesses are improved by coarse residuals, which do not depend on phases.
 2. Unknown time offsets are scanned (`time_offsets`).
-3. The waveform is compared over windows that grow, from the best few.
-4. The best one is tried again some periods earlier and later.
+3. The waveform is fitted over growing windows, from the best few guesses.
+4. The best fit is tried again some periods earlier and later.
 
-Where all recordings are limit cycles, guesses that have one are first brought to the measured frequency. Then harmonics are
-compared, roughly and to the noise, from one guess after the other until what is left is noise.
+If all recordings are of limit cycles, guesses that have a limit cycle are first brought to the measured frequency. Then the
+harmonics are fitted, first roughly and then to the noise, from one guess after the other until the residuals are noise.
 """
 
 from collections.abc import Iterator
@@ -22,30 +22,30 @@ from .least_squares import Minimum, minimise
 from .problem import About, Problem
 from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_aside
 
-# Guesses that go on from the coarse residuals to the waveform.
+# Number of guesses that go on from the coarse residuals to the waveform.
 KEPT = 4
-# Guesses of a limit cycle that are fitted, if none before explains the recording; and steps to bring one to its frequency.
+# The most guesses of a limit cycle that are fitted, until one explains the recording; and steps to bring one to the frequency.
 MOST_IN_TURN, FREQUENCY_STEPS = 16, 2
-# Guesses this close in every parameter, as a share of it, lead to the same minimum.
+# Guesses this close in every parameter (relative) count as the same.
 ALIKE, ALIKE_CYCLES = 0.01, 0.05
 WINDOWS = (0.15, 0.4, 1.0)
-# Where a fit stops: what is left along what the data tell, in standard deviations. Rounding of nearly parallel modes leaves
-# a thousandth.
+# Distances from the minimum at which a fit stops, in standard deviations of identifiable combinations. Rounding of nearly
+# parallel modes leaves a thousandth.
 EARLY_TOLERANCE, FINAL_TOLERANCE = 0.1, 1e-2
 MOST_EVALUATIONS = 60
-# Sums of squares, relative to the best, above which a candidate is given up after a window.
+# A candidate is given up after a window if its sum of squares, relative to the best, is larger than this.
 HOPELESSLY_WORSE = 25.0
 
 
 class Candidate(NamedTuple):
-    """A point that the search goes on from, and what is known about it."""
+    """A point from which the search continues, and its data."""
 
     x: Float[np.ndarray, " j"]
     about: About | None
 
 
 class Search:
-    """One fit's search; `best` is where it ended."""
+    """The search of one fit; `best` is its end."""
 
     best: Minimum
 
@@ -56,7 +56,7 @@ class Search:
         self.evaluations = 0
 
     def run(self) -> Iterator[str]:
-        """Yields the name of each stage before it begins."""
+        """Run the search; yields the name of each stage before it begins."""
         yield "guesses"
         if self.cycles_only:
             candidates = self._at_measured_frequency()
@@ -73,9 +73,9 @@ class Search:
         self._other_periods()
 
     def _at_measured_frequency(self) -> list[Candidate]:
-        """The guesses that come closest to the limit cycles, brought to their frequency by the least change of parameters.
+        """The guesses closest to the measured limit cycles, brought to their frequency by the smallest change of parameters.
 
-        Far off, a scene may have no limit cycle, and no derivative leads there.
+        A scene far from the answer may have no limit cycle, and no derivative leads to one.
         """
         found: list[tuple[float, Candidate]] = []
         for guess in self.guesses:
@@ -91,11 +91,11 @@ class Search:
                 x, about = x + np.clip(step, -0.5, 0.5), at.about
         found.sort(key=lambda one: one[0])
         kept = _distinct([one.x for _, one in found], ALIKE_CYCLES)[:MOST_IN_TURN]
-        # Without any cycle the scene's own parameters end the fit, with a name.
+        # If no guess has a limit cycle, the fit ends with the scene's own parameters and an outcome that says so.
         return [one for _, one in found if any(one.x is x for x in kept)] or [Candidate(self.guesses[0], None)]
 
     def _fitted_in_turn(self, candidates: list[Candidate]) -> None:
-        """Fits from one candidate after the other until what is left is noise."""
+        """Fit from one candidate after the other until the residuals are noise."""
         for k, candidate in enumerate(candidates):
             rough = self.fit_from(candidate, WINDOWS[0], EARLY_TOLERANCE)
             found = self.fit_from(Candidate(rough.x, rough.at.about))
@@ -118,7 +118,7 @@ class Search:
         return [Candidate(x, None) for x in _distinct([*best_first, *self.guesses])[:KEPT]]
 
     def _with_offsets(self, candidates: list[Candidate]) -> list[Candidate]:
-        """The candidates with the time offsets at which each agrees best over all of the recording, or its beginning."""
+        """The candidates with the time offsets at which each agrees best, over the whole recording or its beginning."""
         moved = [k for k, one in enumerate(self.problem.moved) if one]
         if not moved:
             return candidates
@@ -165,7 +165,7 @@ class Search:
 
     @property
     def growth(self) -> float:
-        """Largest multiplier of the cycles, in a period; 0 without any."""
+        """Size of the largest multiplier of the cycles; 0 without cycles."""
         structure = self.problem.scene.structure
         where = structure.size + structure.tangential
         systems = self.best.at.about.systems
@@ -173,7 +173,7 @@ class Search:
 
 
 def _distinct(points: list[np.ndarray], alike: float = ALIKE) -> list[np.ndarray]:
-    """Without those that repeat one before them."""
+    """The points without those that repeat an earlier one."""
     kept = []
     for point in points:
         if not any(np.allclose(point, other, rtol=0, atol=alike) for other in kept):

@@ -1,16 +1,15 @@
-r"""Periodic motion by shooting: one period through every contact event, and what it takes to close it.
+r"""Periodic motion by shooting: one period through every contact event, and the equations that close it.
 
-A limit cycle is a state that comes back to itself after one period. With $Φ(y, T)$ the motion from y over a time T,
+A state of a limit cycle returns to itself after one period. With $Φ(y, T)$ the motion from y over a time T,
 
 $$Φ(y, T) - y = 0$$
 
-determines the period and all components of the state but one: the tangential velocity, whose value only says where on the
-cycle one looks. Newton's method meets it to rounding however slowly the motion settles, and the same equation gives the
-derivatives, over a single period. (Differentiating a motion that settles would carry along a phase that turns by thousands
-of degrees on the way.)
+determines the period and all components of the state but one: the tangential velocity, whose value only chooses a point of the
+cycle. Newton's method solves it to rounding even if the motion settles slowly, and the same equation gives the derivatives,
+over a single period. (In the derivative of a transient, the phase would change by thousands of degrees.)
 
 Fourier coefficients are integrals over exactly one period. Where the contact closes, velocities jump and accelerations are
-impulses; but the coefficients of an acceleration are those of its velocity, differentiated.
+impulses; the coefficients of an acceleration follow from those of its velocity by differentiation.
 """
 
 from typing import NamedTuple
@@ -25,23 +24,23 @@ from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import for_derivatives
 
-# From its first, arbitrary state a motion is followed for so many periods before it is taken for nearly periodic.
+# A motion is followed for so many periods before it counts as nearly periodic.
 SETTLING_PERIODS = 80
-# Then it is looked at so often per expected period, to see where it comes back to itself.
+# Then its state is sampled so often per expected period, to see where it returns to itself.
 LOOKS = 48
-# Periods that are tried, in units of the expected one.
+# The shortest and the longest period tried, relative to the expected one.
 SHORTEST, LONGEST = 0.6, 1.7
 
 
 class Cycle(NamedTuple):
-    """A guess of a periodic motion: a state on it and how long it takes to come back. NaN where there is none."""
+    """A guess of a periodic motion: a state and the period. NaN where there is none."""
 
     y: State
     contact: Contact
     period: Float[Array, ""]  # s
 
     def unknowns(self, tangential: int) -> Float[Array, " state"]:
-        """What closes the cycle: the state, with the period in place of the tangential velocity."""
+        """The unknowns that close the cycle: the state, with the period in place of the tangential velocity."""
         return self.y.at[self.y.shape[0] // 2 + tangential].set(self.period)
 
     def at(self, unknowns: Float[Array, " state"], tangential: int) -> "Cycle":
@@ -53,16 +52,18 @@ class Cycle(NamedTuple):
 class Around(NamedTuple):
     """One period of a motion that may not be closed yet."""
 
-    y: State  # at its end
+    y: State  # at the end of the period
     contact: Contact
     lines: Complex[Array, "count n"]  # of the velocities: v(t) = Re sum of c_h exp(2πi h t / period), m/s
-    fractions: Float[Array, "2"]  # of the time, sticking and detached
+    fractions: Float[Array, "2"]  # of time, sticking and detached
 
 
 def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
-    """The motion under the final load after a kick almost as fast as the belt, which is outside everything that dies out.
+    """A guess of the limit cycle under the final load: the motion that starts with 0.9 of the belt's speed, after it has
+    settled.
 
-    Where its tangential velocity rises through zero, and after about how long, near 1/`frequency` (Hz), it is nearly back.
+    Its state where the tangential velocity rises through zero, and the time, near 1/`frequency` (Hz), after which it is closest
+    to that state again.
     """
     mechanics, load = Mechanics(scene), scene.load.final
     n, tangential = scene.structure.size, scene.structure.tangential
@@ -86,14 +87,14 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     later = jnp.arange(states.shape[0]) - begin
     tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS)
     back = jnp.argmin(jnp.where(tried & jnp.isfinite(apart), apart, jnp.inf))
-    # What no longer moves, and what slides at rest, is no cycle.
+    # A motion that has died out is no cycle.
     moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.abs(scene.belt_speed))
     period = jnp.where(moves, (back - begin) / (LOOKS * frequency), jnp.nan)
     return Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
 
 
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
-    """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable, forward."""
+    """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
     mechanics, load = Mechanics(scene), scene.load.final
     method, codes = for_derivatives(method, mechanics), jnp.array([Status.STICK, Status.DETACH])
 
@@ -111,7 +112,7 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
 
 
 def _integrals(within: Within, t, period, count: int) -> Float[Array, "count 2 n"]:
-    """Of velocities times cosines and sines over one advance that begins at t; m."""
+    """Integrals of velocities times cosines and sines over one advance that begins at t (s), in m."""
     n = within.states.shape[1] // 2
     turns = 2 * jnp.pi * jnp.arange(1, count + 1)[:, None] * ((t + within.times) / period)
     waves = jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)

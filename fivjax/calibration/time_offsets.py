@@ -1,4 +1,4 @@
-"""At which instant of a simulation a recording begins: scanned before a fit, and tried whole periods aside after it."""
+"""Time offsets of recordings: scanned before a fit, and tried again whole periods earlier and later after it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +11,10 @@ from .misfit import OFFSET_UNIT
 from .problem import Problem
 from .waveform_misfit import KickMisfit
 
-# Candidates with time offsets to try: two, with three offsets each.
+# Candidates with time offsets that are tried: two, with three offsets each.
 KEPT_WITH_OFFSETS = 6
 OFFSETS_PER_BLOCK = 4
-# Periods by which the time offset of what fits best is tried again, and how often it may move on from there.
+# Numbers of periods by which the time offset of the best fit is changed, and how often this may be repeated.
 WHOLE_PERIODS = (-2, -1, 1, 2)
 MOST_ROUNDS = 4
 
@@ -22,7 +22,7 @@ MOST_ROUNDS = 4
 def best_offsets(
     problem: Problem, k: int, bounds: tuple[float, float], points: list[np.ndarray], windows: tuple[float, ...]
 ) -> Float[np.ndarray, "candidate window"]:
-    """For each point and window the offset at which recording k agrees best, in units of the problem."""
+    """For each point and window the offset at which recording k agrees best, in the units of the problem."""
     mine, (low, high) = problem.misfits[k], bounds
     edges, means, sigma = map(np.asarray, (mine.edges, mine.means, mine.sigma))
     step = (edges[1] - edges[0]) / OFFSETS_PER_BLOCK
@@ -42,9 +42,9 @@ def best_offsets(
 def periods_aside(
     problem: Problem, k: int, bounds: tuple[float, float], x: np.ndarray
 ) -> tuple[list[np.ndarray], float]:
-    """The point `x` with the offset of recording k moved by whole periods, where the bounds allow, and half a period.
+    """The points `x` with the offset of recording k changed by whole periods, where the bounds allow it; and half a period.
 
-    A vibration is much like itself a period on.
+    A vibration is similar to itself a period later, so these may be better minima.
     """
     place = problem.size + int(np.sum(problem.moved[:k]))
     period = _period(problem, x[: problem.size]) / OFFSET_UNIT
@@ -55,7 +55,7 @@ def periods_aside(
 
 
 def slid_throughout(problem: Problem, best: Minimum) -> bool:
-    """Whether the fitted responses are the same when contact events are looked for."""
+    """Whether the fitted responses are the same when contact events are taken into account."""
     for k, mine in enumerate(problem.misfits):
         if isinstance(mine, KickMisfit):
             instants = mine.edges + problem.offsets(best.x)[k]
@@ -63,7 +63,7 @@ def slid_throughout(problem: Problem, best: Minimum) -> bool:
             width = float(mine.edges[1] - mine.edges[0])
             integrals: np.ndarray = np.asarray(_integrals(problem, k, u, instants, eventful=True))
             found = np.diff(integrals, axis=0) / width
-            # Rounding of both ways; an event leaves a trace that is larger by far.
+            # A tolerance for rounding; the effect of an event is much larger.
             if not np.allclose(found, best.at.about.models[k], rtol=0, atol=1e-6 * np.ptp(found)):
                 return False
     return True
@@ -75,7 +75,7 @@ def _integrals(problem: Problem, which: int, u: Float[Array, " k"], instants: Fl
 
 
 def _period(problem: Problem, u: Float[np.ndarray, " k"]) -> float:
-    """Of the least damped vibration of steady sliding, s; 0 where none is there."""
+    """The period of the least damped mode of steady sliding, s; 0 if none vibrates."""
     (matrix,) = state_matrices(problem.parameters, problem.scene, jnp.asarray(u[None]))
     eigenvalues = np.linalg.eigvals(np.asarray(matrix))
     vibrating = eigenvalues[eigenvalues.imag > 0]

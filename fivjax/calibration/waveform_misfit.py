@@ -1,4 +1,4 @@
-"""A small motion or the response to a kick beside a recording, block by block."""
+"""Comparison of a small motion, or of the response to a kick, with a recording, block by block."""
 
 import equinox as eqx
 import jax
@@ -17,12 +17,12 @@ from .misfit import AbstractMisfit, Compared, finite, window
 from .mode_poles import strongest_poles
 from .noise import noise_of_means
 
-# Poles that leave more of the signal's energy unexplained are not those of a small motion.
+# The least share of the signal's energy that poles must explain to count as those of a small motion.
 LEAST_EXPLAINED = 0.7
 
 
 class AbstractWaveformMisfit(AbstractMisfit):
-    """A recording that is compared block by block; far from the answer by the poles and shapes of its small motion."""
+    """A recording that is compared block by block; far from the answer, by the poles and shapes of its small motion."""
 
     edges: Float[Array, " edge"]
     means: Float[Array, "B k"]
@@ -37,8 +37,8 @@ class AbstractWaveformMisfit(AbstractMisfit):
 
 
 class SlidingMisfit(AbstractWaveformMisfit):
-    """A small motion about steady sliding. Whatever set it off, it is a sum of the sliding modes: their amplitudes are
-    found by linear least squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+    """A small motion about steady sliding. It is a sum of the sliding modes, whose unknown amplitudes are found by linear least
+    squares inside the residual (variable projection; Golub and Pereyra 1973)."""
 
     projected: int = eqx.field(static=True)
 
@@ -51,7 +51,7 @@ class SlidingMisfit(AbstractWaveformMisfit):
         return Compared(finite(target - q @ (q.T @ target)), waves @ amplitudes, jnp.zeros(0), None)
 
     def _waves(self, scene) -> Float[Array, "B k m"]:
-        """Block means for each unit initial state, scaled alike."""
+        """Block means for each unit initial state, scaled to the same size."""
         scene = scene.replace(**self.known)
         matrix = linear_sliding(scene).matrix
         m = matrix.shape[0] // 2
@@ -63,7 +63,7 @@ class SlidingMisfit(AbstractWaveformMisfit):
             row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
             columns.append((states[1:, row] - states[:-1, row]) / width)
         waves = jnp.stack(columns, axis=1)
-        # Displacements and velocities differ by the frequency, which least squares need not see.
+        # Responses to displacements and to velocities differ by a factor of the frequency, which would worsen the conditioning.
         return waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
 
 
@@ -71,7 +71,7 @@ class KickMisfit(AbstractWaveformMisfit):
     """The response to the scene's own load, from steady sliding, through every contact event."""
 
     method: AbstractStepper
-    # Whether no contact event is taken to happen: then matrix exponentials do, a hundred times as fast.
+    # Whether contact events are excluded: then matrix exponentials are enough, and a hundred times as fast.
     uneventful: bool = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
 
@@ -81,14 +81,14 @@ class KickMisfit(AbstractWaveformMisfit):
         return Compared(finite(weight * (self.means - model)).ravel(), model, jnp.zeros(0), None)
 
     def integrals(self, scene: Scene, instants: Float[Array, " i"], eventful: bool = False) -> Float[Array, "i k"]:
-        """What the channels are rates of, velocities and displacements, at evenly spaced instants of the simulation (s)."""
+        """The integrals of the channels (velocities or displacements) at evenly spaced instants of the simulation (s)."""
         respond = _sliding_throughout if self.uneventful and not eventful else _through_events
         y = respond(scene.replace(**self.known), self.method, instants)
         return _integrals(y, self.channels)
 
 
 def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
-    """States at instants of the simulation (s): the response from steady sliding, which it was in before, too."""
+    """States at instants of the simulation (s); before its start, the state of steady sliding."""
     q, _ = steady_sliding(scene, scene.load.force)
     y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
@@ -97,7 +97,7 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
 
 
 def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
-    """The same for constant friction, if the contact never stops sliding: exact, from one load to the next."""
+    """The same for constant friction, if the contact never stops sliding: exact, from one jump of the load to the next."""
     matrix, keep = (
         linear_sliding(scene).matrix,
         sliding_coordinates(scene.structure.size, scene.structure.normal).tolist(),
@@ -131,7 +131,7 @@ def _integrals(y, channels: tuple[Channel, ...]):
 
 
 def _powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
-    """I, step, step², …: by doubling, so that a long recording is a few products of many matrices."""
+    """I, step, step², …: by doubling, so that a long recording takes only a few products of many matrices."""
     powers, next_one = jnp.eye(step.shape[0])[None], step
     while powers.shape[0] < count:
         powers = jnp.concatenate([powers, powers @ next_one])
@@ -146,10 +146,10 @@ def misfit_of_waveform(
     known = {name: jnp.asarray(value) for name, value in recording.known.items()}
     sigma = noise_of_means(recording, blocks)
     width = blocks.edges[1] - blocks.edges[0]
-    # A kick's response is a small motion again, if at all, towards its end.
+    # The response to a kick may be a small motion again towards its end.
     tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
     found = strongest_poles(tail, width, scene.structure.size - 1)
-    # As many places as there may be poles, so that every recording of this length shares what is compiled.
+    # Padded to the largest number of poles, so that all recordings of this length share compiled programs.
     values = np.full(scene.structure.size - 1, np.nan, complex)
     shapes = np.full((len(values), len(recording.channels)), np.nan, complex)
     if found.explained > LEAST_EXPLAINED:
