@@ -7,7 +7,7 @@ import lazy_loader
 
 from .io.accessor import draw_with as _draw_with
 
-# A name is imported when it is first used: `import fivjax` costs nothing, and a map loads no optimiser.
+# A name is imported when it is first used, so that `import fivjax` is fast and a map loads no optimiser.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = metadata.version("fivjax")
@@ -19,7 +19,7 @@ def _show(dataset, **options):
     return show(dataset, **options)
 
 
-# What a lower room may not import is handed down to it here: who draws a dataset, and who shows results in a notebook.
+# Lower packages may not import higher ones, so the function that draws datasets and the display in notebooks are set here.
 _draw_with(_show)
 if "IPython" in sys.modules:
     from .notebook.registration import register as _register

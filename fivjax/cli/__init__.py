@@ -1,6 +1,6 @@
-"""The command line, `fivjax …`: the public API with sensible defaults, data and a picture of each result.
+"""The command line, `fivjax …`: the public API with sensible defaults; each command writes data and a picture.
 
-Nothing heavy is imported before a command runs, so that `--help`, `--version` and refusals come at once.
+Heavy packages are imported only when a command runs, so that `--help`, `--version` and errors in options come at once.
 """
 
 from .command_line import main as main

@@ -1,4 +1,4 @@
-"""`fivjax cea` and `fivjax calibrate`: what linear theory says of a scene, and which scene a recording is of."""
+"""`fivjax cea` and `fivjax calibrate`: linear theory, and parameters from a recording."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ class Cea:
     """files to write, without suffix"""
     overwrite: Overwrite = False
     structure: Path | None = None
-    """file of a finite-element code to take the structure from, instead of the oscillator; `fj.read_structure` says which"""
+    """file of a finite-element code with the structure, instead of the oscillator; formats: see `fj.read_structure`"""
     units: str | None = None
     """units of that file, such as mm-t-s"""
     contact: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NODE:ALONG:AWAY[:AGAINST] …")] = ()
@@ -39,7 +39,7 @@ class Cea:
             self._of_file(self.structure, data, picture)
             return
         scene = self.scene.scene()
-        # Lines through one point are an empty picture.
+        # With a single value there would be no lines to draw.
         dataset = fj.cea.modes(scene, **dict([axis(self.x, least=2)]))
         fj.save(dataset, data)
         fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
@@ -84,13 +84,13 @@ class Calibrate:
     """Parameters from a recording, with uncertainties. Writes OUT.nc and OUT.png."""
 
     recording: tyro.conf.Positional[Path]
-    """what was measured: .csv, .npy, .npz, .wav or .mat"""
+    """file of the recording: .csv, .npy, .npz, .wav or .mat"""
     free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
     """parameters to find, such as `mu c1 k1` or `mu,c1,k1`; all others are taken from the scene"""
     regime: Literal["sliding", "kick", "limit cycle"] = "kick"
     """what was recorded: a small motion about sliding, the response to the scene's kick, or a steady vibration"""
     column: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=CHANNEL …")] = ()
-    """which column is which channel, such as `Acc_X=acceleration0`; by their names unless given"""
+    """channels of columns, such as `Acc_X=acceleration0`; by their names unless given"""
     unit: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=UNIT …")] = ()
     """units of columns, such as `t=ms Acc_X=g`; the file's own or SI unless given"""
     time: str | None = None
@@ -98,13 +98,13 @@ class Calibrate:
     rate: float | None = None
     """sampling rate, where the file has no time base (Hz)"""
     full_scale: float = 1.0
-    """what the largest sample of a .wav means, in the channel's unit"""
+    """value of the largest sample of a .wav, in the channel's unit"""
     offset: tuple[float, float] | None = None
-    """kick: where the first sample may lie on the simulation's time (s), 0 to 0.5 unless given"""
+    """kick: range for the time of the first sample in the simulation (s), 0 to 0.5 unless given"""
     bound: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW:HIGH …")] = ()
     """bounds of free parameters, such as `mu=0.05:0.5`"""
     starts: int = 8
-    """how many starts, the scene's own and others around it"""
+    """number of first guesses, the scene's own and others around it"""
     out: Path = Path("calibration")
     """files to write, without suffix"""
     overwrite: Overwrite = False
@@ -137,7 +137,7 @@ class Calibrate:
 
 
 def with_options(sentence: str) -> str:
-    """A sentence of `read_recording` with its arguments called by the options that set them: "with `columns`" is `--column`."""
+    """A sentence of `read_recording` with its arguments replaced by the options that set them: `columns` by `--column`."""
     options = {
         "columns": "--column",
         "units": "--unit",

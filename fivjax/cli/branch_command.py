@@ -15,16 +15,16 @@ from .parsing import axis, bound
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
-    """Limit cycles, stable and unstable, over a parameter, and where they begin and end. Writes OUT.nc and OUT.png."""
+    """Limit cycles, stable and unstable, over a parameter, and where the branch begins and ends. Writes OUT.nc and OUT.png."""
 
     over: Annotated[str, tyro.conf.arg(metavar="NAME=LOW:HIGH")] = "mu=0.02:0.3"
-    """parameter, and how far it is followed; the scene's own value lies between"""
+    """parameter, and the range over which it is followed; the scene's own value must lie in it"""
     each: Annotated[str | None, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = None
     """one branch for each value of another parameter; writes OUT-1.nc, OUT-2.nc, …"""
     map: Annotated[str | None, tyro.conf.arg(metavar="NAME=FROM:TO:COUNT")] = None
-    """a map of that parameter upwards, over the same range to the right, is drawn beside; writes OUT-map.nc"""
+    """also draw a map with this parameter upwards, over the same range to the right; writes OUT-map.nc"""
     points: int = 400
-    """the most cycles that are computed each way"""
+    """the largest number of cycles computed in each direction"""
     out: Path = Path("branch")
     """files to write, without suffix"""
     overwrite: Overwrite = False

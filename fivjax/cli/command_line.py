@@ -1,4 +1,4 @@
-"""The program: which commands there are, what exit code each end has."""
+"""The program: its commands and exit codes."""
 
 import contextlib
 import signal
@@ -31,9 +31,9 @@ COMMANDS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; sentences on standard error and an exit code that is not zero for what does not end well.
+    """Run one command. Returns the exit code; errors are sentences on standard error.
 
-    2: refused before any work; 1: no result, or the disk did not take it; 130: interrupted.
+    0: success; 1: no result, or the disk did not take it; 2: refused before any work; 130: interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
@@ -69,12 +69,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _terminated_like_interrupted():
-    """SIGTERM, which a batch system sends before it kills, ends a run as Ctrl-C does: in order."""
+    """SIGTERM, which a batch system sends before it kills a process, ends a run in the same orderly way as Ctrl-C."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    # Only a program's main thread may say what a signal does.
+    # Only a program's main thread may set signal handlers.
     mine = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, interrupt) if mine else None
     try:

@@ -1,15 +1,15 @@
-"""Where the command line keeps compiled code from one start to the next."""
+"""The folder in which the command line keeps compiled code for later runs."""
 
 import os
 from pathlib import Path
 
-# Bytes of compiled code that are kept.
+# The largest size of the compiled code that is kept, in bytes.
 LARGEST = 2**30
 
 
 def keep_compiled_code() -> None:
-    """Keep compiled code, and with it what was traced (`foundation.kept_programs`), in the user's cache folder, unless JAX
-    was told where to keep it. What was used longest ago goes first.
+    """Keep compiled code, and traced programs (`foundation.kept_programs`), in the user's cache folder, unless JAX has a
+    compilation cache already. What was used longest ago is removed first.
     """
     import jax
 

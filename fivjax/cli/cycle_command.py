@@ -1,4 +1,4 @@
-"""`fivjax cycle`: the limit cycle of a scene, and the saddle cycle on the boundary of its basin."""
+"""`fivjax cycle`: the limit cycle of a scene, and the saddle cycle on the boundary to sliding."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`fivjax map`: which kick leads to a limit cycle, over two parameters."""
+"""`fivjax map`: a bi-stability map over two parameters."""
 
 import dataclasses
 import warnings
@@ -21,7 +21,7 @@ def _folder(words: list[str]) -> Path:
     return Path(*words)
 
 
-# Without a word after it, an empty path.
+# The option `--resume` without a value gives an empty path.
 Resume = Annotated[
     Path | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -46,25 +46,25 @@ class Map:
     """files to write, without suffix"""
     overwrite: Overwrite = False
     refine: int = 0
-    """how many times to halve all intervals where neighbours differ"""
+    """how often to halve the intervals where neighbours differ"""
     t_max: float | None = None
-    """time after which a trajectory without a verdict is called undecided (s); unless given, so long that few are"""
+    """time after which a trajectory without a verdict is called undecided (s); 20 s or 2000 periods unless given"""
     memory: float = 2e9
-    """memory for trajectories under way (bytes)"""
+    """memory for all jobs that run at a time (bytes)"""
     resume: Resume = None
-    """go on with the map of the same name that was interrupted; with a folder, keep the map there as it runs (Zarr), and go on
-    with what is there"""
+    """continue the interrupted map of the same name; with a folder, keep the map there while it runs (Zarr), and continue
+    what is there"""
     workers: int = 0
-    """processes that compute; unless given, threads of this one"""
+    """number of worker processes; unless given, threads of this process"""
     dask: str | None = None
-    """address of a Dask scheduler whose workers compute, such as tcp://10.0.0.1:8786"""
+    """address of a Dask scheduler whose workers run the jobs, such as tcp://10.0.0.1:8786"""
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
     method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
 
     def run(self) -> None:
         import numpy as np
 
-        # Whoever began the map that is gone on with was asked whether its files may be overwritten.
+        # When the interrupted map was begun, its files were checked already.
         (unfinished,) = output_paths(self.out, True, ".unfinished")
         asked = self.resume is not None
         folder = None if self.resume == Path() else self.resume
@@ -86,7 +86,7 @@ class Map:
             )
         try:
             with warnings.catch_warnings(), workers_of(self.workers, self.dask) as executor:
-                # What is said of an interrupted map here is more.
+                # The message printed below says more.
                 warnings.filterwarnings("ignore", message="Interrupted:")
                 dataset = fj.bistability_map(
                     scene,

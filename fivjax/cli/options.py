@@ -1,4 +1,4 @@
-"""Options that several commands share: the scene, and how to step."""
+"""Options that several commands share: the scene and the method."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Literal
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
     from ..steppers.base import AbstractStepper
 
-# What friction is where nothing is said of it, and how fast it falls where it does.
+# The default friction coefficient, and the default decay factor of Eq. 1 (s/m).
 MU, DECAY = 0.227, 0.5
 
 
@@ -34,9 +34,9 @@ class SceneOptions:
     p: float = 1.2
     """perturbation coefficient: the kick raises the load to p times itself (Eq. 14)"""
     duration: float = 0.1
-    """how long the kick lasts (s)"""
+    """duration of the kick (s)"""
     start: float = 0.0
-    """when it starts (s)"""
+    """start of the kick (s)"""
     restitution: float = 0.0
     """coefficient of restitution of the closing gap"""
     m1: float = 0.53

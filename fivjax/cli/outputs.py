@@ -1,4 +1,4 @@
-"""Where results go: asked before any work, never overwritten unasked, and said at the end."""
+"""Output files: checked before any work, never overwritten without being asked for, and named at the end."""
 
 import contextlib
 import sys
@@ -12,23 +12,23 @@ import tyro
 
 from ..io.files import check_writable
 
-# An option of every command that writes. It is not called --force, because that is the load.
+# An option of every command that writes files. It is not called --force, because that is the load.
 Overwrite = Annotated[bool, tyro.conf.arg(help="replace files that are there already", help_behavior_hint="")]
 
 
 class Interrupted(Exception):
-    """A run that was stopped from outside and can be resumed."""
+    """A run was stopped from outside and can be resumed."""
 
 
 class Failure(Exception):
-    """A run that came to its end without a result."""
+    """A run ended without a result."""
 
 
 def output_paths(stem: Path, overwrite: bool, *endings: str) -> tuple[Path, ...]:
-    """The files of a result, by endings such as `.nc`; found writable, and not there yet, before any work is done.
+    """The files of a result, by endings such as `.nc`; checked before any work is done.
 
-    **Raises:** `ValueError` where the option names no file, a folder does not exist or cannot be written, and for files
-    that are there already unless they may be overwritten.
+    **Raises:** `ValueError` if the option names no file, if a folder does not exist or cannot be written, and for existing
+    files unless they may be overwritten.
     """
     if not stem.name:
         raise ValueError(f"Option `--out` must name the files to write, such as `--out result`, but is `{stem}`.")
@@ -40,7 +40,7 @@ def output_paths(stem: Path, overwrite: bool, *endings: str) -> tuple[Path, ...]
 
 
 def refuse_existing(*paths: Path) -> None:
-    """Refuse files that are there already."""
+    """Refuse existing files."""
     there = [path for path in paths if path.exists()]
     if there:
         raise ValueError(
@@ -49,13 +49,15 @@ def refuse_existing(*paths: Path) -> None:
 
 
 def say(*paths: Path) -> None:
-    """Say which files were written."""
+    """Print which files were written."""
     print("\n".join(f"wrote {path}" for path in paths))
 
 
 @contextlib.contextmanager
 def waiting(what: str, after: float = 0.5) -> Iterator[None]:
-    """Within, say every second on a terminal what is waited for, and for how long; nothing where there is no terminal."""
+    """Inside this context, print every second on a terminal what the program is waiting for, and for how long; without a
+    terminal, nothing.
+    """
     if not sys.stderr.isatty():
         yield
         return

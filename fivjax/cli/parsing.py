@@ -1,4 +1,4 @@
-"""What is typed on the command line as `NAME=…`, read; each refusal shows how it must read."""
+"""Parsing of options of the form `NAME=…`; each error shows the right form."""
 
 import math
 
@@ -8,7 +8,7 @@ import numpy as np
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     """The name and values of an axis from `NAME=FROM:TO:COUNT`.
 
-    **Raises:** `ValueError` for anything else, ends that are not finite or do not go up, fewer than `least` values.
+    **Raises:** `ValueError` for anything else, ends that are not finite or not increasing, and fewer than `least` values.
     """
     try:
         name, values = text.split("=")
@@ -31,7 +31,7 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
 
 
 def pair(text: str, option: str) -> tuple[str, str]:
-    """What stands on the two sides of `COLUMN=…`."""
+    """The two sides of `COLUMN=…`."""
     name, equals, meaning = text.partition("=")
     if not (name and equals and meaning):
         raise ValueError(f"Option `{option}` must read COLUMN=…, such as `t=ms`, but reads {text!r}.")
@@ -49,7 +49,7 @@ def bound(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def check_angle(what: str, angle: float) -> None:
-    """Refuse an inclination of a right angle or more: it was meant in degrees, or the belt is no belt."""
+    """Refuse an inclination of a right angle or more, which was probably meant in degrees."""
     if math.isfinite(angle) and abs(angle) >= 0.5 * math.pi:
         raise ValueError(
             f"{what} is in rad and must be less than a right angle, {0.5 * math.pi:.4f}, but is {angle:g}; "

@@ -19,11 +19,11 @@ class Simulate:
     t1: float = 2.0
     """end (s)"""
     dt_save: float = 1e-4
-    """distance of saved instants (s)"""
+    """time between saved instants (s)"""
     quantity: Literal["displacement", "velocity", "acceleration"] = "acceleration"
-    """what to draw, along the belt"""
+    """quantity to draw, along the belt"""
     energy: bool = False
-    """keep the energy ledger: its lines go into the data, and into a picture of their own"""
+    """keep the energy ledger: its lines are in the data and in a second picture"""
     out: Path = Path("response")
     """files to write, without suffix"""
     overwrite: Overwrite = False

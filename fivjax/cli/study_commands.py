@@ -1,4 +1,4 @@
-"""`fivjax tradeoff` and `fivjax reproduce`: what accuracy costs, and the paper's figures."""
+"""`fivjax tradeoff` and `fivjax reproduce`: the cost of accuracy, and the paper's figures."""
 
 import dataclasses
 import time
@@ -15,14 +15,14 @@ from .outputs import Overwrite, output_paths, refuse_existing, say
 
 @dataclasses.dataclass(frozen=True)
 class Tradeoff:
-    """What accuracy costs on a scene: methods, steps and precisions compared. Writes OUT.nc and OUT.png."""
+    """The cost of accuracy on a scene: methods, steps and precisions compared. Writes OUT.nc and OUT.png."""
 
     t1: float = 0.5
     """time after which states are compared (s)"""
     trajectories: int = 256
-    """trajectories side by side when cost is measured"""
+    """number of trajectories in the batch whose cost is measured"""
     boundary: bool = True
-    """compare p_crit and verdicts too, which takes minutes"""
+    """compare p_crit and verdicts, too, which takes minutes"""
     out: Path = Path("tradeoff")
     """files to write, without suffix"""
     overwrite: Overwrite = False
@@ -41,12 +41,12 @@ class Tradeoff:
 
 @dataclasses.dataclass(frozen=True)
 class Reproduce:
-    """The paper's Figures 2 to 18 and its tables, and reproduce.md: what it prints beside what is computed."""
+    """The paper's Figures 2 to 18 and its tables, and reproduce.md with its printed numbers beside the computed ones."""
 
     figure: Annotated[str | None, tyro.conf.arg(metavar="2…18|table1|table2")] = None
     """make only this one; all unless given"""
     out: Path = Path("reproduction")
-    """folder to write into, made where there is none"""
+    """folder to write into, made if it does not exist"""
     overwrite: Overwrite = False
 
     def run(self) -> None:

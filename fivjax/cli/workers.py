@@ -1,4 +1,4 @@
-"""Who computes for a command: processes of this machine, or the workers of a Dask scheduler."""
+"""Workers of a command: processes of this machine, or the workers of a Dask scheduler."""
 
 import contextlib
 import multiprocessing
@@ -11,7 +11,7 @@ from .compiled_code import keep_compiled_code
 
 @contextlib.contextmanager
 def workers_of(count: int, dask: str | None) -> Iterator:
-    """An executor for `fivjax.bistability_map` (None: its own threads) while the command runs.
+    """An executor for `fivjax.bistability_map` (None: threads of this process) while the command runs.
 
     **Raises:** `ValueError` for counts below zero, both kinds at once, and a scheduler that does not answer.
     """
@@ -24,14 +24,14 @@ def workers_of(count: int, dask: str | None) -> Iterator:
             yield client
     elif count:
         context = multiprocessing.get_context("spawn")
-        # A function, so that the map makes them, has others when they die, and ends them when it is interrupted.
+        # A function, so that the map makes the pool, replaces it when workers die, and ends it when it is interrupted.
         yield lambda: ProcessPoolExecutor(count, mp_context=context, initializer=_begin)
     else:
         yield None
 
 
 def _begin() -> None:
-    """In each process: Ctrl-C is answered by the one that hands the jobs out."""
+    """In each worker process: ignore Ctrl-C, which the process that hands out the jobs handles."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     keep_compiled_code()
 

@@ -1,4 +1,4 @@
-"""Design by gradient: move the critical friction, or the critical kick, where it does no harm, within bounds."""
+"""Design by gradient: raise the critical friction or the critical kick by changing parameters within bounds."""
 
 from ..linear.design import BracketedNewton as BracketedNewton
 from ..linear.design import Design as Design

@@ -1,11 +1,11 @@
-r"""A scene that bears a larger kick: the smallest relative change of its parameters that raises p_crit by a given share.
+r"""Scenes with a larger critical kick: the smallest relative change of parameters that raises p_crit by a given share.
 
 With $r_i = (θ_i - θ_{i,0}) / |θ_{i,0}|$ the changes are those of
 
 $$ \min_r \tfrac12 |r|^2 \quad\text{with}\quad p_\mathrm{crit}(r) = p_\mathrm{target}, $$
 
-within the bounds, found by sequential quadratic programming: in each step p_crit is replaced by its value and its exact
-derivatives, and p_crit at the end of the step is computed anew. A step that does not keep what was promised is halved.
+within the bounds, found by sequential quadratic programming: in each step p_crit is linearised with its exact derivatives, and
+at the end of the step it is computed anew. A step whose gain falls short of the linear prediction is halved.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,15 @@ from ..model.load import Pulse
 from ..model.scene import Scene
 from .least_change import smallest_change
 
-# The target is met within this share above it, and the change is the smallest when a further step moves it by less than this.
+# The target is met if p_crit is at most this share above it; the change is the smallest if a further step would alter it by
+# less than this share.
 MET, SETTLED = 1e-6, 1e-3
-# A step is taken when it keeps this share of its promise, or ends this near to the target, as a share of the rise.
+# A step is taken if it gains this share of its prediction, or ends this near to the target (as a share of the rise); the most
+# halvings of a step.
 KEPT, NEAR, HALVINGS = 0.2, 0.02, 5
-# A step that promises less than this share of what is missing is not tried.
+# A step predicted to gain less than this share of what is missing is not tried.
 PROMISING = 1e-2
-# Width of the brackets that Newton's method begins with.
+# Width of the brackets with which Newton's method begins.
 BRACKET = 1e-4
 
 
@@ -49,15 +51,15 @@ class RaisedCriticalKick(NamedTuple):
     after: float  # p_crit
     target: float
     before_bracket: tuple[float, float]  # kicks proved to slide, and to end on a limit cycle
-    after_bracket: tuple[float, float]  # the same, bracketed anew without derivatives
+    after_bracket: tuple[float, float]  # the same at the end, bracketed without derivatives
     changes: dict[str, tuple[float, float]]  # by parameter: its value before and after
     outcome: DesignOutcome
-    why: str  # in a sentence, where the target is not reached
-    steps: int  # at how many scenes p_crit was computed
+    why: str  # a sentence, if the target is not reached
+    steps: int  # number of scenes for which p_crit was computed
 
     @property
     def reached(self) -> bool:
-        """Whether p_crit is the target's, or above."""
+        """Whether p_crit has reached the target."""
         return self.outcome is DesignOutcome.TARGET_REACHED
 
     def __str__(self) -> str:
@@ -89,22 +91,24 @@ def raise_critical_perturbation(
         raised = fj.design.raise_critical_perturbation(scene, by=0.1, free=["k1", "k2", "c1", "c2"])
         print(raised)
 
-    Each step computes p_crit anew, the first crossing in the range, with its derivatives; the end is bracketed anew without
-    them. The search is local: what it finds is the smallest change near the scene.
+    Each step computes p_crit (the first crossing in the range) and its derivatives; the result is bracketed again without
+    derivatives. The search is local: it finds the smallest change near the scene.
 
     **Arguments:**
 
     - `scene`, whose load is a `Pulse`.
-    - `by`: the share by which p_crit is to rise; 0.2 asks for 1.2 times as much.
+    - `by`: the share by which p_crit is to rise; 0.2 means 1.2 times the value.
     - `free`: names of the parameters that may change; those of `bounds` unless given.
     - `bounds`: lowest and highest value by name; from half to twice the scene's own value unless given.
-    - `p_range`, `p_step`: where p_crit is looked for, as in `critical_perturbation`. The range must hold the target.
-    - `steps`: the most scenes at which p_crit is computed.
+    - `p_range`, `p_step`: the range and the steps of the scan for p_crit, as in `critical_perturbation`. The range must contain
+      the target.
+    - `steps`: the largest number of scenes for which p_crit is computed.
 
     **Returns:** a `RaisedCriticalKick`; printing it says what was changed, and whether the target is reached.
 
-    **Raises:** `ValueError` for names that are not free numbers of the scene, for zero ones (they have no relative change),
-    for bounds that do not hold the scene's own value, and where there is no p_crit with derivatives to start from.
+    **Raises:** `ValueError` for names that are no scalar parameters of the scene, for parameters that are zero (they have no
+    relative change), for bounds that do not contain the scene's own value, and if there is no p_crit with derivatives to start
+    from.
 
     **Example:**
 
@@ -151,7 +155,7 @@ def raise_critical_perturbation(
             if taken == steps:
                 break
             tried, taken = at(here.r + share * ahead), taken + 1
-            # Near the target a step along it misses by what curvature does, which the next one mends.
+            # Near the target a step misses it by its curvature, which the next step corrects.
             allowed = max(
                 (1 - KEPT * share * abs(promised) / max(missing, MET * target)) * missing, NEAR * by * first.p
             )
@@ -167,14 +171,14 @@ def raise_critical_perturbation(
 
 
 class _Step(NamedTuple):
-    """A scene on the way, with its critical kick."""
+    """A scene in the search, with its critical kick."""
 
     scene: Scene
     r: np.ndarray  # relative changes
     p: float
-    slopes: np.ndarray  # of p in r
+    slopes: np.ndarray  # derivatives of p by r
     bracket: tuple[float, float]
-    why: str  # there is no p_crit with derivatives
+    why: str  # why there is no p_crit with derivatives, if there is none
 
 
 def _bracket(found) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The smallest change within bounds that moves a linear quantity by a given amount."""
+"""The smallest change within bounds that changes a linear quantity by a given amount."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,10 +8,10 @@ from scipy.optimize import brentq
 def smallest_change(
     gradient: Float[np.ndarray, " k"], level: float, low: Float[np.ndarray, " k"], high: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:
-    """The vector r of least length with `gradient @ r == level` and `low <= r <= high`, where the bounds hold zero.
+    """The vector r of least length with `gradient @ r == level` and `low <= r <= high`; the bounds must contain zero.
 
-    It is the gradient times one number, each component clipped to its bounds. Where no r within the bounds reaches the level,
-    the one that comes closest.
+    It is the gradient times a factor, with each component clipped to its bounds. If no r within the bounds reaches the level,
+    the one that comes closest is returned.
     """
 
     def at(factor: float) -> np.ndarray:

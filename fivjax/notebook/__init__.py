@@ -1,1 +1,1 @@
-"""How results show themselves in a notebook, and the explorer."""
+"""The display of results in notebooks, and the explorer."""

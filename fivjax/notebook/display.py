@@ -1,4 +1,4 @@
-"""The picture of a result, and results as HTML for notebooks (`registration` tells IPython of it)."""
+"""The picture of a result, and results as HTML for notebooks (`registration` hands these functions to IPython)."""
 
 import base64
 import html
@@ -27,7 +27,7 @@ def show(result, **options) -> Figure:
     """The picture of a result.
 
     **Arguments:** `result`, a `Trajectory`, a map, a critical perturbation, modes, a stability chart, energies per cycle,
-    sensitivities, a `tradeoff` or a `Calibration`; `options` go to the function of `fj.plot` that draws it.
+    sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of `fj.plot` that draws it.
 
     **Returns:** a matplotlib figure.
 
@@ -58,7 +58,7 @@ def show(result, **options) -> Figure:
     )
 
 
-# What a dataset is drawn as, by what it holds.
+# The function that draws a dataset, by the variables that it has.
 _PICTURES = (
     (lambda d: "verdict" in d and d["verdict"].ndim == 2, plot.bistability),
     (lambda d: "special" in d and "word" in d, plot.branch),
@@ -87,7 +87,7 @@ def _of_trajectory(run: Trajectory, **options) -> Figure:
         return plot.response(run, **options)
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
-    # A part of a figure has all that a picture function asks of a figure.
+    # A subfigure has all methods that these functions need.
     plot.response(run, **options, figure=left)  # pyright: ignore[reportArgumentType]
     plot.phase_plane(run, last=0.25 * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
     return figure
@@ -101,7 +101,7 @@ def png(figure: Figure) -> bytes:
 
 
 def trajectory_summary(run: Trajectory) -> str:
-    """A trajectory as HTML: its picture, and in one line how long, how often and how much."""
+    """A trajectory as HTML: its picture, and a line with its duration, number of events and peak."""
     counts = {name: int(np.sum(np.asarray(run.status) == status)) for status, name in plot.STATUS_NAMES.items()}
     shares = ", ".join(f"{name} {count / np.size(run.status):.1%}" for name, count in counts.items() if count)
     along = np.asarray(run.slip_velocity) + np.asarray(run.scene.belt_speed)

@@ -1,5 +1,5 @@
 # pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
-"""An explorer for notebooks: sliders for a scene's parameters, and its answer at once, from code compiled once."""
+"""An explorer for notebooks: sliders for a scene's parameters, and its response at once, from code compiled once."""
 
 import json
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ from .map_picture import MapPicture
 from .panels import drawing_panels
 from .sliders import BESIDE, PICTURE, parameters_shown, slider
 
-# Rows a second: 22 a cycle at 68 Hz draw a round phase plane, and few enough to answer at once.
+# Rows per second: 22 per cycle at 68 Hz are enough for a smooth phase plane, and few enough for an immediate response.
 RATE = 1500
-# How long the trajectory shown is followed for its verdict, s.
+# The time for which the trajectory shown is followed for its verdict, s.
 T_MAX = 10.0
 
 
@@ -38,13 +38,13 @@ def explorer(
         fj.explorer(scene)
         fj.explorer(scene, fj.bistability_map(scene, mu=…, p=…))  # a click on the map opens that trajectory
 
-    A map belongs to the parameters that it was computed for: where the sliders leave them, it is veiled, and a button
+    A map belongs to the parameters for which it was computed: when other sliders change, it is greyed out, and a button
     computes it anew.
 
-    **Arguments:** `scene`, where the sliders start; `dataset`, a map over two of the scene's parameters; `t1`, how much to
-    simulate, in s; `ranges`, the ends of sliders by name of parameter.
+    **Arguments:** `scene`, which gives the first values of the sliders; `dataset`, a map over two of the scene's parameters;
+    `t1`, the time to simulate, in s; `ranges`, the ends of sliders by name of parameter.
 
-    **Returns:** an `Explorer`, which shows itself.
+    **Returns:** an `Explorer`, which notebooks display.
 
     **Raises:** `ImportError` where ipywidgets or anywidget is missing, `ValueError` for unknown parameters or a map without
     two axes.
@@ -63,7 +63,9 @@ def explorer(
 
 @final
 class Explorer:
-    """What `explorer` returns: `sliders` by name, `picture`, `map` and `anew` (or None), `said`; `widget` holds them all."""
+    """The result of `explorer`: `sliders` by name, `picture`, `map` and `anew` (or None), `said`; `widget` contains them
+    all.
+    """
 
     def __init__(self, scene: Scene, dataset: xr.Dataset | None, t1: float, ranges: dict):
         widgets, picture = _widgets()
@@ -83,7 +85,7 @@ class Explorer:
         self.said = widgets.HTML()
         self.map = self.anew = None
         self._shown = scene
-        # One after the other: pictures do not wait for verdicts, and of two verdicts only the last is wanted.
+        # Verdicts are computed one at a time beside the pictures; only the last one requested is shown.
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._pending: Future | None = None
         self._quiet = False
@@ -104,7 +106,7 @@ class Explorer:
 
     @in_double_precision
     def update(self) -> None:
-        """Simulate with what the sliders say, and draw; the verdict follows when it is known."""
+        """Simulate with the values of the sliders, and draw; the verdict follows when it is known."""
         if self._quiet:
             return
         try:
@@ -128,15 +130,15 @@ class Explorer:
             self._pending = self._worker.submit(self._judge, scene, lines)
 
     def wait(self) -> None:
-        """Return when nothing is being computed any more."""
+        """Wait until no computation is running."""
         if self._pending is not None and not self._pending.cancelled():
             self._pending.result()
 
     def open_trajectory(self, right: float, down: float) -> None:
-        """Show the trajectory of the map nearest to a place, given as shares of the picture's width and height.
+        """Show the trajectory of the map nearest to a point, given as shares of the picture's width and height.
 
-        The other sliders go back to the map's scene: what is shown is that trajectory, and not one like it. Beside the map
-        nothing happens.
+        All other sliders return to the values of the map's scene, so that exactly this trajectory is shown. A point outside of
+        the map has no effect.
         """
         found = self._map.nearest(right, down)
         if found is None:
@@ -151,7 +153,7 @@ class Explorer:
         self.update()
 
     def compute_map(self) -> None:
-        """Compute the map for what the sliders say, along the same axes."""
+        """Compute the map for the values of the sliders, over the same axes."""
         self.anew.disabled, self.anew.description = True, "computing the map …"
         try:
             settings = json.loads(self._map.dataset.attrs.get("settings", "{}"))
@@ -173,7 +175,7 @@ class Explorer:
             self.said.value = "<br>".join([first, *lines])
 
     def _value(self, name: str) -> float:
-        # A browser rounds what it is given to the slider's steps; the trajectory of a map is meant exactly.
+        # A browser rounds values to the steps of a slider; a trajectory of the map needs its exact values.
         value, exact = self.sliders[name].value, self._exact.get(name, np.inf)
         return exact if abs(value - exact) <= 0.5001 * self.sliders[name].step else value
 

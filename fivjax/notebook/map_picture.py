@@ -1,4 +1,4 @@
-"""The explorer's map: drawn once, marked where the sliders are, veiled where it is of another scene, answering clicks."""
+"""The explorer's map: drawn once, marked at the values of the sliders, greyed out if it belongs to another scene, clickable."""
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from .panels import png
 
 
 class MapPicture:
-    """A map of two axes, with the scene that it was made for: the dataset's own where that is known, else the one given."""
+    """A map of two axes, with the scene for which it was computed: that of the dataset if it has one, else the one given."""
 
     def __init__(self, dataset: xr.Dataset, scene: Scene):
         self.dataset = dataset
@@ -30,13 +30,15 @@ class MapPicture:
         self._words = self.axes.text(0.5, 0.5, "", **place, animated=True, weight="bold")
 
     def differences(self, scene: Scene) -> dict[str, tuple[float | None, float | None]]:
-        """What a scene has otherwise than the map's, beside the map's axes: by name, the map's value and the scene's."""
+        """Parameters, other than the map's axes, in which a scene differs from the map's: by name, the map's value and the
+        scene's.
+        """
         ours, theirs = ({name: float(x) for name, x in one.parameters.items()} for one in (self.scene, scene))
         names = [name for name in dict.fromkeys([*ours, *theirs]) if name not in self.values]
         return {name: (ours.get(name), theirs.get(name)) for name in names if ours.get(name) != theirs.get(name)}
 
     def verdict(self, scene: Scene) -> tuple[Verdict, float] | None:
-        """The verdict of a scene that the map holds exactly, and when it was decided (s); None for any other scene."""
+        """The verdict on a scene that is exactly one of the map's, and when it was decided (s); None for any other scene."""
         at = {name: float(scene.parameters[name]) for name in self.values if name in scene.parameters}
         if self.differences(scene) or any(not np.any(self.values[name] == x) for name, x in at.items()):
             return None
@@ -45,7 +47,7 @@ class MapPicture:
         return Verdict(int(found["verdict"])), when
 
     def marked(self, scene: Scene) -> bytes:
-        """The map as PNG, with the scene's place marked; veiled, and with words over it, where it is of another scene."""
+        """The map as PNG, with the scene's point marked; greyed out, with a text over it, if it belongs to another scene."""
         self._canvas.restore_region(self._drawn)
         different = self.differences(scene)
         if different:
@@ -58,7 +60,7 @@ class MapPicture:
         return png(self._canvas)
 
     def nearest(self, right: float, down: float) -> dict[str, float] | None:
-        """The map's values nearest to a place, given as shares of the picture's width and height; None beside the map."""
+        """The map's values nearest to a point, given as shares of the picture's width and height; None outside of the map."""
         width, height = self._canvas.get_width_height()
         place = right * width, (1 - down) * height
         if not self.axes.bbox.contains(*place):
@@ -71,7 +73,7 @@ class MapPicture:
 
 
 def stale(different: dict[str, tuple[float | None, float | None]]) -> str:
-    """What is said over a map that is of another scene than the one shown."""
+    """The text over a map that belongs to another scene than the one shown."""
     ours, theirs = (
         ", ".join(f"{name} = {pair[k]:g}" for name, pair in different.items() if pair[k] is not None) for k in (0, 1)
     )

@@ -1,4 +1,4 @@
-"""The explorer's picture of a trajectory: four panels whose artists are made once, so that a new one is drawn at once."""
+"""The explorer's picture of a trajectory: four panels whose artists are made once, so that drawing is fast."""
 
 import io
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from ..plot import STATUS_NAMES
 from ..plot.style import BLACK, BLUE, GREEN, VERMILION
 from ..simulation.trajectory import Trajectory
 
-# The least that a panel's height or width stands for, as a share of the load over the mass, the belt's speed, the
-# displacement or the energy of steady sliding. Far below it there is nothing but rounding.
+# The smallest range of a panel's axis, as a share of the load over the mass, the belt speed, the displacement or the energy of
+# steady sliding. Far below it there is only rounding.
 LEAST = 1e-2
 
 
@@ -28,10 +28,10 @@ def drawing_panels(t1: float) -> Callable[[Trajectory], bytes]:
     (steps,) = status.plot([], [], ".", color=VERMILION, ms=2)
     (mechanical,) = energy.plot([], [], color=BLACK, lw=1.0, label="mechanical energy")
     (contact,) = energy.plot([], [], color=GREEN, lw=1.0, ls="--", label="from the contact, less damping")
-    # Its last point shows where nothing moves.
+    # The last point is marked, so that a motion at rest is visible.
     (orbit,) = phase.plot([], [], color=BLUE, lw=0.8, marker="o", ms=3, markevery=[-1])
     belt = phase.axhline(0, color=BLACK, ls=":", lw=0.8)
-    # Between two panels, where no curve can run behind it.
+    # Between two panels, where it covers no curve.
     place = {"loc": "lower right", "bbox_to_anchor": (1, 0.97), "borderaxespad": 0, "borderpad": 0.3}
     energy.legend(**place, ncols=2, fontsize="small", frameon=False)
 
@@ -54,7 +54,7 @@ def drawing_panels(t1: float) -> Callable[[Trajectory], bytes]:
         stored = np.concatenate([mechanical.get_ydata(), contact.get_ydata()])
         energy.set_ylim(limits(stored, LEAST * np.nanmax(np.abs(stored))))
         phase.set_xlim(limits(orbit.get_xdata(), LEAST * np.nanmax(np.abs(orbit.get_xdata()))))
-        # A belt far beyond the motion is left out of the picture rather than shrinking it.
+        # A belt speed far from the motion's is left out, because it would shrink the motion in the picture.
         phase.set_ylim(limits(orbit.get_ydata(), LEAST * abs(float(run.scene.belt_speed))))
         canvas.draw()
         return png(canvas)
@@ -63,7 +63,7 @@ def drawing_panels(t1: float) -> Callable[[Trajectory], bytes]:
 
 
 def limits(values, least: float) -> tuple[float, float]:
-    """The ends of an axis for these values: with a margin, and `least` apart, so that rounding is not blown up."""
+    """The ends of an axis for these values: with a margin, and at least `least` apart, so that rounding is not magnified."""
     known = np.asarray(values)[np.isfinite(values)]
     low, high = (known.min(), known.max()) if known.size else (0.0, 0.0)
     half = 0.5 * max(1.1 * (high - low), least, 1e-30)
@@ -71,9 +71,9 @@ def limits(values, least: float) -> tuple[float, float]:
 
 
 def png(canvas: FigureCanvasAgg) -> bytes:
-    """What is drawn on a canvas, as PNG."""
+    """The picture on a canvas, as PNG."""
     written = io.BytesIO()
-    # Little compression: what counts is that it comes at once.
+    # Little compression, because speed matters.
     Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(written, format="png", compress_level=1)
     return written.getvalue()
 
@@ -90,12 +90,12 @@ def _axes(figure: Figure, t1: float):
     phase.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
     for axes in (response, status):
         axes.tick_params(labelbottom=False)
-    # What places labels, and how many ticks there are, is what drawing waits for.
+    # Fixed positions of labels and few ticks, because these take most of the time of drawing.
     for axes, left in ((response, -0.13), (energy, -0.13), (phase, -0.21)):
         axes.yaxis.set_label_coords(left, 0.5)
         for axis, ticks in ((axes.xaxis, 4 if axes is phase else 5), (axes.yaxis, 5)):
             axis.set_major_locator(MaxNLocator(ticks))
-            # What numbers have in common would be printed over an axis's name; a power of ten above the axis would not.
+            # Without an offset, which would be printed over the name of the axis.
             written = ScalarFormatter(useOffset=False)
             written.set_powerlimits((-1, 4) if axis is phase.yaxis else (-5, 6))
             axis.set_major_formatter(written)

@@ -1,4 +1,4 @@
-"""A picture in a notebook that says where it was clicked. Needs anywidget; `explore` says how to get it where it is missing."""
+"""A picture in a notebook that reports clicks. It needs anywidget; `explore` says how to get it if it is missing."""
 
 from typing import final
 
@@ -32,7 +32,7 @@ export default { render };
 
 @final
 class Picture(anywidget.AnyWidget):
-    """A PNG; `clicked` is where it was last clicked, as shares of its width and height from the upper left corner."""
+    """A PNG picture; `clicked` is the point of the last click, as shares of its width and height from the upper left corner."""
 
     _esm = SCRIPT
     name = traitlets.Unicode().tag(sync=True)

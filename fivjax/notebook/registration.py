@@ -1,14 +1,14 @@
-"""How a running IPython learns to show results.
+"""Registration of the display functions of results with IPython.
 
-A scene shows itself (`Scene._repr_html_`); a trajectory, sensitivities and a calibration need pictures, which stand in
-rooms above theirs. So `fivjax/__init__.py`, which is above all rooms, has IPython told here which function shows a class,
-by the names of both: nothing is imported until the first such result is shown. Without IPython nothing happens, and it is
-no dependency. Datasets show as xarray shows them; their pictures are `fj.show(m)` and `m.fivjax.plot()`.
+A scene has its own HTML (`Scene._repr_html_`). A trajectory, sensitivities and a calibration need pictures, whose packages lie
+above those of the results. So `fivjax/__init__.py` calls `register`, which tells IPython the function that displays each class,
+by the names of both: nothing is imported until the first such result is displayed. Without IPython nothing happens; it is no
+dependency. Datasets are displayed by xarray; their pictures are `fj.show(m)` and `m.fivjax.plot()`.
 """
 
 import sys
 
-# Classes by module and name, and the function of `display` that shows each as HTML.
+# Classes by module and name, and the function in `display` that gives the HTML of each.
 SHOWN_BY = {
     ("fivjax.simulation.trajectory", "Trajectory"): "trajectory_summary",
     ("fivjax.linear.sensitivities", "Sensitivity"): "with_picture",
@@ -17,7 +17,7 @@ SHOWN_BY = {
 
 
 def register() -> bool:
-    """Hand the formatters to the running IPython, if there is one; returns whether there was."""
+    """Give the formatters to the running IPython, if there is one. Returns whether there is."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if shell is None:
         return False
@@ -41,5 +41,5 @@ def _shown_by(function: str):
 def _own_figure(figure) -> bytes | None:
     from . import display
 
-    # A figure that pyplot manages is for pyplot to show.
+    # A figure that pyplot manages is displayed by pyplot.
     return display.png(figure) if getattr(figure.canvas, "manager", None) is None else None

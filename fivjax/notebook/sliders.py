@@ -1,4 +1,4 @@
-"""The explorer's sliders: which parameters have one, over what range, in what steps, and how they stand beside a picture."""
+"""The explorer's sliders: which parameters have one, their ranges and steps, and their layout."""
 
 from collections.abc import Mapping
 
@@ -15,9 +15,9 @@ RANGES = {
     "p": (1.0, 3.0),
     "belt_speed": (0.1, 10.0),
 }
-# What a structure's parameters range over, as shares of their own values.
+# The range of a structure's parameters, relative to their values.
 SHARES = (0.5, 1.5)
-# A slider keeps its width however narrow the notebook is: the picture moves below it instead.
+# Sliders keep their width; in a narrow notebook the picture moves below them.
 SLIDER = {"width": "330px", "min_width": "330px", "flex": "0 0 auto"}
 BESIDE = {"flex_flow": "row wrap", "align_items": "flex-start"}
 PICTURE = {"flex": "1 1 480px", "max_width": "680px"}
@@ -30,17 +30,17 @@ def parameters_shown(scene: Scene, also: Mapping) -> list[str]:
 
 
 def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
-    """A slider for one parameter; it reaches its own value and both ends of the map's axis of that name."""
+    """A slider for one parameter; its range includes the scene's value and both ends of the map's axis of that name."""
     low, high = ranges.get(name) or RANGES.get(name) or tuple(share * value for share in SHARES)
     reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:
         high = low + 1.0
-    # Steps of 1, 2 or 5 times a power of ten, at least five hundred of them: a value that was typed lies on one.
+    # Steps of 1, 2 or 5 times a power of ten, at least five hundred of them, so that typed values are multiples of a step.
     finest = (high - low) / 500
     power = 10.0 ** np.floor(np.log10(finest))
     step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
-    # A browser rounds to steps from the lower end; the scene's own value has to be one of them.
+    # A browser rounds to steps from the lower end, so the scene's value must be a whole number of steps from it.
     low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
     unit = QUANTITIES[name][1] if name in QUANTITIES else "1"
     return widgets.FloatSlider(

@@ -1,1 +1,1 @@
-"""The paper: its figures and tables, beside what it prints."""
+"""The paper's figures and tables, computed and compared with what it prints."""

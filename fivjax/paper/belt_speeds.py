@@ -1,4 +1,4 @@
-"""Section 4.3: what the speed of the belt changes (Table 2, Figs. 15 to 18)."""
+"""Section 4.3: the influence of the belt speed (Table 2, Figs. 15 to 18)."""
 
 import numpy as np
 import xarray as xr
@@ -119,7 +119,7 @@ def figure_15(runs: Runs) -> Made:
 
 
 def shown_cycles(cycles: xr.Dataset, window: Window) -> np.ndarray:
-    """Which cycles a window shows whole."""
+    """Which cycles lie wholly in a window."""
     inside = (cycles["cycle_start"].values >= window[0] - 1e-9) & (cycles["cycle_end"].values <= window[1] + 1e-9)
     return np.flatnonzero(inside)
 
@@ -130,7 +130,7 @@ def in_millijoules(energies: np.ndarray) -> str:
 
 
 def _growth(runs: Runs, name: str, window: Window, per_cycle: str) -> Figure:
-    """What Figs. 15 and 16 have in common."""
+    """The common parts of Figs. 15 and 16."""
     picture = plot_energy.growth(runs.beginning(name), runs.cycles(name), window, per_cycle)
     whole, _, zoom = picture.axes[:3]
     return pictures.lettered(picture, [whole, zoom])
@@ -148,7 +148,7 @@ def figure_16(runs: Runs) -> Made:
     last = float(cycles["cycle_end"].values[sticks][-1])
     longest = {name: 1e3 * float(runs.cycles(name)["stick_time"].max()) for name in ("1 m/s", "1.5 m/s")}
     window = two_cycles(cycles, last - 0.4, 3)
-    # From here on every cycle that sticks loses.
+    # From this time on every cycle that sticks loses energy.
     since = float(cycles["cycle_end"].values[sticks & (gain >= 0)].max(initial=0.0))
     shown = shown_cycles(cycles, window)
     findings = (

@@ -106,12 +106,12 @@ def figure_13(runs: Runs) -> Made:
     return Made(caption, plot_energy.contact_exchange(runs.beginning(name), cycles, window), runs.data(name), findings)
 
 
-# How many cycles that detach are compared, from the first on.
+# The number of cycles with detachment that are compared, from the first on.
 FIRST = 10
 
 
 def first_detachments(cycles: xr.Dataset) -> slice:
-    """The first cycles of a run, one after the other, that detach."""
+    """The first consecutive cycles of a run with detachment."""
     begun = int(np.flatnonzero(cycles["detach_time"].values > 0)[0])
     return slice(begun, begun + FIRST)
 
@@ -129,8 +129,7 @@ def listed(values: np.ndarray) -> str:
 def figure_14(runs: Runs) -> Made:
     names = ("p = 1.2", "p = 1.19")
     cycles = {name: runs.cycles(name) for name in names}
-    # Cycle by cycle from the first that detaches, while both are still deciding: the larger kick's run is not yet on its
-    # limit cycle.
+    # Compared cycle by cycle from the first with detachment, while the run with the larger kick is not yet on its limit cycle.
     first = {name: first_detachments(cycles[name]) for name in names}
     off = {name: 1e3 * cycles[name]["detach_time"].values[part] for name, part in first.items()}
     windows = {

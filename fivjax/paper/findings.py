@@ -1,8 +1,7 @@
-"""What the paper says at one place beside what was computed, and what counts as agreeing.
+"""Findings: what the paper says and what was computed, and what counts as agreement.
 
-Three kinds are told apart. A *number* is printed by the paper and computed here. A *statement* is in words, and the computed
-numbers bear it out or do not. An *input* is what the paper prescribes: it is taken as printed, agrees with itself and is never
-counted.
+There are three kinds. A *number* is printed in the paper and computed here. A *statement* is in words, and the computed numbers
+support it or do not. An *input* is prescribed by the paper: it is taken as printed, agrees with itself and is never counted.
 """
 
 import dataclasses
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 
 
 class Kind(enum.StrEnum):
-    """What a finding is about."""
+    """The kind of a finding."""
 
     NUMBER = "number"
     STATEMENT = "statement"
@@ -23,7 +22,7 @@ class Kind(enum.StrEnum):
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What the paper says at one place, beside what was computed."""
+    """A number, statement or input of the paper, and what was computed."""
 
     kind: Kind
     where: str  # "Fig. 3", "Section 4.3"
@@ -31,12 +30,12 @@ class Finding:
     printed: str
     computed: str
     agrees: bool
-    why: str = ""  # where it differs; or what else is worth knowing
+    why: str = ""  # why it differs, or another remark
 
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """One figure or table: a matplotlib figure, a dataset, and the findings."""
+    """One figure or table: a matplotlib figure, its data, and the findings."""
 
     caption: str
     picture: Figure
@@ -45,7 +44,7 @@ class Made:
 
 
 def number(where: str, what: str, printed: str, computed: float, unit: str = "", why: str = "") -> Finding:
-    """A number that the paper prints: it agrees where the computed one, rounded to as many digits, prints the same."""
+    """A number that the paper prints: it agrees if the computed one, rounded to as many digits, is the same."""
     decimals = len(printed.partition(".")[2])
     agrees = f"{computed:.{decimals}f}" == printed
     unit = f" {unit}" if unit else ""
@@ -55,17 +54,17 @@ def number(where: str, what: str, printed: str, computed: float, unit: str = "",
 
 
 def statement(where: str, what: str, said: str, computed: str, holds, why: str = "") -> Finding:
-    """A statement without a number: `holds` says whether the computed numbers bear it out."""
+    """A statement without a number: `holds` says whether the computed numbers support it."""
     return Finding(Kind.STATEMENT, where, what, said, computed, bool(holds), why)
 
 
 def given(where: str, what: str, printed: str, why: str = "") -> Finding:
-    """An input: a value that the paper prescribes and that the runs start from."""
+    """An input: a value that the paper prescribes and that the computation uses."""
     return Finding(Kind.INPUT, where, what, printed, "taken as printed", True, why)
 
 
 def score(findings: Iterable[Finding]) -> dict[Kind, tuple[int, int]]:
-    """By kind, how many agree and how many there are; inputs are counted apart and agree with themselves."""
+    """By kind, how many agree and how many there are; inputs are a kind of their own and always agree."""
     findings = list(findings)
     counted = {}
     for kind in Kind:
@@ -75,7 +74,7 @@ def score(findings: Iterable[Finding]) -> dict[Kind, tuple[int, int]]:
 
 
 def summary(findings: Iterable[Finding]) -> str:
-    """In a sentence how much of what was computed agrees with the paper."""
+    """A sentence that says how much of what was computed agrees with the paper."""
     counted = score(findings)
     met, numbers = counted[Kind.NUMBER]
     borne, statements = counted[Kind.STATEMENT]

@@ -9,12 +9,12 @@ from .findings import Made, number, statement
 from .measures import Window, frequency, growing_mode, growth_rate, peak, straightness, two_cycles
 from .runs import Runs
 
-# A harmonic counts as seen if the picture of the spectrogram shows it, in dB of the fundamental.
+# A harmonic counts as visible if the picture of the spectrogram shows it: its level relative to the fundamental, in dB.
 SEEN = -pictures.DEPTH
 
 
 def _onset(runs: Runs, name: str, since: float, where: str):
-    """What Figs. 4 and 5 have in common."""
+    """The common parts of Figs. 4 and 5."""
     run, cycles = runs(name), runs.cycles(name)
     spectrum = spectra.spectrogram(run)
     start = runs.first(name)
@@ -40,7 +40,7 @@ def _onset(runs: Runs, name: str, since: float, where: str):
     return run, hertz, shift, overtones, data, picture, grows
 
 
-# What may change by less than this is called constant.
+# A quantity that changes by less than this share counts as constant.
 CONSTANT = 0.05
 
 NOT_SAID = (

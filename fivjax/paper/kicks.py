@@ -14,7 +14,7 @@ from .runs import Runs, energy_of
 
 
 def critical(mu, belt_speed, p_range: Window, p_step: float) -> xr.Dataset:
-    """Fig. 10 and Table 2 over the same two axes, so that they share what is compiled."""
+    """Critical kicks for Fig. 10 and Table 2, over the same two axes, so that they share compiled programs."""
     return critical_perturbation(
         paper.scene(), mu=mu, belt_speed=belt_speed, p_range=p_range, p_step=p_step, tolerance=1e-5, progress=False
     )

@@ -1,4 +1,4 @@
-"""What is read off a transient and its cycles: frequency, growth, straightness, peaks, windows."""
+"""Quantities of a transient and its cycles: frequency, growth rate, linearity of growth, peaks, windows."""
 
 import numpy as np
 import xarray as xr
@@ -33,7 +33,7 @@ def growing_mode(scene: Scene) -> tuple[float, float]:
 
 
 def straightness(run: Trajectory, cycles: xr.Dataset, window: Window) -> float:
-    """R² of a line through the amplitudes of a window's cycles."""
+    """R² of a straight line through the amplitudes of the cycles in a window."""
     inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
     t = cycles["cycle_start"].values[inside]
     amplitude = -cycles["turning_point"].values[inside]
@@ -42,13 +42,13 @@ def straightness(run: Trajectory, cycles: xr.Dataset, window: Window) -> float:
 
 
 def two_cycles(cycles: xr.Dataset, t: float, count: int = 2) -> Window:
-    """From the first cycle at or after an instant, so many cycles."""
+    """The window of `count` cycles from the first one that begins at or after an instant (s)."""
     k = int(np.searchsorted(cycles["cycle_start"].values, t))
     k = min(k, cycles.sizes["cycle"] - count)
     return float(cycles["cycle_start"][k]), float(cycles["cycle_end"][k + count - 1])
 
 
 def peak(run: Trajectory, since: float, quantity: str = "acceleration") -> float:
-    """Largest tangential value from an instant on."""
+    """Largest tangential value of a quantity from an instant (s) on."""
     late = np.asarray(run.t) >= since
     return float(np.abs(getattr(run, quantity)[late, run.scene.structure.tangential]).max())

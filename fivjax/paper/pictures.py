@@ -1,7 +1,7 @@
-"""Pictures in the layout of the paper's Figs. 2, 4–6 and 9 and its tables; results in, a matplotlib `Figure` out.
+"""Pictures in the layout of the paper's Figs. 2, 4–6 and 9 and its tables: matplotlib figures from computed results.
 
-Colours are near the paper's where those can be told apart by everyone; in grey they differ in lightness, and lines in
-style as well.
+Colours are similar to the paper's where everyone can distinguish them; in grey they differ in lightness, and lines also in
+style.
 """
 
 import textwrap
@@ -19,7 +19,7 @@ from ..simulation.trajectory import Trajectory
 
 Window = tuple[float, float]
 
-# How far below the strongest line a spectrogram is drawn, in dB. The paper does not print its range; at this one its two
+# The range of a spectrogram below its strongest line, in dB. The paper does not state its range; with this one its two
 # spectrograms look as it describes them.
 DEPTH = 40.0
 
@@ -73,7 +73,7 @@ def coexistence(
         panels["a"].annotate(
             name, (0.5 * (start + end), 0.92), (3, 0), xycoords=("data", "axes fraction"), textcoords="offset points"
         )
-    # Room above the lines for these names.
+    # Space above the curves for these names.
     low, high = panels["a"].get_ylim()
     panels["a"].set_ylim(low, high + 0.12 * (high - low))
     accelerations(panels["b"], zoomed, zoom)
@@ -88,7 +88,7 @@ def overlaid(
     if axes is None:
         figure = new_figure(figure, 8.4, 3.8)
         axes = figure.add_subplot()
-    # Of different lightness, so that they are told apart in grey too.
+    # Of different lightness, so that they can be distinguished in grey.
     shades = [(BLUE, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
     for (name, run), colour in zip(runs.items(), shades, strict=False):
         axes.plot(run.t, run.acceleration[:, run.scene.structure.tangential], color=colour, lw=0.5, label=name)
@@ -106,7 +106,7 @@ def accelerations(axes: Axes, run: Trajectory, window: Window) -> None:
         (values[:, run.scene.structure.tangential], "tangential ($x_2$)", VERMILION, "-", 1.3 if short else 0.5),
         (values[:, 1], "normal ($y_1$)", BLUE, "--" if short else "-", 1.3 if short else 0.5),
     ]
-    # The larger first, so that it does not hide the smaller.
+    # The larger one first, so that it does not hide the smaller.
     for line, label, colour, style, width in sorted(lines, key=lambda item: -np.nanmax(np.abs(item[0]))):
         axes.plot(t, line, color=colour, ls=style, lw=width, label=label)
     if short:
@@ -142,7 +142,7 @@ def captioned(figure: Figure, caption: str) -> Figure:
 
 
 def lettered(figure: Figure, panels: Sequence[Axes] | None = None, names: Sequence[str] = ()) -> Figure:
-    """The figure with (a), (b) … above its panels, all of them unless some are given, and a name after each letter."""
+    """The figure with (a), (b) … above its panels (all, unless some are given), followed by a name if given."""
     panels = figure.axes if panels is None else panels
     for letter, axes, name in zip("abcdefgh", panels, names or [""] * len(panels), strict=False):
         axes.set_title(f"({letter}) {name}".rstrip(), loc="left", fontsize="medium")
@@ -150,6 +150,6 @@ def lettered(figure: Figure, panels: Sequence[Axes] | None = None, names: Sequen
 
 
 def _thick(legend: Legend) -> None:
-    # Lines that are hairs in a long run are too thin to tell their colour from.
+    # The thin lines of a long run would not show their colour in the legend.
     for line in legend.get_lines():
         line.set_linewidth(3)

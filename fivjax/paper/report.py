@@ -1,4 +1,4 @@
-"""The paper in one call: its figures and tables as pictures and data, and a report on what agrees with it."""
+"""The paper in one call: its figures and tables as pictures and data, and a report on agreement."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,11 +16,11 @@ REPORT = "reproduce.md"
 
 
 class Reproduction(dict[str, Made]):
-    """What was made, by name of figure or table."""
+    """The results, by name of figure or table."""
 
     @property
     def summary(self) -> str:
-        """In a sentence how much of what was computed agrees with the paper."""
+        """A sentence that says how much of what was computed agrees with the paper."""
         return summary(finding for made in self.values() for finding in made.findings)
 
 
@@ -39,12 +39,12 @@ def reproduce(
     **Arguments:**
 
     - `figure`: which to make: "2" to "18", "table1", "table2", or several of them; all unless given. Runs that several
-      figures of one call show are made once.
-    - `out`: a folder to write into, made where there is none: `figNN.png` or `tableN.png`, the data beside it as `.nc`, and
-      `reproduce.md`, which puts each number that the paper prints beside the computed one. Nothing is written unless given.
-    - `progress`: show a bar; unless given, where there is a terminal or a notebook to show it in.
+      figures of one call show are computed once.
+    - `out`: a folder to write into, made if it does not exist: `figNN.png` or `tableN.png`, the data as `.nc`, and
+      `reproduce.md`, which compares each number that the paper prints with the computed one. Unless given, nothing is written.
+    - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.
 
-    **Returns:** by name, a `Made` with `picture` (a matplotlib figure), `data` (an xarray dataset), `caption` and `findings`;
+    **Returns:** by name, objects with `picture` (a matplotlib figure), `data` (an xarray dataset), `caption` and `findings`;
     `summary` says in a sentence how much agrees.
 
     **Raises:** `ValueError` for a figure that the paper does not have, or a folder that cannot be written, before any work.
@@ -77,7 +77,7 @@ def reproduce(
 
 
 def markdown(made: Mapping[str, Made]) -> str:
-    """What the paper prints beside what was computed, as Markdown."""
+    """The printed and the computed values, as Markdown."""
     findings = [finding for one in made.values() for finding in one.findings]
     differing = [finding for finding in findings if not finding.agrees]
     lines = [

@@ -1,4 +1,4 @@
-"""The paper's transients, each run once however many figures show it, and what figures keep of them."""
+"""The paper's transients, each computed only once for all figures, and the data that figures keep of them."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from .scenes import CASES
 
 
 class Runs:
-    """The paper's transients, each run once however many figures show it."""
+    """The paper's transients, each computed only once."""
 
     @functools.cache  # noqa: B019 (lives as long as one reproduction)
     def __call__(self, name: str) -> Trajectory:
@@ -22,7 +22,7 @@ class Runs:
 
     @functools.cache  # noqa: B019
     def beginning(self, name: str, t1: float = 4.0) -> Trajectory:
-        """The first part of a run, in as many rows: for pictures whose windows show what lasts less than a row of the whole."""
+        """The first part of a run, with as many rows: for windows that show details shorter than a row of the whole run."""
         return dataclasses.replace(CASES[name], t1=t1).run()
 
     @functools.cache  # noqa: B019
@@ -30,9 +30,10 @@ class Runs:
         return energy_per_cycle(self(name))
 
     def first(self, name: str, status: int | None = None) -> float:
-        """When a run first sticks (0) or detaches (2), or else when its first contact event comes, in s; infinite if never.
+        """The time (s) at which a run first sticks (0) or detaches (2), or, without `status`, of its first contact event;
+        infinite if there is none.
 
-        Read off the ledger, which misses nothing between rows; late by less than a row.
+        From the ledger, which misses nothing between rows; late by less than one row.
         """
         run = self(name)
         ledger = energy_of(run).ledger
@@ -41,7 +42,7 @@ class Runs:
         return float(run.t[begun[0]] - spent[begun[0]]) if len(begun) else np.inf
 
     def data(self, *names: str, cycles: bool = True) -> xr.Dataset:
-        """What the pictures draw of some runs and, unless not wanted, of their cycles, over `case`."""
+        """The data that the pictures draw, of some runs and (with `cycles`) of their cycles, over `case`."""
         kept = ["displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load"]
         kept += ["mechanical_energy", "stick_power", "slide_power", "damping_power", "load_power", "energy_residual"]
         of_cycles = ["contact_work", "energy_gain", "stick_time", "detach_time", "turning_point"]
@@ -62,7 +63,7 @@ def energy_of(run: Trajectory) -> Energy:
 
 def _cases(parts: Mapping[str, xr.Dataset]) -> xr.Dataset:
     scenes = {name: part.attrs["scene"] for name, part in parts.items()}
-    # Runs of unequal length have instants of their own: rows are numbered, and `t` says when they are.
+    # Runs of different length have different instants: rows are numbered, and `t` is their time.
     rows = [part.reset_index("t").reset_coords("t").rename_dims(t="row") for part in parts.values()]
     data = xr.concat(rows, xr.Variable("case", list(parts)), join="outer", combine_attrs="override")
     data.attrs["scene"] = str(scenes)

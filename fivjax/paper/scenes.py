@@ -1,8 +1,7 @@
-"""The paper: its parameters, the runs behind its figures, and what it says about each, in words and numbers.
+"""The paper's parameters, and the runs behind its figures.
 
 *Energy analysis of contact nonlinear transitions: Insights on the origin of limit cycles and bi-stable states in
-friction-induced instabilities.* Everything here is printed there, except what `Case` has to add because the paper leaves
-it open; that is said where it is added.
+friction-induced instabilities.* All values are printed there, except those that the paper leaves open; comments mark these.
 """
 
 import dataclasses
@@ -41,10 +40,11 @@ MU = 0.227
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One transient of the paper. Times are from t = 0; the paper's 40 s of quiet sliding before a kick are left out.
+    """One transient of the paper. Times are from t = 0; the paper's 40 s of steady sliding before a kick are left out.
 
-    `nudge` displaces the sliding equilibrium by that share of itself. The paper starts an unstable system at rest at
-    its equilibrium, where it would stay for ever; what sets it off there is not said, and only decides when it starts.
+    `nudge` displaces the start from the sliding equilibrium, by that share of its displacements. The paper starts an unstable
+    system at its equilibrium, where it would stay for ever; the disturbance is not stated, and only determines when the
+    vibration grows.
     """
 
     friction: AbstractFriction
@@ -53,7 +53,7 @@ class Case:
     start: float = 0.0
     nudge: float = 0.0
     t1: float = 12.0
-    # Every case has as many rows, so that all of one friction law share what is compiled for the first.
+    # All cases have the same number of rows, so that those with the same friction law share compiled programs.
     rows: int = 60_000
 
     def scene(self) -> Scene:
@@ -74,7 +74,7 @@ CASES = {
     "negative slope": Case(FALLING, 0.5, nudge=NUDGE, t1=6.0),
     "mode coupling": Case(CONSTANT, 0.5, nudge=NUDGE, t1=6.0),
     "both": Case(BOTH, 0.5, nudge=NUDGE, t1=6.0),
-    # A kick that dies out (Fig. 8); the paper does not say how strong.
+    # A kick whose vibration dies out (Fig. 8); the paper does not state its size.
     "a kick": Case(Coulomb(MU), 3.0, p=1.1, start=0.5),
     "p = 1.2": Case(Coulomb(MU), 3.0, p=1.2),
     "p = 1.19": Case(Coulomb(MU), 3.0, p=1.19),

@@ -1,4 +1,4 @@
-"""What frequencies a trajectory holds, and when: spectrogram, harmonics, phase shift. NumPy and SciPy, on saved rows."""
+"""Spectra of a trajectory from its saved rows: spectrogram, harmonics, phase shift; by NumPy and SciPy."""
 
 import numpy as np
 import xarray as xr
@@ -7,7 +7,7 @@ from ..foundation import arguments
 from ..io.datasets import labelled
 from ..simulation.trajectory import Trajectory
 
-# A Hann window leaves half of a sinusoid's amplitude in the mean.
+# A Hann window reduces the amplitude of a sinusoid to half.
 HANN_GAIN = 0.5
 
 
@@ -16,14 +16,14 @@ def spectrogram(
 ) -> xr.Dataset:
     """The spectrum of one coordinate over time, as in Figs. 4(c) and 5(c).
 
-    **Arguments:** `run`, with rows at equal distances; `quantity`, "displacement", "velocity" or "acceleration";
-    `coordinate`, the tangential one unless given; `window`, the length in s of the Hann windows, which overlap by nine
-    tenths. Their inverse is the resolution in frequency.
+    **Arguments:** `run`, with evenly spaced rows; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, the
+    tangential one unless given; `window`, the length in s of the Hann windows, which overlap by nine tenths; its inverse is the
+    frequency resolution.
 
-    **Returns:** a dataset over `frequency` (Hz) and `t` (the middle of each window, s) with `level`, power in dB below the
-    strongest of all.
+    **Returns:** a dataset over `frequency` (Hz) and `t` (the middle of each window, s) with `level`, the power relative to the
+    strongest of all, in dB.
 
-    **Raises:** `ValueError` for a window that does not fit into the run, or rows at unequal distances.
+    **Raises:** `ValueError` for a window that does not fit into the run, or rows that are not evenly spaced.
     """
     arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
     arguments.one_of("quantity", quantity, ("displacement", "velocity", "acceleration"))
@@ -35,7 +35,7 @@ def spectrogram(
             f"Argument `window` must hold at least 8 rows and fit into the run, but {window:g} s holds {samples} of "
             f"{len(run.t)} rows."
         )
-    # Half a second to import, which no map should wait for.
+    # Imported here, because it takes half a second.
     from scipy.signal import spectrogram as short_time_spectrum
 
     coordinate = run.scene.structure.tangential if coordinate is None else coordinate
@@ -44,7 +44,7 @@ def spectrogram(
         signal, rate, window="hann", nperseg=samples, noverlap=round(0.9 * samples), detrend="constant"
     )
     strongest = np.max(power)
-    # Far below what is drawn; keeps silence finite.
+    # The floor is far below the range that is drawn, and keeps levels finite.
     level = 10 * np.log10(np.maximum(power / (strongest if strongest > 0 else 1.0), 1e-20))
     dataset = xr.Dataset(
         {"level": (("frequency", "t"), level, {"long_name": f"power of {quantity}", "units": "dB"})},
@@ -54,20 +54,20 @@ def spectrogram(
 
 
 def component(t: np.ndarray, signal: np.ndarray, frequency: float) -> complex:
-    """The sinusoid of one frequency (Hz) in a signal at equal distances: its complex amplitude, Hann-windowed."""
+    """The complex amplitude of one frequency (Hz) in an evenly sampled signal, with a Hann window."""
     weights = np.hanning(len(t)) / (HANN_GAIN * len(t))
     return complex(2 * np.sum(weights * (signal - np.mean(signal)) * np.exp(-2j * np.pi * frequency * t)))
 
 
 def harmonics(run: Trajectory, window: tuple[float, float], frequency: float, count: int = 4) -> np.ndarray:
-    """Levels of the tangential acceleration at 2, 3, … `count` times a frequency (Hz), in dB above that frequency's own."""
+    """Levels of the tangential acceleration at 2, 3, … `count` times a frequency (Hz), relative to that frequency's, in dB."""
     inside, signal = _within(run, window, run.scene.structure.tangential)
     found = [abs(component(inside, signal, k * frequency)) for k in range(1, count + 1)]
     return 20 * np.log10(np.array(found[1:]) / found[0])
 
 
 def phase_shift(run: Trajectory, window: tuple[float, float], frequency: float, coordinate: int) -> float:
-    """By how much a coordinate's acceleration lags behind the tangential one at a frequency (Hz), in degrees, -180 to 180."""
+    """The phase lag of a coordinate's acceleration behind the tangential one at a frequency (Hz), in degrees, -180 to 180."""
     t, tangential = _within(run, window, run.scene.structure.tangential)
     _, other = _within(run, window, coordinate)
     return float(np.degrees(np.angle(component(t, tangential, frequency) / component(t, other, frequency))))
@@ -80,7 +80,7 @@ def _within(run: Trajectory, window: tuple[float, float], coordinate: int) -> tu
 
 def _sampling_rate(run: Trajectory) -> float:
     steps = np.diff(run.t)
-    # The last row is the end of the run, wherever that falls.
+    # The last row is the end of the run, which need not be a multiple of the step.
     if np.ptp(steps[:-1]) > 1e-6 * steps[0]:
         raise ValueError("Argument `run` must have rows at equal distances; `simulate` makes such runs.")
     return 1.0 / float(steps[0])

@@ -1,4 +1,4 @@
-"""Windows of runs with their ledgers, for the pictures of energy."""
+"""Time windows of runs, their ledgers and legends, for the pictures of energy."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ def shade(axes: Axes, run: Trajectory, part: slice) -> dict:
 
 
 def inside(run: Trajectory, window: Window) -> slice:
-    """The rows of a run in a window; refused if it holds no two of them."""
+    """The rows of a run in a window; refused if there are fewer than two."""
     check_run(run)
     start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
     if end - start < 2:
@@ -35,7 +35,7 @@ def inside(run: Trajectory, window: Window) -> slice:
 
 
 def ledger(run: Trajectory) -> Energy:
-    """The ledger of a run, or a sentence about how to get one."""
+    """The ledger of a run; a run without one is refused in a sentence that says how to get it."""
     check_run(run)
     if run.energy is None:
         raise ValueError("This picture needs a run with its ledger; ask for it: `simulate(..., energy=True)`.")
@@ -48,7 +48,7 @@ def styles(runs: Mapping) -> list:
 
 
 def align_zeros(*pair: Axes) -> None:
-    """Put the zeros of two vertical axes at one height, so that signs can be read off both."""
+    """Put the zeros of two vertical axes at the same height, so that signs can be read from both."""
     limits = [axes.get_ylim() for axes in pair]
     sizes = [max(abs(low), abs(high)) for low, high in limits]
     below = max(max(-low, 0.0) / size for (low, _), size in zip(limits, sizes, strict=True))
@@ -58,7 +58,7 @@ def align_zeros(*pair: Axes) -> None:
 
 
 def legend_between(axes: Axes, entries: list) -> None:
-    """One row of entries between a panel and the one above it."""
+    """A legend in one row between a panel and the one above it."""
     axes.legend(
         handles=entries,
         loc="lower right",
@@ -72,6 +72,6 @@ def legend_between(axes: Axes, entries: list) -> None:
 
 
 def legend_of_figure(figure: Figure, handles: Mapping) -> None:
-    """One legend above all panels, none where nothing is to be said."""
+    """One legend above all panels; none if there are no entries."""
     if handles:
         figure.legend(handles=list(handles.values()), loc="outside upper right", ncols=4, frameon=False)

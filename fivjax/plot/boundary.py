@@ -13,7 +13,8 @@ from .style import BLACK, BLUE, ORANGE, VERMILION, cell_edges, check_dataset, ne
 
 
 def boundary_section(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """The stable manifold, the saddle and two kicks beside the critical one, over the verdicts of a plane of the section.
+    """The stable manifold, the saddle and the motions after two nearly critical kicks, over the verdicts in a plane of the
+    section.
 
     **Arguments:** `dataset` from `boundary_section`.
 

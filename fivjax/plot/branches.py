@@ -25,7 +25,7 @@ def branch(
     """A bifurcation diagram: steady sliding and limit cycles over a parameter; stable ones solid, unstable ones dashed.
 
     **Arguments:** `branches`, a dataset from `continue_cycle`, or several over the same parameter by label; `beside`, a map
-    from `bistability_map` that is drawn to the right; `tori`, from `tori_along`, what attracts where cycles are unstable.
+    from `bistability_map` that is drawn to the right; `tori`, from `tori_along`, the attractors where cycles are unstable.
 
     **Returns:** a matplotlib figure.
 
@@ -67,7 +67,7 @@ def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
     x, y, stable = one["parameter"].values, one["amplitude"].values, one["stable"].values
     known = np.isfinite(y)
     x, y, stable = x[known], y[known], stable[known]
-    # A line between two points is that of a stable cycle if both are, or a special point lies at one of its ends.
+    # Solid: the lines that follow a stable point. Dashed: the lines that lead to an unstable one.
     for is_stable, style in ((True, "-"), (False, "--")):
         chosen = stable == is_stable
         shown = chosen | np.append(False, chosen[:-1]) if is_stable else chosen | np.append(chosen[1:], False)

@@ -1,4 +1,4 @@
-"""The contact's status and the kick, marked in pictures over time."""
+"""Marks for the contact's status and for the kick, in pictures over time."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,12 +11,12 @@ from .style import ORANGE, SKY, VERMILION
 
 STATUS_COLOURS = {Status.STICK: ORANGE, Status.DETACH: SKY}
 STATUS_NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}
-# How much of a panel's height the mark of a kick takes, at its top.
+# The height of the mark of a kick, at the top of a panel, as a share of the panel's height.
 KICK_HEIGHT = 0.045
 
 
 def shade_status(axes: Axes, run: Trajectory, contact: int = 0) -> list[Patch]:
-    """Shade where a contact (by its number, of several) sticks or is detached; returns legend entries for what occurs."""
+    """Shade where a contact (by its number) sticks or is detached. Returns legend entries for the statuses that occur."""
     handles = []
     statuses = np.asarray(run.status)
     statuses = statuses if statuses.ndim == 1 else statuses[:, contact]
@@ -26,7 +26,7 @@ def shade_status(axes: Axes, run: Trajectory, contact: int = 0) -> list[Patch]:
         if not is_on.any():
             continue
         hatch = "///" if status == Status.STICK else None
-        # From the first row that has it to the row that has another, so that one row alone is seen too.
+        # From the first row with the status to the first row with another, so that a single row is visible, too.
         edges = np.diff(np.concatenate([[False], is_on, [False]]).astype(int))
         begun, ended = t[np.flatnonzero(edges > 0)], t[np.flatnonzero(edges < 0)]
         axes.broken_barh(
@@ -44,7 +44,7 @@ def shade_status(axes: Axes, run: Trajectory, contact: int = 0) -> list[Patch]:
 
 
 def mark_kick(axes: Axes, run: Trajectory) -> list[Patch]:
-    """Mark at the top of a panel when the kick acts; returns its legend entry, none where there is no kick."""
+    """Mark the time of the kick at the top of a panel. Returns its legend entry; none if there is no kick."""
     load = run.scene.load
     if not isinstance(load, Pulse) or float(load.p) == 1 or float(load.start) >= run.t[-1]:
         return []
@@ -53,7 +53,7 @@ def mark_kick(axes: Axes, run: Trajectory) -> list[Patch]:
         (1 - KICK_HEIGHT, KICK_HEIGHT),
         transform=axes.get_xaxis_transform(),
         facecolor=VERMILION,
-        # In a long run a short kick is still a line wide.
+        # With an edge, so that a short kick is visible in a long run.
         edgecolor=VERMILION,
         lw=1.2,
     )

@@ -20,8 +20,8 @@ NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "deta
 def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figure | None = None) -> Figure:
     """A limit cycle in the phase plane, coloured by contact mode, and its Floquet multipliers beside the unit circle.
 
-    Of a torus the points of the section stand beside it instead of the multipliers. `others` (the saddle cycle, say) are drawn
-    dashed into the same plane. Of several contacts the one that moves fastest is shown.
+    For a torus, the points of the section are drawn instead of the multipliers. `others` (for instance the saddle cycle) are
+    drawn dashed in the same phase plane. With several contacts, the one that moves fastest is shown.
 
     **Raises:** `TypeError` for anything but a `LimitCycle`.
     """
@@ -56,8 +56,8 @@ def _tangential(run, contact: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _phase_plane(axes: Axes, cycle: LimitCycle) -> int:
-    """Draws the cycle; which of its contacts is shown."""
-    # Of a torus, some beats.
+    """Draw the cycle. Returns the number of the contact that is shown."""
+    # For a torus, long enough for several beats.
     periods = 1 if cycle.kind == "periodic" else 40
     run = cycle.trajectory(ROWS, periods=periods)
     speeds = np.abs(np.asarray(run.velocity) @ run.scene.structure.tangential_directions)
@@ -66,7 +66,7 @@ def _phase_plane(axes: Axes, cycle: LimitCycle) -> int:
     status = np.asarray(run.status).reshape(len(x), -1)[:, contact]
     for mode in _statuses(cycle, contact):
         here = status == mode
-        # A row belongs to the line before and after it.
+        # A row belongs to the line segments before and after it.
         shown = here | np.append(False, here[:-1])
         axes.plot(1e3 * np.where(shown, x, np.nan), np.where(shown, v, np.nan), color=COLOURS[mode], lw=1.3)
     belt = float(np.broadcast_to(cycle.scene.belt_speed, speeds.shape[1])[contact])

@@ -1,7 +1,7 @@
-"""Pictures of energy, in the manner of Figs. 7, 11–16 and 18; results in, a matplotlib `Figure` out, nothing computed.
+"""Pictures of energy, in the manner of Figs. 7, 11–16 and 18, from results that have been computed.
 
-Runs come from `simulate(..., energy=True)`, cycles from `energy_per_cycle(run)`. A window is a pair of instants in s. What
-matters is told by line style or hatching as well as by colour.
+Runs come from `simulate(..., energy=True)`, cycles from `energy_per_cycle(run)`. A window is a pair of instants in s. Curves
+and areas differ in line style or hatching as well as in colour.
 """
 
 from ._windows import STYLES as STYLES

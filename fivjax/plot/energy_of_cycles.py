@@ -27,9 +27,9 @@ PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy g
 
 
 def contact_exchange(run: Trajectory, cycles: xr.Dataset, window: Window, *, figure: Figure | None = None) -> Figure:
-    """Tangential displacement and status above; power at the contact and what it sums to in each cycle below (Fig. 13).
+    """Tangential displacement and status above; power at the contact and its work in each cycle below (Fig. 13).
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that holds none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
     """
     figure = new_figure(figure, 8.0, 4.8)
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -49,12 +49,12 @@ def detachments(
     *,
     figure: Figure | None = None,
 ) -> Figure:
-    """Displacement and status of several runs in a window, and how long each cycle was detached (Fig. 14).
+    """Displacement and status of several runs in a window, and the detached time of each cycle (Fig. 14).
 
-    The `window` is one for all, or one of its own for each run by label. How long cycles were detached is shown over the
-    whole runs, unless an `overview` is given.
+    `window` is one for all runs, or a window for each run by label. Detached times are shown over the whole runs, or over
+    `overview` if it is given.
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that holds none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
     """
     figure = new_figure(figure, 4.2 * len(runs), 5.4)
     grid = figure.add_gridspec(2, len(runs), height_ratios=(1, 1))
@@ -90,10 +90,10 @@ def growth(
 ) -> Figure:
     """Tangential acceleration and status of a whole run; below, a window of it (Figs. 15, 16).
 
-    There: velocity, contact power, and over each cycle by how much mechanical energy grew ("energy_gain"), or what the
-    contact gave ("contact_work").
+    The window shows velocity, contact power, and for each cycle the growth of mechanical energy ("energy_gain") or the work of
+    the contact ("contact_work").
 
-    **Raises:** `ValueError` for a run without a ledger, or a window that holds none of its instants.
+    **Raises:** `ValueError` for a run without a ledger, or a window that contains none of its instants.
     """
     figure = new_figure(figure, 8.0, 7.2)
     whole, strip, middle, lower = figure.subplots(4, 1, height_ratios=(2, 0.7, 1.6, 1.6))
@@ -119,7 +119,7 @@ def growth(
 
 
 def per_cycle(cycles: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """Energy over each cycle by line of the ledger, and how long each cycle stuck and was detached.
+    """Energy over each cycle by line of the ledger, and the time of sticking and of detachment in each cycle.
 
     **Raises:** `TypeError` for anything but energies per cycle.
     """
@@ -156,7 +156,7 @@ def _displacement(axes: Axes, run: Trajectory, window: Window) -> dict:
 
 
 def _exchange(axes: Axes, run: Trajectory, cycles: xr.Dataset, window: Window, name: str) -> dict:
-    """Power at the contact, and on an axis of its own a line of the ledger over each whole cycle."""
+    """Power at the contact, and, on a second axis, a line of the ledger for each whole cycle."""
     part = inside(run, window)
     axes.axhline(0, color="0.7", lw=0.8)
     (power,) = axes.plot(

@@ -1,4 +1,4 @@
-"""A picture of a calibration: data against fit, what is left, and the parameters. It draws and computes nothing."""
+"""The picture of a calibration: data and fit, residuals, and parameters. It computes nothing."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,14 +9,14 @@ from .style import BLACK, SKY, VERMILION, new_figure
 
 MEASURED, FITTED, LEFT = SKY, BLACK, VERMILION
 UNITS = {"acceleration": "m/s²", "velocity": "m/s"}
-# A fit is looked at in its details and as a whole: so many blocks of the first, all of the second.
+# The number of blocks shown in the detailed view of a fit.
 DETAIL = 160
 
 
 def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
-    """Every channel of every recording: the beginning in detail, the whole with what the fit leaves; the parameters above.
+    """Every channel of every recording: the beginning in detail, the whole with the residuals of the fit; the parameters above.
 
-    A limit cycle is fitted by its first harmonics: these are drawn, and what is left is also all that lies above them.
+    A limit cycle is fitted by its first harmonics: these are drawn, and the residuals contain all higher ones.
     """
     rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
     figure = new_figure(figure, 9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows))

@@ -1,4 +1,4 @@
-"""`fj.plot_linear` and its like: the modules `linear`, `energy` and `fits` of `fj.plot`, kept for those who use them."""
+"""`fj.plot_linear`, `fj.plot_energy` and `fj.plot_calibration`: other names of the modules `linear`, `energy` and `fits`."""
 
 from . import energy as plot_energy
 from . import fits as plot_calibration

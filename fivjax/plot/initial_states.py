@@ -12,15 +12,15 @@ from ..verdicts.verdict import Verdict
 from .maps import SLIDING_SHADE
 from .style import BLACK, VERMILION, cell_edges, check_dataset, new_figure, with_unit
 
-# Of attractors, in the order of the table: told apart by those who do not see red and green.
+# Colours of attractors, in the order of the table; readers who do not see red and green can distinguish them.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#F0E442")
 
 
 def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Figure | None = None) -> Figure:
-    """A picture of basins: each attractor has its colour, and its share stands in the legend.
+    """A picture of basins: each attractor has its colour, and its share is in the legend.
 
     **Arguments:** `dataset` from `basins` with two axes (the first is drawn to the right); `saddle`, the unstable cycle from
-    `saddle_cycle`, drawn over it where both axes are of one coordinate, as x2 and dx2.
+    `saddle_cycle`, drawn over it if both axes belong to the same coordinate, such as x2 and dx2.
 
     **Raises:** `TypeError` for anything but basins, `ValueError` for those that do not have two axes.
     """

@@ -1,7 +1,7 @@
-"""Pictures of the linear analysis: they draw what `cea` has computed, and compute nothing.
+"""Pictures of the linear analysis, from datasets that `cea` has computed.
 
-Each function takes a dataset and returns a matplotlib figure, a new one unless given. Colours are told apart by readers
-who do not see all of them and in grey; lines differ in style as well.
+Each function takes a dataset and returns a matplotlib figure, a new one unless given. Colour-blind readers can distinguish the
+colours, and they differ in grey; lines differ in style as well.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ FALLS, RISES = BLUE, ORANGE
 def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Frequencies and growth rates of the modes over one parameter (Fig. 3), with the critical friction marked.
 
-    `dataset` is from `cea.modes`. A single point of the axis is drawn as such.
+    `dataset` is from `cea.modes`. With a single value on the axis, points are drawn.
 
     **Raises:** `TypeError` for anything but modes.
     """
@@ -68,7 +68,7 @@ def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
 
 
 def sensitivity(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """Which parameter moves the critical friction: percent per percent, the largest on top (a tornado).
+    """How each parameter changes the critical friction, in percent per percent, the largest on top (a tornado diagram).
 
     `dataset` is from `cea.sensitivity(structure).dataset`. The plain derivative is written beside each bar. Bars to the
     left (μ_crit falls) are hatched.
@@ -103,14 +103,14 @@ def sensitivity(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
         )
     axes.set_yticks(range(len(names)), names)
     axes.axvline(0, color="black", linewidth=0.8)
-    # Room for the numbers beside the longest bars.
+    # Space for the numbers beside the longest bars.
     axes.margins(x=0.6)
     axes.set_xlabel(f"percent of $\\mu_{{crit}}$ = {float(dataset['mu_crit']):.5g} per percent of the parameter")
     return figure
 
 
 def chart(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """Growth rate over two parameters, with the limit of stability drawn in.
+    """Growth rate over two parameters, with the stability limit.
 
     `dataset` is from `cea.chart`. Points without steady sliding are left white.
 
@@ -135,7 +135,7 @@ def chart(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
 
 
 def design(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """How a design went: the quantity it improves, and the parameters, over the steps (`Design.history`).
+    """The course of a design: the quantity it improves, and the parameters, over the steps (`Design.history`).
 
     The design that was returned is marked, with its value; the target is a dashed line.
 
@@ -173,7 +173,7 @@ def _limit(axes: Axes, x, y, growth) -> None:
         return
     if min(growth.shape) < 2:
         return
-    # White under black: seen on any colour.
+    # A white line under a black one is visible on any colour.
     axes.contour(x, y, growth, levels=[0.0], colors="white", linewidths=3.0)
     axes.contour(x, y, growth, levels=[0.0], colors="black", linewidths=1.4)
     axes.set_title("line: limit of stability", fontsize="medium")

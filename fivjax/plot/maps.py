@@ -21,7 +21,7 @@ def bistability(
     """A bi-stability map: where sliding returns, and how large the limit cycle is elsewhere.
 
     **Arguments:** `dataset` from `bistability_map` with two axes (the first is drawn to the right); `critical`, from
-    `critical_perturbation`, drawn over it instead of the map's own, coarser boundary; `value`, what colours the limit
+    `critical_perturbation`, drawn over it instead of the map's own, coarser boundary; `value`, the variable that colours limit
     cycles: "amplitude", "decided_at", "contact_events" or "last_event".
 
     **Raises:** `TypeError` for anything but a map, `ValueError` for a map that does not have two axes.

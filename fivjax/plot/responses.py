@@ -31,10 +31,10 @@ def response(
 ) -> Figure:
     """One coordinate over time, with the contact's status shaded and the kick marked at the top.
 
-    Of several contacts, a panel for each: its tangential coordinate, with its own status.
+    With several contacts, there is a panel for each: its tangential coordinate, with its own status.
 
     **Arguments:** `run`; `quantity`, "displacement", "velocity" or "acceleration"; `coordinate`, by its number, the
-    tangential one unless given. Of several contacts, a coordinate that is given is drawn without any status.
+    tangential one unless given. With several contacts, a given coordinate is drawn without status.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for another quantity.
 
@@ -73,7 +73,7 @@ def phase_plane(
 ) -> Figure:
     """Tangential velocity over displacement for the `last` seconds of one run or of several by label (Fig. 17).
 
-    Of several contacts, a panel for each.
+    With several contacts, there is a panel for each.
 
     **Example:**
 
@@ -97,16 +97,16 @@ def phase_plane(
             axes.set_title(f"contact {contact}", loc="right", fontsize="medium")
     panels[0].set_ylabel("tangential velocity (m/s)")
     if any(runs):
-        # Beside the motions: they may be anywhere in the plane.
+        # The legend is outside of the plane, because motions may be anywhere in it.
         legend_above(panels[0])
     return figure
 
 
 def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure | None = None) -> Figure:
-    """The load's pulse and the tangential acceleration that answers it (Fig. 8).
+    """The load's pulse and the tangential acceleration in response (Fig. 8).
 
-    **Arguments:** `run`; `zoom`, a length in s: beside the whole run, so much of it around the kick, whose shape cannot be
-    seen in a long run.
+    **Arguments:** `run`; `zoom`, a time in s: if given, this much of the run around the kick is shown as well, because the
+    shape of a kick is not visible in a long run.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for a `zoom` that is not positive.
 
@@ -134,7 +134,7 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
         lower.plot(run.t, np.asarray(run.acceleration)[:, tangential], color=BLUE, lw=0.7)
         mark_kick(lower, run)
         lower.set(xlabel="time (s)", xlim=window)
-    # Around what the load does, not from zero: a kick of a tenth is to be seen.
+    # The axis covers the range of the load, not zero, so that a kick of a tenth is visible.
     low, high = float(np.min(run.load)), float(np.max(run.load))
     room = 0.2 * (high - low) or 0.1 * high
     panels[0, 0].set(ylabel="load (N)", ylim=(low - room, high + room))
@@ -148,7 +148,7 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
 def comparison(
     runs: Mapping[str, Trajectory], quantity: str = "acceleration", *, figure: Figure | None = None
 ) -> Figure:
-    """The tangential response of several runs by label, each in a row of its own, on one scale (Fig. 9).
+    """The tangential response of several runs by label, each in a row of its own, on the same scale (Fig. 9).
 
     **Example:**
 

@@ -1,7 +1,7 @@
-"""What all pictures share: colours, labels with units, new figures, and sentences about what cannot be drawn.
+"""Functions for all pictures: colours, labels with units, new figures, and errors for objects that cannot be drawn.
 
-Figures are made without `pyplot`, so nothing global is touched. Colours are Okabe and Ito's and matplotlib's perceptually
-uniform maps; lines differ in style as well, so that they are told apart by everyone and in grey.
+Figures are made without `pyplot`, so there is no global state. Colours are those of Okabe and Ito, and matplotlib's
+perceptually uniform colour maps; lines differ in style as well, so that everyone can distinguish them, even in grey.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
     "#D55E00",
     "#CC79A7",
 )
-# In an order of falling darkness; with as many dashes as are needed to tell neighbours apart.
+# From dark to light; lines also differ in their dashes.
 COLOURS = (BLACK, BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DASHES = ("-", "--", "-.", ":")
 SYMBOLS = {"mu": r" $\mu$", "p": " $p$"}
@@ -36,12 +36,12 @@ def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A label with its unit, none for pure numbers."""
+    """A label with its unit; without one for pure numbers."""
     return text if unit == "1" else f"{text} ({unit.replace('2', '²')})"
 
 
 def axis_label(name) -> str:
-    """The label of a parameter or result, by the name that fivjax knows it by."""
+    """The label of a parameter or result, by its name in fivjax."""
     long_name, unit = QUANTITIES.get(str(name), (str(name), "1"))
     return with_unit(long_name + SYMBOLS.get(str(name), ""), unit)
 
@@ -53,7 +53,7 @@ def variable_label(variable: xr.DataArray) -> str:
 
 
 def coordinate_label(structure: Structure, index: int) -> str:
-    """The name of a coordinate with what it is to a contact: "tangential x2", "normal y2", "y1"."""
+    """The name of a coordinate with its direction at a contact, if any: "tangential x2", "normal y2", "y1"."""
     name = structure.coordinates[index]
     roles = {}
     for tangential, normal in structure.places:
@@ -63,7 +63,7 @@ def coordinate_label(structure: Structure, index: int) -> str:
 
 
 def cell_edges(values: np.ndarray) -> np.ndarray:
-    """The edges of cells around the values of an axis; a single value has a cell of its own, too."""
+    """The edges of cells around the values of an axis; a single value has a cell, too."""
     values = np.asarray(values, float)
     if len(values) == 1:
         half = 0.5 * abs(values[0]) or 0.5
@@ -73,13 +73,13 @@ def cell_edges(values: np.ndarray) -> np.ndarray:
 
 
 def legend_above(axes: Axes, handles=None, columns: int = 3) -> Legend:
-    """A legend without frame above the right end of a panel, where it hides nothing."""
+    """A legend without frame above the right end of a panel, where it covers no curve."""
     options = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": columns, "frameon": False}
     return axes.legend(**({} if handles is None else {"handles": handles}), **options)
 
 
 def check_run(run) -> None:
-    """Refuse what is no trajectory, with the call that makes one."""
+    """Refuse anything but a trajectory; the error names the call that makes one."""
     if isinstance(run, xr.Dataset):
         raise TypeError(
             "Argument `run` must be a trajectory, as `fj.simulate` returns it, but is a dataset. Pass the trajectory itself; "
@@ -89,7 +89,7 @@ def check_run(run) -> None:
 
 
 def check_runs(runs) -> None:
-    """Refuse what is no collection of trajectories by label."""
+    """Refuse anything but a mapping of trajectories by label."""
     if not isinstance(runs, dict) or not runs:
         raise TypeError(
             'Argument `runs` must be trajectories by label, such as {"3 m/s": run}, but is '
@@ -100,7 +100,7 @@ def check_runs(runs) -> None:
 
 
 def check_dataset(dataset, variables: tuple[str, ...], call: str, name: str = "dataset") -> None:
-    """Refuse what does not hold the variables that a picture draws, with the call whose result does."""
+    """Refuse anything but a dataset with the variables of a picture; the error names the call whose result has them."""
     if isinstance(dataset, xr.Dataset):
         missing = [variable for variable in variables if variable not in dataset]
         if not missing:

@@ -1,4 +1,4 @@
-"""The critical perturbation over one parameter (Fig. 10, Table 2): a line where it is proved, a bar where a range is."""
+"""The critical perturbation over one parameter (Fig. 10, Table 2): a line where it is known, a bar where only its range is."""
 
 import json
 
@@ -14,8 +14,8 @@ from .style import BLUE, VERMILION, axis_label, check_dataset, new_figure
 def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """The critical perturbation over one parameter (Fig. 10, Table 2).
 
-    A line with dots where it is known; hollow where more crossings were seen above it. Where undecided trajectories leave no
-    more than a range, from the last kick proved to slide to the first proved to end on a limit cycle, that range is a bar.
+    A line with dots where it is known; dots are hollow if there are more crossings above. Where undecided trajectories leave
+    only a range, from the last kick proved to slide to the first proved to end on a limit cycle, that range is drawn as a bar.
 
     **Raises:** `TypeError` for anything but a critical perturbation, `ValueError` for one over several parameters.
     """
@@ -67,16 +67,16 @@ def critical(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
 
 
 def draw_threshold(axes: Axes, dataset: xr.Dataset, name: str, colour: str, limit: float = np.inf) -> list[Line2D]:
-    """Draw p_crit over one axis: a line where it is known, bars where only a range is; returns the legend entries.
+    """Draw p_crit over one axis: a line where it is known, bars where only a range is. Returns the legend entries.
 
-    A line is drawn between neighbours that are both known; at the `limit` of linear theory it is broken, because beyond
-    it sliding is left without a kick.
+    A line joins neighbours that are both known; it is broken at the `limit` of linear theory, because beyond it sliding is
+    unstable without a kick.
     """
     x, p = dataset[name].values, dataset["p_crit"].values
     handles = [Line2D([], [], color=colour, lw=1.6, label=r"critical perturbation $p_\mathrm{crit}$")]
     for part in (x < limit, x >= limit):
         axes.plot(x[part], p[part], color=colour, lw=1.6)
-    # One known point between unknown ones makes no line.
+    # A single known point between unknown ones has no line.
     known = np.concatenate([[False], np.isfinite(p), [False]])
     alone = known[1:-1] & ~known[:-2] & ~known[2:]
     axes.plot(x[alone], p[alone], "o", color=colour, ms=3)

@@ -1,4 +1,4 @@
-"""What accuracy costs: the picture of `fj.tradeoff`."""
+"""The cost of accuracy: the picture of `fj.tradeoff`."""
 
 import numpy as np
 import xarray as xr
@@ -12,9 +12,9 @@ MARKERS = "os^Dv<>pPX*hd"
 
 
 def tradeoff(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
-    """A work–precision picture of `fj.tradeoff`: what a trajectory costs per period, against the error of its state.
+    """A work–precision diagram of `fj.tradeoff`: the cost of a trajectory per period over the error of its state.
 
-    Methods have markers of their own, named beside the picture; single precision is hollow.
+    Each method has its own marker, named in the legend; markers of single precision are hollow.
 
     **Raises:** `TypeError` for anything but the result of `fj.tradeoff`.
     """
