@@ -13,7 +13,8 @@ CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle.
 LONGEST = (
-    "maps cycles energy tradeoff gradients attractor checkpoint notebooks verdicts simulate steppers cea properties"
+    "energy maps gradients cycles several_contacts simulate cea steppers attractor verdicts windowed_returns notebooks "
+    "tradeoff calibrate checkpoint properties reproduce types precision propagators basins branches"
 )
 LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
 

@@ -15,6 +15,7 @@ import numpy as np
 from gradient_reference import bouncing_height, point_mass, richardson, stick_slip
 
 import fivjax as fj
+from fivjax.foundation.compiling import compiled
 
 # A kick a moment after the start, so that its instant can be moved both ways; times count from the kick.
 START = 0.01
@@ -122,7 +123,7 @@ def closed_forms(mode, method=None):
             return jnp.stack([found.displacement[-1, 0], found.velocity[-1, 0]])
 
         x = jnp.array(list(values.values()))
-        found = jax.jit((jax.jacfwd if mode == "forward" else jax.jacrev)(run))(x)
+        found = compiled((jax.jacfwd if mode == "forward" else jax.jacrev)(run))(x)
         # Periods of 8.9026 s: slips for the third time from 18.3 s on.
         expected = jax.jacfwd(lambda x: stick_slip(t1, 2, x0, *x))(x)
     yield "stick–slip block, 5 events, in " + ", ".join(values), np.asarray(found), np.asarray(expected)

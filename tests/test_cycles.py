@@ -113,7 +113,9 @@ def test_the_saddle_has_one_direction_outside_and_lies_between_sliding_and_the_c
         assert (sizes[-300:].max() > np.linalg.norm(weights * saddle.deviation)) == stays
 
 
+@pytest.mark.slow
 def test_from_a_start_newton_finds_the_unstable_cycle_too(saddle):
+    """`test_branches` begins at a cycle that is given, and goes on along unstable ones."""
     again = fj.limit_cycle(paper(1.0), start=(saddle.state, saddle.contact.status))
     assert again.period == pytest.approx(saddle.period, rel=1e-12) and not again.stable
     nearby = fj.limit_cycle(paper(1.01), start=saddle)

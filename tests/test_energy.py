@@ -15,6 +15,7 @@ from test_simulate import CASES, scene_of
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
 from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.foundation.compiling import compiled
 from fivjax.maps.engine import run_to_verdict
 from fivjax.plot import energy as plot_energy
 from fivjax.simulation import energy as accounts
@@ -55,8 +56,8 @@ SQUEALING = {
     "frictionless impact": mode_coupling(COULOMB, impact_law="frictionless"),
     "reset impact": mode_coupling(COULOMB, impact_law="reset"),
 }
-# Each impact law is compiled anew.
-SLOW = ("frictionless impact", "reset impact")
+# Each impact law and friction law is compiled anew; `test_properties` looks at the balance under falling friction.
+SLOW = ("frictionless impact", "reset impact", "falling friction")
 
 
 @pytest.fixture(scope="module")
@@ -437,7 +438,7 @@ def test_a_batch_of_ledgers_equals_a_loop(paper_scene):
             np.testing.assert_allclose(line[lane], alone[name], atol=1e-10, err_msg=name)
 
 
-@eqx.filter_jit
+@compiled
 def entered_with_mistakes(scene, wrong, lost_impacts, t1):
     """A trajectory by its own physics, as lanes of a map are followed, but entered as if another scene's."""
     method, mechanics, mistaken = fj.EventExact(), mechanics_about_sliding(scene), mechanics_about_sliding(wrong)

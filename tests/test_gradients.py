@@ -236,8 +236,9 @@ def test_refusals(options, error, fragments):
         assert fragment in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_a_structure_of_ones_own_takes_part():
-    """Parameters of a builder that is not fivjax's are parameters like any other."""
+    """Parameters of a builder that is not fivjax's are parameters like any other: as in the closed forms above, by `derivatives`."""
     scene = fj.Scene(point_mass(1.0, 0.1), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
     start = ([0.0, 0.0], [0.5, 0.0])
     d = fj.derivatives(measure.last_state, scene, ["stiffness", "damping"], 1.0, 1.0, y0=start, method=FEW)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from catalogue import steady
 
 import fivjax as fj
 
 SCENES = {
-    "mode coupling": fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.5), 3.0, fj.ConstantLoad(100.0)),
-    "negative slope": fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.1, 0.5), 0.5, fj.ConstantLoad(100.0)),
+    "mode coupling": fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.5), 3.0, steady()),
+    "negative slope": fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.1, 0.5), 0.5, steady()),
 }
 
 

@@ -21,12 +21,6 @@ def shown(notebook) -> str:
     return "\n".join(said)
 
 
-@pytest.fixture(scope="module")
-def compiled(request):
-    """A cache of compiled code that the notebooks share, kept for the next run of the tests."""
-    return request.config.cache.mkdir("compiled")
-
-
 # What each must show: a number of the paper's, a picture, a parameter that is found again.
 MUST_SHOW = {
     "01_quickstart": [
@@ -61,10 +55,9 @@ SLOW = (
 @pytest.mark.parametrize(
     "path", [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in SLOW), id=path.stem) for path in NOTEBOOKS]
 )
-def test_notebook_runs(path, compiled, monkeypatch):
+def test_notebook_runs(path, monkeypatch):
+    """In a process of its own, which finds what other tests have compiled (see `conftest`)."""
     monkeypatch.setenv("FIVJAX_SMALL", "1")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(compiled))
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
     # The package under test, wherever it lies.
     root = str(FOLDER.parent)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])))

@@ -1,6 +1,5 @@
 """The batch stepper: the same motion as by the oracle and by the series stepper, through every kind of event."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +9,12 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
+from fivjax.foundation.compiling import compiled
 from fivjax.maps.progress import next_step_end
 from fivjax.steppers.windowed import Windowed
 
 
-@eqx.filter_jit
+@compiled
 def begun(method, scene, y):
     mechanics = Mechanics(scene)
     return method.prepare(mechanics), status_from_forces(mechanics, scene.load(0.0), y)
@@ -25,7 +25,7 @@ def at_rest(scene) -> np.ndarray:
     return np.concatenate([q, np.zeros_like(q)])
 
 
-@eqx.filter_jit
+@compiled
 def advanced(method, prepared, scene, contact, y, t, t1):
     end = jnp.minimum(next_step_end(scene.load, t, method.dt), t1)
     after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t, True)

@@ -9,6 +9,7 @@ from catalogue import LOW_ORDER, QUICK, steady
 
 import fivjax as fj
 from fivjax.contact import Status
+from fivjax.foundation.compiling import compiled
 
 CASES = {
     "detachment": ({"mu": 0.227, "belt_speed": 3.0, "p": 1.3}, 0.5),
@@ -157,7 +158,7 @@ def test_batch_equals_loop(paper_scene):
         return run.displacement, run.status
 
     with jax.enable_x64(True):
-        displacement, status = jax.jit(jax.vmap(end))(kicks)
+        displacement, status = compiled(jax.vmap(end))(kicks)
     for i, p in enumerate(kicks):
         alone = fj.simulate(paper_scene.replace(p=p), 0.3, 0.05, LOW_ORDER)
         # Vectorised arithmetic is ordered differently; the rounding grows through events.

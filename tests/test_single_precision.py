@@ -1,12 +1,12 @@
 """`EventExact` on a scene in float32: its series must neither overflow nor vanish, and thresholds must know its rounding."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.foundation.compiling import compiled
 from fivjax.simulation.start import start_state
 from fivjax.simulation.trajectory import states_at
 from fivjax.steppers.base import MOST_ADVANCES
@@ -14,7 +14,7 @@ from fivjax.steppers.base import MOST_ADVANCES
 T1 = 0.3
 
 
-@eqx.filter_jit
+@compiled
 def ends(scene: fj.Scene, y0, instants):
     return states_at(scene, fj.EventExact(), y0, instants, MOST_ADVANCES)[0]
 

@@ -1,7 +1,6 @@
 """Both steppers against closed forms, against each other, and in a plain `diffrax.diffeqsolve`."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +11,14 @@ from catalogue import LOW_ORDER
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
 from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.foundation.compiling import compiled
 from fivjax.steppers.core import follow
 
-# One of each order, and others of the same orders.
-RUNGE_KUTTA = [diffrax.Heun, diffrax.Bosh3, diffrax.Tsit5, diffrax.Dopri8]
+# Of the lowest order, of the default one and of the highest; others are compiled anew, too.
+RUNGE_KUTTA = [diffrax.Heun, diffrax.Tsit5, diffrax.Dopri8]
 RUNGE_KUTTA += [
-    pytest.param(solver, marks=pytest.mark.slow) for solver in (diffrax.Midpoint, diffrax.Ralston, diffrax.Dopri5)
+    pytest.param(solver, marks=pytest.mark.slow)
+    for solver in (diffrax.Midpoint, diffrax.Ralston, diffrax.Bosh3, diffrax.Dopri5)
 ]
 
 
@@ -36,13 +37,13 @@ def point_mass(mu=0.0, mu_static=None, stiffness=1.0, belt_speed=0.0, force=1.0,
     return fj.Scene(structure, friction, belt_speed, fj.ConstantLoad(force), restitution=restitution)
 
 
-@eqx.filter_jit
+@compiled
 def begun(scene, y):
     mechanics, load = Mechanics(scene), scene.load(0.0)
     return mechanics, load, status_from_forces(mechanics, load, y)
 
 
-@eqx.filter_jit
+@compiled
 def advanced(method, mechanics, contact, load, y, h):
     return method.advance(mechanics, contact, load, y, h)
 
@@ -294,7 +295,7 @@ def test_a_load_that_jumps_at_rest_does_not_lengthen_the_first_step():
     with jax.enable_x64(True):
         sliding = Contact(jnp.asarray(1, jnp.int32), jnp.asarray(1.0))
 
-        @jax.jit
+        @compiled
         def moved(y, h):
             mechanics = mechanics_about_sliding(scene)
             return follow(fj.EventExact(), mechanics, sliding, jnp.asarray(20.0), y, h, kind="lax").y

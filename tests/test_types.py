@@ -18,11 +18,21 @@ sys.modules["checker"] = checker
 
 ROOMS = ["foundation", "model", "contact", "steppers", "linear", "simulation", "cycles"]
 PROOFS = ["verdicts." + name for name in ("capture", "sliding_proof", "sticking_proof", "verdict")]
+
+# What an earlier test traced is not looked for: the checker is at work while JAX traces.
+def not_kept(path):
+    raise FileNotFoundError(path)
+
+
 with install_import_hook(["fivjax." + name for name in ROOMS + PROOFS], "checker.checked"):
     for name in [*ROOMS, "verdicts"]:
         room = importlib.import_module("fivjax." + name)
         for module in pkgutil.iter_modules(room.__path__, room.__name__ + "."):
             importlib.import_module(module.name)
+
+from fivjax.foundation import kept_programs
+
+kept_programs._read = not_kept
 """
 
 WORK = """

@@ -9,6 +9,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.contact import Contact
+from fivjax.foundation.compiling import compiled
 from fivjax.maps.section import ReturnMaps, Section
 from fivjax.maps.sharing import Batch, shared_by
 from fivjax.maps.tori import section_at
@@ -96,6 +97,6 @@ def test_the_peak_of_an_advance_may_be_at_its_end(maps):
             speeds = jax.numpy.abs(inside[:, 3])
             return peak, jax.numpy.max(speeds), jax.numpy.argmax(speeds)
 
-        peak, sampled, place = map(np.asarray, jax.jit(jax.vmap(both))(y, h))
+        peak, sampled, place = map(np.asarray, compiled(jax.vmap(both))(y, h))
     assert np.any(place == 399) and np.any((place > 0) & (place < 399))
     assert np.all(peak >= sampled * (1 - 1e-12)) and np.all(peak <= sampled * (1 + 1e-4))
