@@ -5,9 +5,9 @@
 FOLDER holds the matrices (BrakeSqueal 0.1; Gräbner, Mehrmann, Quraishi, Schröder, von Wagner, ZAMM 96, 2016); unless given, it
 is `brake` in the folder that FIVJAX_DATA names, else in `../shared/data`.
 
-The reference: the undamped modes of the elastic springs alone give first guesses, by a dense solution in their span; Newton's method on
-(λ²M + λC + K) x = 0 with the length of x fixed then solves each to rounding. It shares neither the linear problem, nor the
-operator, nor the iteration with what is measured.
+The reference: the undamped modes of the elastic springs alone give first guesses, by a dense solution in the space that they span;
+Newton's method on (λ²M + λC + K) x = 0 with the length of x fixed then solves each to rounding. It shares neither the linear problem,
+nor the operator, nor the iteration with the function that is measured.
 """
 
 import os
@@ -46,7 +46,7 @@ def brake(p: dict, speed: float) -> fj.cea.Pencil:
 
 
 def speed_derivative(p: dict, speed: float) -> fj.cea.Pencil:
-    """How it changes with the speed."""
+    """The derivative of the pencil by the speed."""
     return fj.cea.Pencil(0 * p["M"], p["DG"] - p["DR"] / speed**2, 2 * speed * p["KGEO"])
 
 
@@ -71,7 +71,7 @@ def reference(pencil: fj.cea.Pencil, elastic, frequencies, modes: int = 40) -> t
 
 
 def newton(pencil: fj.cea.Pencil, value: complex, shape: np.ndarray) -> tuple[complex, float]:
-    """The eigenvalue that Newton's method comes to from a guess, and its residual relative to the size of the terms."""
+    """The eigenvalue that Newton's method reaches from a guess, and its residual relative to the size of the terms."""
     for _ in range(12):
         # (λ²M + λC + K) dx + (2λM + C) x dλ = -(λ²M + λC + K) x, and x keeps its length.
         factors = splu(pencil.at(value), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
@@ -93,7 +93,7 @@ def measure(folder: Path) -> dict:
     seconds = time.perf_counter() - begun
     wanted, residuals = reference(pencil, p["K1"], (785.0, 2769.0))
     places = [int(np.argmin(np.abs(modes.eigenvalues - value))) for value in wanted]
-    # From three other speeds; at this one it was never told anything.
+    # The basis is from three other speeds; none of it is from this one.
     points = [fj.cea.complex_modes(brake(p, speed), up_to=3000.0) for speed in (2 * np.pi, 6 * np.pi, 20 * np.pi)]
     basis = fj.cea.shape_basis(pencil, *points, coordinates=60)
     small = fj.cea.complex_modes(pencil.projected(basis), up_to=3500.0).eigenvalues

@@ -1,9 +1,9 @@
-"""What branches of limit cycles are good for, against an ODE solver and the independent solver in `reference`.
+"""Branches of limit cycles against an ODE solver and the independent solver in `reference`.
 
     python tests/measure_branches.py [benchmark_a] [births] [cost]
 
-`benchmark_a`: both ends of the unstable branch of benchmark A. `births`: the friction at which the paper's limit cycle is born
-at belt speeds 1 and 3, and what the independent solver does 1e-4 above and below it. `cost`: seconds for a branch, once its
+`benchmark_a`: both ends of the unstable branch of benchmark A. `births`: the friction at which the paper's limit cycle appears
+at belt speeds 1 and 3, and the independent solver's motions 1e-4 above and below it. `cost`: seconds for a branch, once its
 programs are compiled.
 """
 
@@ -40,7 +40,7 @@ def of_benchmark_a() -> None:
 
 
 def started(belt_speed: float) -> tuple[fj.Scene, fj.LimitCycle]:
-    """A scene of the paper's with its limit cycle; at 3 m/s a large kick of little friction leads to it."""
+    """The paper's scene with its limit cycle; at 3 m/s a large kick at low friction leads to it."""
     if belt_speed == 1.0:
         scene = paper(1.0, 0.2)
         return scene, fj.limit_cycle(scene)

@@ -1,4 +1,4 @@
-"""How well parameters are recovered, and what it costs: `python tests/measure_calibration.py`.
+"""Errors of recovered parameters, and the time of a calibration: `python tests/measure_calibration.py`.
 
     python tests/measure_calibration.py [recovery] [quiet] [cost] [--draws=100] [--case="limit cycle"] [--free=3]
 

@@ -1,7 +1,7 @@
 """Measure the linear theory: `python tests/measure_cea.py`.
 
-Prints what the library finds beside an independent route (Eq. 3 typed out, NumPy's eigenvalues, SciPy's `brentq`; see
-`linear_reference`), and how long it takes. What needs simulated transients is measured elsewhere.
+Prints the library's results beside those of independent routes (Eq. 3 typed out, NumPy's eigenvalues, SciPy's `brentq`; see
+`linear_reference`), and the time they take.
 """
 
 import time

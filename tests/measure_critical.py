@@ -4,7 +4,7 @@
 
 `table2`: the kicks of Table 2, by Newton's method and by bisection with the independent solver. `random`: the same for ten
 random structures. `derivatives`: all of them at two points of each kind against differences of the independent solver's kicks.
-`cost`: how long the derivatives take, in trajectories.
+`cost`: the time of the derivatives, in units of a trajectory.
 """
 
 import argparse
@@ -25,7 +25,7 @@ def paper(belt_speed: float, **others) -> fj.Scene:
 
 
 def static(belt_speed: float, mu: float) -> fj.Scene:
-    """Static friction above kinetic friction: what just touches sticking squeals."""
+    """Static friction above kinetic friction: a motion that just touches sticking squeals."""
     return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu, mu_static=0.5), belt_speed=belt_speed, load=fj.Pulse(p=1.2))
 
 
@@ -97,7 +97,7 @@ def derivatives() -> None:
         print(f"  {found.kind.values} at v = {speed:g}: {p:.12f}, the reference's bracket {low:.12f} to {high:.12f}")
         for name in differentiable(scene):
             value, slope = float(scene.parameters[name]), float(found.d_p_crit.sel(parameter=name))
-            # So little that p_crit stays smooth (further away another swing touches first), and far above its rounding.
+            # So small that p_crit is smooth (farther away another oscillation touches first), and far above its rounding.
             by = min(1e-3 * (abs(value) or 1.0), 2e-6 / max(abs(slope), 1e-12))
             difference = extrapolated(scene, name, p, slope, by)
             apart = abs(slope - difference)

@@ -117,7 +117,7 @@ def paper() -> None:
 
 
 def critical() -> None:
-    """Energy at the end of the critical kick: what the load put in, what the contact did, and what vibrates."""
+    """Energy at the end of the critical kick: the work of the load, the work of the contact, and the energy of the vibration."""
     for v, p in ((0.5, 1.0536), (1.0, 1.1072), (1.5, 1.1608), (3.0, 1.19028238), (10.0, 1.19028238)):
         run = fj.simulate(scene(belt_speed=v, p=p), 0.1, 0.1, energy=True)
         y = np.concatenate([run.displacement[-1], run.velocity[-1]])

@@ -1,4 +1,4 @@
-"""Who runs a map's jobs: the same bits everywhere, workers that are killed, what processes and Dask cost, store and memory.
+"""Executors of a map's jobs: the same bits everywhere, workers that are killed, the cost of processes and Dask, store and memory.
 
     python tests/measure_executors.py [overhead] [killed] [killed_dask] [size]
 
@@ -117,7 +117,7 @@ def killed_dask() -> None:
     import dask
     from distributed import Client, LocalCluster
 
-    # Else a worker that takes longer to come back is not expected any more; `cluster.adapt` would have another.
+    # Otherwise a worker that takes longer to come back is given up; `cluster.adapt` would start another one.
     dask.config.set({"distributed.deploy.lost-worker-timeout": "2m"})
     with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         # A nanny gives up on a worker that dies before it has begun.

@@ -1,4 +1,4 @@
-"""What holds at the extremes: the table and figures of `docs/measurements.md`.
+"""Extreme parameters: the table and figures of `docs/measurements.md`.
 
     python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [resume] [refusals]
 

@@ -1,9 +1,9 @@
-"""The README's map on an accelerator, against the same on the CPU of the same machine: everything in one run.
+"""The README's map on an accelerator, compared with the same map on the CPU of that machine, in one run.
 
     python tests/measure_gpu.py [points of a side, such as 64 256 1024]
 
-On a machine without one it measures the CPU against itself. A verdict that differs is looked at: within 1e-9 of the critical kick
-rounding decides, elsewhere it is an error.
+On a machine without an accelerator it compares the CPU with itself. Verdicts that differ are checked: within 1e-9 of the critical kick
+rounding decides, elsewhere a difference is an error.
 """
 
 import os
@@ -23,7 +23,7 @@ ROUNDING = 1e-9
 
 
 def measured(points: int) -> dict[str, np.ndarray]:
-    """Wall times of the first and two more maps, and what the last one says."""
+    """Wall times of the first and two more maps, and the results of the last one."""
     seconds = []
     for _ in range(3):
         begin = time.perf_counter()

@@ -118,7 +118,7 @@ def start() -> None:
 
 
 def memory() -> None:
-    """What a map adds to the memory of a process that has compiled all it needs, at its highest, per trajectory."""
+    """The largest additional memory of a map, per trajectory, in a process that has compiled everything."""
 
     def resident() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
@@ -139,7 +139,7 @@ def memory() -> None:
 
 
 def roofline() -> None:
-    """Arithmetic and traffic of a step of a map's trajectories, by XLA's own count, against what one core can do."""
+    """Arithmetic and memory traffic of a step of a map's trajectories, by XLA's count, compared with the speed of the machine."""
     import jax
     import jax.numpy as jnp
 

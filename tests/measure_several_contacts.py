@@ -1,9 +1,9 @@
-"""What several contacts cost: processor time per trajectory and cycle, on the limit cycle, relative to one contact.
+"""The cost of several contacts: processor time per trajectory and cycle, on the limit cycle, relative to one contact.
 
     python tests/measure_several_contacts.py [counts ...]
 
-Copies of the paper's oscillator stand in one structure, uncoupled (each has events of its own) or with their neighbours
-coupled in the mass matrix (`coupled`). Processor time, least of three runs after compilation.
+One structure contains copies of the paper's oscillator, uncoupled (each has events of its own) or with neighbours coupled in the mass
+matrix (`coupled`). Processor time is the least of three runs after compilation.
 """
 
 import sys

@@ -17,7 +17,7 @@ import fivjax as fj
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 TRAJECTORIES = 2000
-# What slides counts as this much larger, so that the search goes on to what squeals.
+# The size of a perturbation that slides is multiplied by this, so that the search goes on to those that squeal.
 SLIDES = 10.0
 
 
@@ -101,7 +101,7 @@ def history() -> None:
     duration = float(SCENE.load.duration) / pieces
 
     def scene_of(x):
-        # The reference knows one pulse: piece by piece, each from where the last one ended. All of this slides.
+        # The reference takes a single pulse, so the history is followed piece by piece; all of it slides.
         base = reference.paper_scene(belt_speed=1.0)
         rest = reference.linear({**base, "p": 1.0}).q_eq
         q, v = rest, np.zeros(3)

@@ -1,4 +1,4 @@
-"""Where the time of a later `fivjax map` goes, from the start of the process: imports, tracing, lowering, the cache, the map.
+"""The parts of the time of a later `fivjax map`, from the start of the process: imports, tracing, lowering, the cache, the map.
 
     python tests/measure_start.py
 
@@ -19,7 +19,7 @@ import fivjax as fj  # noqa: E402
 
 
 def parts() -> None:
-    """Where the time of the first and second map of a process goes."""
+    """The parts of the time of the first and the second map of a process."""
     seconds, counts = collections.Counter(), collections.Counter()
 
     def heard(event: str, duration: float, **_) -> None:

@@ -1,8 +1,8 @@
-"""The gallery of `docs/validation.md`: numbers that are published or follow from a formula, and what fivjax finds.
+"""The gallery of `docs/validation.md`: numbers that are published or follow from a formula, and those of fivjax.
 
     python tests/measure_validation.py [closed] [benchmark] [linear] [cycles] [bifurcation]
 
-Each word picks one study; without any, all run (some minutes on two cores). What has a script of its own is not repeated here:
+Each word picks one study; without any, all run (some minutes on two cores). Studies with a script of their own are not repeated here:
 Table 2 (`measure_maps.py table2`), energies (`measure_energy.py`), derivatives (`measure_gradients.py`), the paper's figures
 (`fivjax reproduce`).
 """

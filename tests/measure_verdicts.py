@@ -1,5 +1,5 @@
-"""Verdicts and amplitudes of maps against the independent solver in `reference`, which runs each lane until it fades for
-certain or for ten thousand periods.
+"""Verdicts and amplitudes of maps against the independent solver in `reference`, which follows each trajectory until it is
+certain to fade, or for ten thousand periods.
 
     python tests/measure_verdicts.py random [--structures N] [--kicks K] [--seed S]
     python tests/measure_verdicts.py cases [ghost] [invented] [single] [kick] [growth] [amplitudes]
@@ -7,8 +7,8 @@ certain or for ten thousand periods.
     python tests/measure_verdicts.py maps [--side N]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value;
-`folds` looks just below the friction where the paper's limit cycle ends; `maps` at the paper's map at belt speeds 1 and
-0.5; `cases` at scenes that were once answered wrongly. `--threads` is for the reference alone.
+`folds` tries friction just below that at which the paper's limit cycle ends; `maps` the paper's map at belt speeds 1 and
+0.5; `cases` scenes that once had wrong verdicts. `--threads` is for the reference only.
 """
 
 import argparse
@@ -28,9 +28,9 @@ NEAR = 1e-2  # relative distance from the critical friction that counts as near 
 
 @dataclasses.dataclass
 class Tally:
-    """What came of comparing lanes: counts, apart for lanes near the stability limit and away from it."""
+    """Counts of compared trajectories, in part separately for those near the stability limit and away from it."""
 
-    lanes: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
+    trajectories: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
     undecided: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
     chaotic: dict = dataclasses.field(default_factory=lambda: {"near": 0, "away": 0})
     failed: int = 0
@@ -41,19 +41,19 @@ class Tally:
     fading_cycles: int = 0
     quiet_cycles: int = 0
     amplitudes: list = dataclasses.field(default_factory=list)
-    untold: int = 0
+    given_up: int = 0
     examples: list = dataclasses.field(default_factory=list)
     map_time: float = 0.0
     reference_time: float = 0.0
 
     def add(self, scenes, verdict, amplitude, near=False, name="", threads=1, chaotic=False):
-        """Compare lanes (dictionaries of `reference`, codes, m/s); returns what the reference says."""
+        """Compare trajectories (dictionaries of `reference`, verdict codes, amplitudes in m/s); returns the fates by reference."""
         began = time.perf_counter()
         truth = judged(scenes, threads)
         self.reference_time += time.perf_counter() - began
         side = "near" if near else "away"
         verdict, amplitude = np.ravel(verdict), np.ravel(amplitude)
-        self.lanes[side] += len(verdict)
+        self.trajectories[side] += len(verdict)
         self.undecided[side] += int((verdict == -1).sum())
         self.chaotic[side] += int(np.sum(chaotic))
         self.failed += int((verdict < -1).sum())
@@ -67,14 +67,14 @@ class Tally:
         wrong_cycle = said_cycle & known & (fades | (truth.fate == "unbounded"))
         self.sliding += int(said_sliding.sum())
         self.cycles += int(said_cycle.sum())
-        self.untold += int((~known).sum())
+        self.given_up += int((~known).sum())
         self.false_sliding += int(wrong_sliding.sum())
         self.false_cycles += int(wrong_cycle.sum())
         self.fading_cycles += int((said_cycle & fading & ~quiet).sum())
         self.quiet_cycles += int((said_cycle & quiet).sum())
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.abs(amplitude / truth.amplitude - 1.0)
-        # A reference that still grows after ten thousand periods has not come to the attractor yet.
+        # A reference run that still grows after ten thousand periods has not reached its attractor yet.
         both = said_cycle & lives & ~fading & ~(lives & truth.growing)
         self.amplitudes += error[both].tolist()
         for kind, where in (
@@ -95,7 +95,8 @@ class Tally:
         errors = np.array(self.amplitudes or [0.0])
         for line in self.examples[:examples]:
             print("   ", line)
-        print(f"lanes: {sum(self.lanes.values())}; called sliding: {self.sliding}; called limit cycle: {self.cycles}")
+        total = sum(self.trajectories.values())
+        print(f"trajectories: {total}; called sliding: {self.sliding}; called limit cycle: {self.cycles}")
         print(f"called sliding, but sustained: {self.false_sliding}")
         print(f"called limit cycle, but slide in the end (or grow without bound): {self.false_cycles}")
         print(f"called limit cycle, still shrinking after ten thousand periods: {self.fading_cycles}")
@@ -104,20 +105,20 @@ class Tally:
         print(
             f"> 3 %: {int((errors > 0.03).sum())}, > 50 %: {int((errors > 0.5).sum())}, largest {100 * errors.max():.3g} %"
         )
-        for side, lanes in self.lanes.items():
+        for side, count in self.trajectories.items():
             open_, chaotic = self.undecided[side], self.chaotic[side]
-            share = 100.0 * (open_ - chaotic) / max(lanes, 1)
+            share = 100.0 * (open_ - chaotic) / max(count, 1)
             place = "near" if side == "near" else "away from"
             print(
-                f"undecided {place} the stability limit: {open_} of {lanes}, {chaotic} of them named chaotic; "
+                f"undecided {place} the stability limit: {open_} of {count}, {chaotic} of them named chaotic; "
                 f"others {share:.2f} %"
             )
-        print(f"failed in the map: {self.failed}; given up by the reference: {self.untold}")
+        print(f"failed in the map: {self.failed}; given up by the reference: {self.given_up}")
         print(f"time: maps {self.map_time:.0f} s, reference {self.reference_time:.0f} s")
 
 
 def judged(scenes, threads=1):
-    """The reference's fates; what still shrinks after ten thousand periods is given ten times as many."""
+    """The reference's fates; runs that still shrink after ten thousand periods get ten times as many."""
     truth = reference.fate(scenes, threads=threads)
     slow = np.flatnonzero((truth.fate == "sustained") & truth.shrinking)
     if len(slow):
@@ -127,16 +128,16 @@ def judged(scenes, threads=1):
     return truth
 
 
-def lanes_of(scene, **axes):
-    """The dictionaries of a map's lanes, in the order of its verdicts."""
+def scenes_of(scene, **axes):
+    """The dictionaries of a map's trajectories, in the order of its verdicts."""
     base = reference.of_scene(scene)
     grids = np.meshgrid(*axes.values(), indexing="ij")
     out = []
     for values in zip(*(g.ravel() for g in grids), strict=True):
-        lane = {**base, **{name: float(value) for name, value in zip(axes, values, strict=True)}}
+        one = {**base, **{name: float(value) for name, value in zip(axes, values, strict=True)}}
         if "mu" in axes:
-            lane["mu_static"] = lane["mu"]
-        out.append(lane)
+            one["mu_static"] = one["mu"]
+        out.append(one)
     return out
 
 
@@ -146,7 +147,7 @@ def compare(tally, scene, near=False, name="", threads=1, **axes):
     found = fj.bistability_map(scene, progress=False, **axes)
     tally.map_time += time.perf_counter() - began
     said = found["verdict"].values, found["amplitude"].values
-    truth = tally.add(lanes_of(scene, **axes), *said, near, name, threads, found["chaotic"].values)
+    truth = tally.add(scenes_of(scene, **axes), *said, near, name, threads, found["chaotic"].values)
     return found, truth
 
 
@@ -154,7 +155,7 @@ def compare(tally, scene, near=False, name="", threads=1, **axes):
 
 
 def draw(rng, near):
-    """A structure and scene: returns the scene, and a line that makes it again."""
+    """A random structure and scene: the scene, and a line of text from which it can be made again."""
 
     def log(low, high):
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -216,16 +217,16 @@ def paper(mu, v, p=1.2, duration=0.1, **parts):
     return fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(mu=mu), belt_speed=v, load=fj.Pulse(100.0, p, duration))
 
 
-# Where the last cycle ends, by `fold`. Shorter runs than its 10,000 periods put the first at 0.1156: what lives on below
-# the fold then are fades that take thousands of periods (at 0.1163, 14,700).
+# The friction at which the last cycle ends, by `fold`. With runs shorter than its 10,000 periods, the first would be 0.1156,
+# because motions below the fold take thousands of periods to fade (14,700 at 0.1163).
 FOLDS = {0.3: 0.1163086, 0.5: 0.1265326, 1.0: 0.1679663, 1.7: 0.0219359, 3.0: 0.0219359}
 
 
 def fold(v, tolerance=2e-6):
     """The friction below which no cycle is left at this belt speed: followed down from 0.2 by the reference.
 
-    At each friction the runs start where those that lived at the last one were, spread over one of its periods of
-    beating; a step in friction that kills all of them is halved.
+    At each friction the runs start from states of those that were sustained at the last one, spread over a period of its
+    beating; a step in friction at which none is sustained is halved.
     """
     mu, step = 0.2, 0.01
     kicked = [reference.paper_scene(mu=mu, belt_speed=v, p=p) for p in (2.0, 3.0, 4.0, 6.0)]
@@ -288,15 +289,15 @@ def maps(side, threads):
 
 
 def ghost():
-    """31 lanes and 32 lanes just below a fold: all slide."""
+    """31 and 32 trajectories just below a fold: all slide."""
     for n in (31, 32):
         tally = Tally()
         compare(tally, paper(0.163, 1.0), p=np.linspace(3.0, 6.0, n))
-        yield f"{n} lanes", tally.false_cycles == 0 and tally.cycles == 0, f"{tally.cycles} called limit cycle"
+        yield f"{n} trajectories", tally.false_cycles == 0 and tally.cycles == 0, f"{tally.cycles} called limit cycle"
 
 
 def invented():
-    """Critical kicks where none squeals."""
+    """No critical kick is stated where no kick squeals."""
     for mu, v in ((0.163, 1.0), (0.166, 1.0), (0.1235, 0.5), (0.114, 0.3)):
         found = fj.critical_perturbation(paper(mu, v), progress=False)
         truth = judged([reference.paper_scene(mu=mu, belt_speed=v, p=p) for p in np.linspace(1.0, 5.0, 401)])
@@ -313,12 +314,12 @@ HEAVY = dict(m1=1.2, m2=0.014, c1=29.0, c2=0.125, k1=56.8e3, k2=61.4e3, theta=0.
 
 
 def single():
-    """A lane by itself that decays slowly with friction and fast without."""
+    """A single trajectory that decays slowly with friction and fast without."""
     yield from _one(paper(0.0981, 1.0, **HEAVY), 2.0)
 
 
 def kick():
-    """Returns that are seen under a long kick's load say nothing about what comes after it."""
+    """Recurrence under the load of a long kick proves nothing about the motion after it."""
     yield from _one(paper(0.1, 1.0, duration=5.0), 0.02)
 
 
@@ -337,7 +338,7 @@ GROWING = dict(m1=0.0503917, m2=0.00479466, c1=0.702084, c2=0.0546901, k1=47563.
 
 
 def growth():
-    """Just above the stability limit small motions grow so slowly that no event comes for seconds: no limit cycle yet."""
+    """Just above the stability limit small motions grow so slowly that there is no event for seconds: no limit cycle yet."""
     mu = float(fj.cea.critical_friction(fj.belt_oscillator(**GROWING))) * (1.0 + 1.7e-4)
     tally = Tally()
     scene = paper(mu, 1.164, **GROWING)
@@ -351,20 +352,20 @@ def growth():
         early == off == tally.false_cycles == tally.false_sliding == 0,
         (
             f"{tally.cycles} called limit cycle, {early} of them more than ten periods after the last event, "
-            f"{off} with an amplitude that is not theirs"
+            f"{off} with a wrong amplitude"
         ),
     )
 
 
 def amplitudes():
-    """Two cycles coexist: each lane has its own amplitude, whatever runs beside it."""
+    """Two cycles coexist: each trajectory has the amplitude of its own cycle, whatever else is in the map."""
     for n in (31, 32):
         tally = Tally()
         found, truth = compare(tally, paper(0.227, 0.5), p=np.linspace(1.0537, 1.0545, n))
         off = np.array(tally.amplitudes)
         here, there = np.unique(np.round(found["amplitude"], 4)), np.unique(np.round(truth.amplitude, 4))
         yield (
-            f"{n} lanes",
+            f"{n} trajectories",
             bool((off < 0.01).all()) and tally.false_cycles == 0,
             f"map {here[:4]}, reference {there[:4]}",
         )
@@ -374,7 +375,7 @@ CASES = dict(ghost=ghost, invented=invented, single=single, kick=kick, growth=gr
 
 
 def cases(names):
-    """Scenes that were once answered wrongly."""
+    """Scenes that once had wrong verdicts."""
     for name in names or CASES:
         for label, right, told in CASES[name]():
             print(f"{'right' if right else 'WRONG'}  {name} {label}: {told}", flush=True)

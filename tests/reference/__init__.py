@@ -1,8 +1,8 @@
-"""An independent event-exact solver in C++ and what it found: what verdicts and limit cycles are compared with.
+"""An independent event-exact solver in C++, and its results: the reference for verdicts and limit cycles.
 
-Nothing is shared with the library under test, nor with `oracle.py` (which it is itself compared with). `trajectory`
-follows one scene, `fate` many scenes until they fade for certain or for ten thousand periods. A scene is a dictionary
-(see `SCENE`); `of_scene` makes one from an `fj.Scene`, `paper_scene` from the paper's parameters.
+It shares no code with the library under test, nor with `oracle.py` (with which it is itself compared). `trajectory` follows one
+scene, `fate` many scenes until they are certain to fade, or for ten thousand periods. A scene is a dictionary (see `SCENE`);
+`of_scene` makes one from an `fj.Scene`, `paper_scene` from the paper's parameters.
 
 The C++ is compiled when it is first used, into a temporary folder; `available()` says whether there is a compiler.
 """
@@ -34,8 +34,8 @@ TROUBLES = (
     "steps",
 )
 
-# What a scene holds, with what is taken where it is left out. `y0` is (displacement, velocity), `deviation` the same with
-# displacements from the sliding equilibrium. Friction is constant unless `decay` is given.
+# The entries of a scene, with their defaults. `y0` is (displacement, velocity), `deviation` the same with displacements from the
+# sliding equilibrium. Friction is constant unless `decay` is given.
 SCENE = dict(
     mass=None, damping=None, stiffness=None, load_direction=None, tangential=0, normal=2,
     mu=None, mu_static=None, mu_dynamic=None, decay=None, belt_speed=3.0,
@@ -207,11 +207,11 @@ def _linear(data):
 
 
 def _modal(data, modal):
-    """What proves that a small motion fades: modal amplitudes |c_j| = |W z|_j, and how far they reach.
+    """The data of the proof that a small motion fades: modal amplitudes |c_j| = |W z|_j, and their effect on N and slip speed.
 
-    With constant friction |c_j| falls by itself: sliding goes on for ever where the sum of what all modes can do to N
-    and to the slip speed is less than what either has. With falling friction d|c|/dt <= -rate |c| + quadratic |c|^2 in
-    the sum norm, while the slip speed keeps at least half of the belt's.
+    With constant friction |c_j| decays: sliding goes on for ever if the sum of the largest effects of all modes on N and on the
+    slip speed is less than the values at equilibrium. With falling friction d|c|/dt <= -rate |c| + quadratic |c|^2 in the sum
+    norm, as long as the slip speed is at least half of the belt speed.
     """
     modal["modes"] = modal["usable"] = 0
     lin = _linear(data)
@@ -258,14 +258,13 @@ def slow_period(scene):
 
 @dataclass
 class Fates:
-    """Where the runs of `fate` end; arrays over the scenes.
+    """The ends of the runs of `fate`; arrays over the scenes.
 
-    `fate`: "slides" (no contact event can come any more), "sustained" (still moving at the end; `late_events` are those
+    `fate`: "slides" (no further contact event is possible), "sustained" (still moving at the end; `late_events` are those
     of the last tenth), "unbounded" or "gave up" (`trouble` says why). `amplitude` is the largest |tangential velocity|
-    in the last tenth, `amplitudes` in each of the last ten tenths; `forward` is the largest tangential velocity, its sign
-    kept. `section` is the last upward crossing of v_t = 0:
-    time, displacement from the equilibrium, velocity. `shrinking`: the largest speed of the last tenth is below that of
-    the tenths before it by more than a part in 1e6, and they fall one after another.
+    in the last tenth, `amplitudes` in each of the last ten tenths; `forward` is the largest tangential velocity with its sign.
+    `section` is the last upward crossing of v_t = 0: time, displacement from the equilibrium, velocity. `shrinking`: the largest
+    speed of the last tenth is below that of the tenths before it by more than a part in 1e6, and they fall one after another.
     """
 
     fate: np.ndarray
@@ -288,7 +287,7 @@ class Fates:
 
     @property
     def growing(self):
-        """The same the other way round: the run has not come to its attractor yet."""
+        """The same for growth: the run has not reached its attractor yet."""
         rises = np.diff(self.amplitudes[:, -5:], axis=1) > 1e-6 * self.amplitudes[:, -1:]
         return np.all(rises, axis=1)
 
@@ -299,10 +298,10 @@ class Fates:
 
 
 def fate(scenes, periods=10_000.0, more=100.0, threads=1, t_max=None):
-    """Run each scene until it fades for certain, or for so many of its slow periods (or `t_max` seconds).
+    """Run each scene until it is certain to fade, or for so many of its slow periods (or `t_max` seconds).
 
-    A run that has slid through its whole last tenth without an event goes on, up to `more` times as far, until it is
-    proved to fade or has an event.
+    A run that has slid without an event for its whole last tenth goes on, up to `more` times as long, until it is proved to fade
+    or has an event.
     """
     library = _library()
     data = _filled(scenes)
@@ -383,9 +382,9 @@ def trajectory(scene, t_end, times=(), max_events=100_000, max_crossings=100_000
 
 
 def crossing_map(scene, x, v, crossings=1, t_end=None):
-    """Start from a state (displacement from the equilibrium, velocity) and return to the section so many times.
+    """The `crossings`-th crossing of the section from a state (displacement from the equilibrium, velocity).
 
-    Returns `(time, x, v)` of the last crossing, or None where the run does not cross that often.
+    Returns its `(time, x, v)`, or None if the run does not cross that often.
     """
     start = {**scene, "y0": None, "deviation": (x, v), "p": 1.0}
     t_end = 20.0 * (crossings + 1) * slow_period(scene) if t_end is None else t_end

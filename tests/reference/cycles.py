@@ -1,6 +1,6 @@
 """Limit cycles found without the library: Benchmark A with SciPy's DOP853, the paper's oscillator with the C++ solver.
 
-`cd tests && python -m reference.cycles` finds them again and writes `cycles.json`, which the tests read.
+`cd tests && python -m reference.cycles` computes them again and writes `cycles.json`, which the tests read.
 
 Benchmark A (Papangelo, Ciavarella and Hoffmann 2017): x'' + 2 xi x' + x = mu(v - x') with
 mu(w) = mu_d + (mu_s - mu_d) exp(-w / v0); unit mass and spring, xi = 0.05, mu_d = 0.5, mu_s = 1, v0 = 0.5.
@@ -22,7 +22,7 @@ HOPF = 0.5 * np.log((MU_S - MU_D) / (DAMPING * 0.5))
 
 
 def stored():
-    """What was found, as it is written in `cycles.json`."""
+    """The results, as stored in `cycles.json`."""
     return json.loads(STORED.read_text())
 
 
@@ -52,9 +52,9 @@ def _integrate(speed, y, t, **options):
 
 
 def _meet(speed, y, of, rate_of, after=1e-3, before=20.0, until=None):
-    """State and time at the first zero of `of(y)` from below after a while, the time by Newton on new integrations.
+    """State and time at the first upward zero of `of(y)` after the time `after`; the time by Newton's method with new integrations.
 
-    None where there is none, or where `until` has a zero from below first.
+    None if there is none, or if `until` has an upward zero first.
     """
 
     def event(t, y):
@@ -121,7 +121,7 @@ def sliding_cycle(speed):
 
 
 def released(speed):
-    """Displacement and velocity where sticking ends: the spring and the damper pull as hard as friction can hold."""
+    """Displacement and velocity where sticking ends: spring and damper pull with the largest force that friction can hold."""
     return [MU_S - DAMPING * speed, speed]
 
 
@@ -151,10 +151,10 @@ def grazing_speed():
         return _friction(speed - y[1]) - DAMPING * y[1] - y[0]
 
     def short(speed):
-        """By how much the largest velocity after the release falls short of the belt's.
+        """The belt speed minus the largest velocity after the release.
 
-        Where it does not, the acceleration a that is left when the belt speed is met says how far it would have gone
-        beyond: the jerk is minus the velocity there, but for terms in a.
+        If the velocity reaches the belt speed, the excess follows from the acceleration a at that instant: the jerk there is minus
+        the velocity, except for terms in a.
         """
         # where the mass turns back; after 4 s it is on its way there
         turn = _meet(speed, released(speed), lambda y: y[1], lambda y: acceleration(y, speed), after=4.0)[1]
