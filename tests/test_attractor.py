@@ -188,6 +188,17 @@ def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monk
     assert late["attractor_amplitude"].item() == pytest.approx(known["attractor_amplitude"].item(), rel=2e-3)
 
 
+def test_a_belt_that_runs_backwards_is_the_mirrored_one(paper_scene):
+    """Seen in a mirror the belt runs the other way and the incline has the other sign; the torus is the same."""
+    mirrored = fj.Scene(fj.belt_oscillator(theta=-0.01), fj.Coulomb(0.227), -3.0, paper_scene.load)
+    here, there = (fj.bistability_map(scene, p=[1.1, 1.5], progress=False) for scene in (paper_scene, mirrored))
+    np.testing.assert_array_equal(there["verdict"], here["verdict"])
+    # Means and peaks over some hundreds of returns from starts that are not mirrored.
+    np.testing.assert_allclose(there["amplitude"], here["amplitude"], rtol=2e-3)
+    np.testing.assert_allclose(there["attractor_period"], here["attractor_period"], rtol=1e-3)
+    assert there["attractor_kind"].values.tolist() == ["torus"]
+
+
 MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)
 MANY |= dict(theta=0.2852258747704728, c1=5.276279472159822, c2=0.8020836517718353)
 PASSING = dict(m1=0.969426838229293, m2=0.010182597880315619, k1=13492.702752569177, k2=25362.931711655165)

@@ -22,7 +22,7 @@ from .sharing import Batch
 from .tori import BACK_WITHIN, BACK_WITHIN_ALONE, Torus, about, section_at, tori_among
 
 # Looks at an ensemble after which cycles are computed from where its members are.
-NEWTON_AT = (24, 64, 128, 256)
+NEWTON_AT = {24: 0.1, 64: 0.03, 128: 0.01, 256: 0.003}
 
 
 class Attractors(NamedTuple):
@@ -92,7 +92,7 @@ def search(
         looks += nominating.SEEN
         moving[running] = now.verdict == Verdict.UNDECIDED
         if looks in NEWTON_AT:
-            _add_cycles(maps, own, running, moving, now, found, members)
+            _add_cycles(maps, own, running, moving, now, found, members, NEWTON_AT[looks])
         if looks in tests:
             open_ = np.unique(running[moving[running]] // members)
             sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
@@ -115,7 +115,9 @@ def _keep(maps: ReturnMaps, new: list[tuple[int, Cycle]], found: list[Attractors
             found[k].cycles.append(cycle)
 
 
-def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int) -> None:
+def _add_cycles(
+    maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int, nearly: float
+) -> None:
     """Cycles where members are by now; those that are captured by them need not be followed any further."""
     latest = np.array(now.crossing)
     usable = moving[running] & np.all(np.isfinite(latest), axis=1) & (now.events > 0)
@@ -132,7 +134,7 @@ def _add_cycles(maps: ReturnMaps, own, running, moving, now, found: list[Attract
     if not len(picked):
         return
     known = {int(own[members * k]): one.cycles for k, one in enumerate(found)}
-    new = stable_cycles(maps, own[running[picked]], at.rows(picked), known)
+    new = stable_cycles(maps, own[running[picked]], at.rows(picked), known, nearly=nearly)
     _keep(maps, [(running[picked[rows[0]]] // members, cycle) for _, rows, cycle in new], found)
     if new:
         take_captured()

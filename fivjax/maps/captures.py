@@ -51,6 +51,7 @@ def stable_cycles(
     known: dict[int, list[Cycle]],
     crossings: int = CROSSINGS,
     settled: bool = False,
+    nearly: float = NEARLY,
 ) -> list[tuple[int, Int, Cycle]]:
     """The stable cycles of up to so many `crossings` that motions from these states are near to: of each the group, the rows
     that led to it, and it. Those of a group that are `known` are not computed anew. Of motions that have `settled` all cycles
@@ -64,7 +65,7 @@ def stable_cycles(
         back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
-        close = nearest <= (SETTLED if settled else np.where(lag > CROSSINGS, MORE_NEARLY, NEARLY))
+        close = nearest <= (SETTLED if settled else np.where(lag > CROSSINGS, MORE_NEARLY, nearly))
         near = np.flatnonzero(np.isfinite(size) & (size > 0) & close)
     if not len(near):
         return []
