@@ -80,16 +80,22 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
 
 
-def test_the_peak_of_an_advance_may_be_at_its_end(maps):
-    """Advances end between the samples of a window, where the velocity may be larger than at any of them."""
+@pytest.mark.parametrize("status", [fj.Status.SLIDE, fj.Status.DETACH])
+def test_the_peak_of_an_advance_may_be_anywhere_in_it(maps, status):
+    """Advances end between the samples of a window, where the velocity may be larger than at any of them; and the largest of the
+    samples may stand beside a lower peak than another one does.
+    """
     random = np.random.default_rng(5)
     with jax.enable_x64(True):
         windows = jax.tree.map(lambda leaf: leaf[0], maps.windows.tree[0])
-        y = jax.numpy.asarray(random.normal(size=(300, 6)) / maps.weights).at[:, [2, 5]].set(0.0)
-        h = 16 * windows.interval * random.uniform(0.05, 1.0, 300)
+        held = [2, 5] if status == fj.Status.SLIDE else []
+        y = jax.numpy.asarray(random.normal(size=(4000, 6)) / maps.weights).at[:, held].set(0.0)
+        # Far from landing, so that advances are long.
+        y = y if len(held) else y.at[:, 2].set(20.0 / maps.weights[2])
+        h = 16 * windows.interval * random.uniform(0.05, 1.0, 4000)
 
         def both(y, h):
-            contact = Contact(jax.numpy.asarray(fj.Status.SLIDE, jax.numpy.int32), jax.numpy.asarray(1.0))
+            contact = Contact(jax.numpy.asarray(status, jax.numpy.int32), jax.numpy.asarray(1.0))
             after = Windowed().advance(windows, contact, 0.0 * h, y, h)
             peak = Windowed().peak(windows, contact, 0.0 * h, y, after.h, after.end)
             times = after.h * jax.numpy.linspace(0.0, 1.0, 400)

@@ -69,11 +69,22 @@ class Window(eqx.Module):
         speed, index = self.speed, jnp.arange(INTERVALS)[:, None]
         return least(jnp.where((speed[:-1] < 0) & (speed[1:] >= 0), index, INTERVALS).astype(jnp.int32))
 
-    def fastest(self, steps: Float[Array, " l"]) -> Int[Array, " l"]:
-        """The sample of the largest tangential speed within the first `steps` intervals."""
-        speed, index = jnp.abs(self.speed), jnp.arange(INTERVALS + 1)[:, None]
-        speed = jnp.where(index <= steps, speed, -1.0)
-        return least(jnp.where(speed == -least(-speed), index, INTERVALS).astype(jnp.int32))
+    def highest_sample(self, steps: Float[Array, " l"]) -> Float[Array, " l"]:
+        """The largest tangential speed among the samples within the first `steps` intervals."""
+        return -least(jnp.where(jnp.arange(INTERVALS + 1)[:, None] <= steps, -jnp.abs(self.speed), 0.0))
+
+    def fastest(self, steps: Float[Array, " l"], sign: float) -> Int[Array, " l"]:
+        """The sample next to the highest peak of the tangential velocity, times `sign`, within the first `steps` intervals.
+
+        The sample that is largest may belong to a lower peak: peaks are told by the parabolas through three samples.
+        """
+        speed, index = sign * self.speed, jnp.arange(INTERVALS + 1)[:, None]
+        rise, bend = 0.5 * (speed[2:] - speed[:-2]), speed[2:] - 2.0 * speed[1:-1] + speed[:-2]
+        bends = (bend < 0) & (jnp.abs(rise) <= -bend) & (rise <= -bend * (steps - index[1:-1]))
+        above = jnp.where(bends, -0.5 * rise**2 / jnp.where(bends, bend, 1.0), 0.0)
+        none = jnp.zeros_like(speed[:1])
+        peak = jnp.where(index <= steps, speed + jnp.concatenate([none, above, none]), -jnp.inf)
+        return least(jnp.where(peak == -least(-peak), index, INTERVALS).astype(jnp.int32))
 
 
 class Bracket(eqx.Module):

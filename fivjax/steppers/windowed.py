@@ -172,12 +172,15 @@ def _peak(
     mechanics, n = prepared.mechanics, y.shape[0] // 2
     steps, sizes, exact = h / prepared.interval, jnp.zeros((8, *load.shape)), physics.exactly_zero(contact)
     window = Window(prepared.window @ stacked(mechanics, contact, load, y), sizes, exact, n, mechanics.tangential)
-    sample = window.fastest(steps)
-    about = stacked(mechanics, contact, load, window.state_at(sample))
-    speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
-    near_sample = highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
-    # The end lies between samples, and the speed there may be larger than at all of them.
-    return jnp.maximum(near_sample, jnp.abs(end[n + mechanics.tangential]))
+
+    def near(sample):
+        about = stacked(mechanics, contact, load, window.state_at(sample))
+        speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
+        return highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
+
+    # Parabolas may misjudge the fastest modes. The end lies between samples, and the speed there may be larger than at all.
+    sampled = jnp.maximum(window.highest_sample(steps), jnp.abs(end[n + mechanics.tangential]))
+    return jnp.maximum(jnp.maximum(near(window.fastest(steps, 1.0)), near(window.fastest(steps, -1.0))), sampled)
 
 
 _advance_one = _side_by_side(_advance)
