@@ -125,7 +125,7 @@ def _curve(weights: np.ndarray, returns: Float[np.ndarray, "k state"]) -> Curve 
     weighted = weights * returns
     size = np.mean(np.linalg.norm(weighted, axis=-1))
     rotation = _rotation(weighted)
-    if abs(rotation) * len(returns) < LEAST_TURNS or _drifts(weighted):
+    if abs(rotation) * len(returns) < LEAST_TURNS or drifts(weighted):
         return None
     order = np.argsort(np.mod(rotation * np.arange(len(returns)), 1.0), kind="stable")
     path = weighted[order]
@@ -155,24 +155,28 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def _extent(weighted: Float[np.ndarray, "k state"]) -> float:
+def extent(weighted: Float[np.ndarray, "k state"]) -> float:
     """The root mean square distance of points from their mean."""
     return float(np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1))))
 
 
-def _drifts(weighted: Float[np.ndarray, "k state"]) -> bool:
-    """Whether the mean of the points changes with time, which it does not on a torus."""
+def drifts(weighted: Float[np.ndarray, "k state"], share: float = DRIFT) -> bool:
+    """Whether the mean of the points changes with time by more than this share of their extent: on a torus it does not."""
     third = len(weighted) // 3
-    x = (np.arange(third) + 0.5) / third
-    bump = np.exp(-1.0 / (x * (1 - x)))[:, None]
-    early, late = (np.sum(bump * part, axis=0) / np.sum(bump) for part in (weighted[:third], weighted[-third:]))
-    return bool(np.linalg.norm(late - early) > DRIFT * _extent(weighted))
+    early, late = (smooth_mean(part) for part in (weighted[:third], weighted[-third:]))
+    return bool(np.linalg.norm(late - early) > share * extent(weighted))
+
+
+def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*state"]:
+    """A mean whose weights vanish smoothly at both ends: of a quasi-periodic sequence it is much better than equal weights."""
+    x = (np.arange(len(values)) + 0.5) / len(values)
+    return np.average(values, axis=0, weights=np.exp(-1.0 / (x * (1 - x))))
 
 
 def tube_radius(weighted: Float[np.ndarray, "k state"]) -> float:
     """The radius of the tube about a curve through these weighted points."""
     size = float(np.mean(np.linalg.norm(weighted, axis=-1)))
-    return min(TUBE * size, TUBE_OF_EXTENT * _extent(weighted))
+    return min(TUBE * size, TUBE_OF_EXTENT * extent(weighted))
 
 
 def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
@@ -182,10 +186,7 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
     plane = centred @ axes[:2].T
     angle = np.arctan2(plane[:, 1], plane[:, 0])
     turns = np.diff(np.unwrap(angle)) / (2 * np.pi)
-    # Weights that vanish smoothly at both ends average a quasi-periodic sequence much better than equal weights.
-    x = (np.arange(len(turns)) + 0.5) / len(turns)
-    bump = np.exp(-1.0 / (x * (1 - x)))
-    guess = np.sum(bump * turns) / np.sum(bump)
+    guess = smooth_mean(turns)
     k = np.arange(len(weighted))
 
     def length(rotation: float) -> float:

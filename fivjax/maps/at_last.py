@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from ..cycles.torus import drifts
 from ..verdicts import tube
 from .captures import MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
 from .section import ReturnMaps, Section
@@ -22,6 +23,9 @@ TIMES = 4
 # States on the section that make the set tried as a torus, and radii of the tube about it. Starts have to come closer than
 # elsewhere, by so much: next to a slow fade there is a direction in which they come back hardly at all.
 SET, RADII, CLOSER = 4096, (tube.RADIUS, tube.RADIUS / 4), 0.5
+# Their mean may change with time by so much of their extent. A fade that takes thousands of periods is such a set, too, and
+# starts further in are home while they pass it.
+DRIFT = 5e-3
 # Crossings in which starts in the tube have to be back.
 BACK_WITHIN = 1536
 
@@ -97,16 +101,21 @@ def _search(maps: ReturnMaps, group, followed: Followed, picked, cycles, tori, r
             if is_new(maps, cycle, cycles.get(g, [])):
                 cycles.setdefault(g, []).append(cycle)
     open_ = np.flatnonzero(on_torus)
+    if not len(open_):
+        return
+    _, paths = maps.path(group[open_], at.rows(open_), SET)
+    set_of = {row: path for row, path in zip(open_, maps.weights * paths, strict=True) if not drifts(path, DRIFT)}
     # A tube that is wider says more, where everything in it comes back.
     for radius in RADII:
+        open_ = np.array(list(set_of), int)
         if not len(open_):
             break
-        _, paths = maps.path(group[open_], at.rows(open_), SET)
         known = [cycles.get(int(g), []) for g in group[open_]]
-        sets = list(enumerate(maps.weights * paths))
+        sets = list(enumerate(set_of.values()))
         found, locked = tori_among(maps, group[open_], sets, known, BACK_WITHIN, report, radius, CLOSER * radius)
         for k, torus in found.items():
             tori.setdefault(int(group[open_[k]]), []).append(Narrow(torus, radius))
         for k, cycle in locked:
             cycles.setdefault(int(group[open_[k]]), []).append(cycle)
-        open_ = np.delete(open_, [*found, *(k for k, _ in locked)])
+        for k in {*found, *(k for k, _ in locked)}:
+            del set_of[open_[k]]

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
+from ..cycles.torus import extent, smooth_mean
 from ..verdicts import tube
+from ..verdicts.tube import nearest
 from ..verdicts.tube_of_several import starts_of_several
 from .captures import MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .section import ReturnMaps, Section
@@ -20,6 +22,9 @@ BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
 FURTHER, PARTING_OVER, PARTING = 8, 48, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
 LOCKED = -0.01
+# On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
+# within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
+SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
 # A motion that nothing has captured in its time is followed on for so many times as many returns at most: until neighbours
 # have parted by so many e-folds since they were closest, or have closed in by so many since they were furthest apart. On a
 # torus they part and close in by turns, by two or three e-folds. Where they have parted by more before they close in, the
@@ -60,8 +65,9 @@ def tori_among(
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
     group, at = own[chosen // tube.STARTS], last.rows(chosen)
-    growth, period, later = _parting(maps, group, at)
+    growth, period, later, path = _parting(maps, group, at)
     growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
+    lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
     closing_in = np.flatnonzero(np.repeat(growth < LOCKED, FURTHER))[:: FURTHER // NOMINATED]
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
@@ -72,7 +78,7 @@ def tori_among(
             cycles.append((sets[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
-        kept = np.flatnonzero((growth < PARTING) & ~np.isin(np.arange(len(back)), locked))
+        kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
     if not len(kept):
         return {}, cycles
     rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
@@ -119,15 +125,34 @@ def _back(
     return np.flatnonzero(np.all(back.reshape(-1, count), axis=1) & ok), last
 
 
-def _parting(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Section]:
+def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
+    """Whether motions, by their weighted states on the section in order, go about the same set again and again."""
+    if not np.all(np.isfinite(paths)):
+        return False
+    whole = paths.reshape(-1, paths.shape[-1])
+    means = np.stack([smooth_mean(path) for path in paths])
+    apart = np.linalg.norm(means - np.mean(means, axis=0), axis=1)
+    third = paths.shape[1] // 3
+    early = paths[:, :third].reshape(-1, paths.shape[-1])
+    late = paths[:, -third:]
+    steps = [np.median(nearest(part, part, others=True)) for part in late]
+    missed = [np.median(nearest(part, early)) for part in late]
+    rounding = ROUNDING * tube.mean_size(whole)
+    return bool(
+        np.max(apart) <= SAME_MEAN * extent(whole) and np.all(missed <= NEAR_OTHERS * np.array(steps) + rounding)
+    )
+
+
+def _parting(maps: ReturnMaps, group, at: Section):
     """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; the mean
-    time of a return (s); and where the motions are in the end.
+    time of a return (s); where the motions are in the end; and their weighted states on the section.
     """
-    beside, growth, time = _beside(at), np.full(len(group), np.nan), np.zeros(len(group))
+    beside, growth, time, paths = _beside(at), np.full(len(group), np.nan), np.zeros(len(group)), []
     for _ in range(2):
-        growth, taken, at, beside = _parted(maps, group, at, beside)
+        growth, taken, at, beside, path = _parted(maps, group, at, beside)
         time = time + taken
-    return growth, time / (2 * PARTING_OVER), at
+        paths.append(path)
+    return growth, time / (2 * PARTING_OVER), at, np.concatenate(paths, axis=1)
 
 
 def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
@@ -137,20 +162,25 @@ def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
 
 def _parted(maps: ReturnMaps, group, at: Section, beside):
     """After `PARTING_OVER` returns: the logarithm of the growth of the distance to neighbours per return, the time taken (s),
-    where the motions are, and neighbours in the direction in which those from before are by then.
+    where the motions are, neighbours in the direction in which those from before are by then, and the motions' weighted states
+    on the section.
     """
     weights = maps.weights
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     apart = np.linalg.norm(weights * (beside - at.y), axis=1)
     pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    image = maps.returns(np.tile(group, 2), pair, PARTING_OVER)
-    at, other = image.at.rows(slice(None, len(group))), image.at.rows(slice(len(group), None))
+    path, time = [], np.zeros(len(group))
+    for _ in range(0, PARTING_OVER, KEPT):
+        image = maps.returns(np.tile(group, 2), pair, KEPT)
+        pair, time = image.at, time + image.time[: len(group)]
+        path.append(weights * image.path[: len(group)])
+    at, other = pair.rows(slice(None, len(group))), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
     distance = np.linalg.norm(away, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log(distance[:, 0] / apart) / PARTING_OVER
         beside = at.y + APART * size * away / distance / weights
-    return growth, image.time[: len(group)], at, beside
+    return growth, time, at, beside, np.concatenate(path, axis=1)
 
 
 def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t"]:
@@ -184,11 +214,11 @@ def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> 
     because events may be rare. On a torus they do neither.
     """
     at = maps.returns(group, at, 1).at
-    _, _, at, beside = _parted(maps, group, at, _beside(at))
+    _, _, at, beside, _ = _parted(maps, group, at, _beside(at))
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
     for _ in range(PARTING_TIMES):
-        growth, _, at, beside = _parted(maps, group[running], at, beside)
+        growth, _, at, beside, _ = _parted(maps, group[running], at, beside)
         parted[running] += PARTING_OVER * growth
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         furthest = np.fmax(furthest, parted - least)

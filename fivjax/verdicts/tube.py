@@ -25,7 +25,12 @@ def directions_from(
     random = np.random.default_rng(0).normal(size=chosen.shape)
     kind = np.arange(STARTS) % 4
     away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
-    return chosen, away, float(np.mean(np.linalg.norm(states, axis=-1)))
+    return chosen, away, mean_size(states)
+
+
+def mean_size(states: Float[np.ndarray, "k 2n"]) -> float:
+    """The mean length of weighted deviations."""
+    return float(np.mean(np.linalg.norm(states, axis=-1)))
 
 
 def starts(
@@ -52,10 +57,18 @@ def home(
     states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"], radius: float = RADIUS
 ) -> Bool[np.ndarray, " m"]:
     """Which starts have come back: all of their last crossing states lie within half the tube."""
-    size = np.mean(np.linalg.norm(states, axis=-1))
+    size = mean_size(states)
     points = np.where(np.isfinite(ends), ends, np.inf).reshape(-1, ends.shape[-1])
     finite = np.all(np.isfinite(points), axis=-1)
-    points = np.where(finite[:, None], points, 0.0)
-    apart = np.sum(points**2, axis=-1)[:, None] - 2 * points @ states.T + np.sum(states**2, axis=-1)
-    inside = finite & (np.min(apart, axis=1) <= (0.5 * radius * size) ** 2)
+    inside = finite & (nearest(np.where(finite[:, None], points, 0.0), states) <= 0.5 * radius * size)
     return np.all(inside.reshape(ends.shape[:-1]), axis=0)
+
+
+def nearest(
+    points: Float[np.ndarray, "m 2n"], states: Float[np.ndarray, "k 2n"], others: bool = False
+) -> Float[np.ndarray, " m"]:
+    """The distance of each point to the nearest of the states; with `others` the states are the points, and none is its own."""
+    apart = np.sum(points**2, axis=-1)[:, None] - 2 * points @ states.T + np.sum(states**2, axis=-1)
+    if others:
+        np.fill_diagonal(apart, np.inf)
+    return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0))
