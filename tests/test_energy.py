@@ -388,7 +388,7 @@ def test_nothing_is_spent_on_a_ledger_that_nobody_asked_for(paper_scene, monkeyp
 
     monkeypatch.setattr(fj.EventExact, "within", refuse)
     monkeypatch.setattr(accounts, "enter", refuse)
-    monkeypatch.setattr(accounts.Books, "__init__", refuse)
+    monkeypatch.setattr(accounts.EnergyData, "__init__", refuse)
     run = eqx.filter_eval_shape(lambda: fj.simulate(paper_scene, 0.0123, 0.00123))
     assert run.energy is None
     with pytest.raises(AssertionError, match="touched"):
@@ -442,10 +442,10 @@ def test_a_batch_of_ledgers_equals_a_loop(paper_scene):
 def entered_with_mistakes(scene, wrong, lost_impacts, t1):
     """A trajectory by its own physics, as lanes of a map are followed, but entered as if another scene's."""
     method, mechanics, mistaken = fj.EventExact(), mechanics_about_sliding(scene), mechanics_about_sliding(wrong)
-    books, wrong_books = accounts.Books(scene), accounts.Books(wrong)
+    energy_data, wrong_books = accounts.EnergyData(scene), accounts.EnergyData(wrong)
     load = scene.load(0.0) - scene.load.final
     y0 = jnp.array([0.0, 0.0, 0.0, 2.5, -1.0, 0.0])
-    start = jnp.zeros(()), y0, fj.contact.status_from_forces(mechanics, load, y0), accounts.open_ledger(books, y0)
+    start = jnp.zeros(()), y0, fj.contact.status_from_forces(mechanics, load, y0), accounts.open_ledger(energy_data, y0)
 
     def advance(carry):
         t, y, contact, ledger = carry
@@ -456,11 +456,11 @@ def entered_with_mistakes(scene, wrong, lost_impacts, t1):
         return t + after.h, after.y, after.contact, entry
 
     _, y, _, ledger = jax.lax.while_loop(lambda carry: carry[0] < t1, advance, start)
-    return ledger, accounts.residual(books, ledger, y)
+    return ledger, accounts.residual(energy_data, ledger, y)
 
 
 def test_a_wrong_line_shows_in_the_residual_by_its_size(paper_scene):
-    """A damper, a friction coefficient and an impact loss, each entered a little wrong: what the books then say is off by
+    """A damper, a friction coefficient and an impact loss, each entered a little wrong: what the energy_data then say is off by
     that much, and so is the residual."""
     with jax.enable_x64(True):
         scene, off = paper_scene.replace(mu=0.2, p=3.0), 1e-6
@@ -484,28 +484,28 @@ def test_a_wrong_line_shows_in_the_residual_by_its_size(paper_scene):
 
 @pytest.mark.slow
 def test_one_advance_entered_by_hand(paper_scene):
-    """What a map does for each lane: open the books, advance, enter; the residual is there after each advance."""
+    """What a map does for each lane: open the energy_data, advance, enter; the residual is there after each advance."""
     scene = paper_scene.replace(mu=0.2, p=3.0)
     method = fj.EventExact()
     with jax.enable_x64(True):
-        books, mechanics = accounts.Books(scene), Mechanics(scene)
+        energy_data, mechanics = accounts.EnergyData(scene), Mechanics(scene)
         q = jnp.asarray(fj.sliding_equilibrium(scene))
         y0 = y = jnp.concatenate([q, jnp.array([2.5, -1.0, 0.0])])
-        ledger = accounts.open_ledger(books, y)
+        ledger = accounts.open_ledger(energy_data, y)
         contact = fj.contact.status_from_forces(mechanics, scene.load(0.0), y)
 
         @jax.jit
         def advance(ledger, contact, y, left):
             after = method.advance(mechanics, contact, scene.load(0.0), y, left)
             return accounts.enter(
-                books, method, mechanics, ledger, Segment(0.0, scene.load(0.0), contact, y, after)
+                energy_data, method, mechanics, ledger, Segment(0.0, scene.load(0.0), contact, y, after)
             ), after
 
         t = 0.0
         while t < 0.1:
             ledger, after = advance(ledger, contact, y, jnp.asarray(0.1 - t))
             t, y, contact = t + float(after.h), after.y, after.contact
-        residual = float(accounts.residual(books, ledger, y))
+        residual = float(accounts.residual(energy_data, ledger, y))
     run = simulate(scene, 0.1, np.asarray(y0))
     assert float(ledger.work.load) == pytest.approx(run.energy.work.load[-1], abs=1e-13)
     assert float(ledger.impact) == pytest.approx(run.energy.impact[-1], abs=1e-13)

@@ -170,5 +170,6 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     with (tmp_path / "site" / "objects.inv").open("rb") as file:
         known = inventory.InventoryFile.load(file, "", lambda base, uri: uri)
-    found = {name for kind, entries in known.data.items() if kind.startswith("py:") for name in entries}
+    entries_of = getattr(known, "data", known)  # a dictionary until Sphinx 8
+    found = {name for kind, entries in entries_of.items() if kind.startswith("py:") for name in entries}
     assert {f"fivjax.{name}" for name in dir(fj)} <= found

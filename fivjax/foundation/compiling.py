@@ -20,11 +20,11 @@ R = TypeVar("R")
 
 # Level 1 leaves out LLVM's costly optimisations. The fusion emitters are XLA's newer way to make kernels of fused operations;
 # the older way compiles much faster where there are many of them.
-LESS_THOUGHT = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+COMPILED_QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """`equinox.filter_jit`, with the compiler options `LESS_THOUGHT` on a CPU.
+    """`equinox.filter_jit`, with the compiler options `COMPILED_QUICKLY` on a CPU.
 
     Under a caller's transformation the function becomes part of the caller's program, which has the caller's options.
     """
@@ -72,10 +72,10 @@ def transformed(arguments) -> bool:
 
 @functools.cache
 def less_thought() -> dict[str, int | bool]:
-    """The options of `LESS_THOUGHT` that this machine's compiler knows and the user has not set."""
+    """The options of `COMPILED_QUICKLY` that this machine's compiler knows and the user has not set."""
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in LESS_THOUGHT.items() if _is_free(name, value)}
+    return {name: value for name, value in COMPILED_QUICKLY.items() if _is_free(name, value)}
 
 
 def _is_free(name: str, value: int | bool) -> bool:

@@ -15,7 +15,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
-from ..simulation.energy import Books, Ledger, enter, mechanical_energy, open_ledger
+from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.windowed import Windowed
@@ -85,7 +85,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
         last_event=jnp.full((), jnp.nan, y.dtype),
         approach=attractors.no_approach(y),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
-        energy=EnergyRecord(open_ledger(Books(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
+        energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
     )
 
 
@@ -96,7 +96,7 @@ def placed(now: Progress, scene: Scene, shared, places: tuple[int, ...], values)
     equilibrium, at = shared.modes.linear.equilibrium, jnp.array(places)
     y = now.y.at[at].set(jnp.where(jnp.isnan(values), now.y[at], values - equilibrium[at]))
     contact = physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y)
-    energy = None if now.energy is None else EnergyRecord(open_ledger(Books(scene), y), now.energy.vibration)
+    energy = None if now.energy is None else EnergyRecord(open_ledger(EnergyData(scene), y), now.energy.vibration)
     return eqx.tree_at(
         lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
     )
@@ -157,7 +157,7 @@ def step(setting: Setting, now: Progress) -> Progress:
 def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
     scene = setting.scene
     segment = Segment(before.t, load, before.contact, before.y, after)
-    ledger = enter(Books(scene), setting.method, setting.mechanics, energy.ledger, segment)
+    ledger = enter(EnergyData(scene), setting.method, setting.mechanics, energy.ledger, segment)
     kick_ends = jnp.max(scene.load.jumps, initial=0.0)
     just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
     vibration = mechanical_energy(scene.structure, after.y)

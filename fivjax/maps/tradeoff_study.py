@@ -19,7 +19,7 @@ from ..linear.cea import eigenvalues
 from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve, refuse_several_contacts
-from ..simulation.energy import Books
+from ..simulation.energy import EnergyData
 from ..simulation.start import start_state
 from ..simulation.trajectory import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
@@ -183,14 +183,16 @@ def _single(scene: Scene) -> Scene:
     return jax.tree.map(lambda leaf: leaf.astype(np.float32), scene)
 
 
-def _run(scene: Scene, method: AbstractStepper, t1: float, p=None, rows: int = 1, books: Books | None = None):
+def _run(
+    scene: Scene, method: AbstractStepper, t1: float, p=None, rows: int = 1, energy_data: EnergyData | None = None
+):
     """States at the ends of `rows` equal intervals; all in the precision of the scene."""
     dtype = scene.belt_speed.dtype
     if p is not None:
         scene = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.replace(p=p))
     y0 = start_state(scene, None).astype(dtype)
     most = MOST_ADVANCES + int(np.ceil(t1 / rows / method.dt))
-    return states_at(scene, method, y0, jnp.linspace(0, t1, rows + 1, dtype=dtype), most, books)
+    return states_at(scene, method, y0, jnp.linspace(0, t1, rows + 1, dtype=dtype), most, energy_data)
 
 
 def _end_state(scene: Scene, method: AbstractStepper, t1: float) -> np.ndarray:
@@ -262,7 +264,9 @@ def _parts(scene: Scene, t1: float) -> dict[str, float]:
     method = EventExact()
 
     def cost(scene: Scene, rows: int = 1, ledger: bool = False) -> float:
-        run = jax.jit(lambda scene: _run(scene, method, t1, rows=rows, books=Books(scene) if ledger else None))
+        run = jax.jit(
+            lambda scene: _run(scene, method, t1, rows=rows, energy_data=EnergyData(scene) if ledger else None)
+        )
         return _timed(lambda: run(scene))
 
     plain = cost(scene)

@@ -67,10 +67,10 @@ def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
     x, y, stable = one["parameter"].values, one["amplitude"].values, one["stable"].values
     known = np.isfinite(y)
     x, y, stable = x[known], y[known], stable[known]
-    # Solid: the lines that follow a stable point. Dashed: the lines that lead to an unstable one.
+    # The line from a point to the next is solid where the first of them is stable.
     for is_stable, style in ((True, "-"), (False, "--")):
         chosen = stable == is_stable
-        shown = chosen | np.append(False, chosen[:-1]) if is_stable else chosen | np.append(chosen[1:], False)
+        shown = chosen | np.append(False, chosen[:-1])
         axes.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), color=colour, ls=style, lw=1.3)
     order = np.argsort(one["parameter"].values, kind="stable")
     x, slides = one["parameter"].values[order], one["sliding_stable"].values[order]

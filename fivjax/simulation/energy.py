@@ -59,7 +59,7 @@ from .energy_lines import Ledger as Ledger
 from .energy_lines import exchanged as exchanged
 
 
-class Books(eqx.Module):
+class EnergyData(eqx.Module):
     """The data of a scene that its ledger needs, worked out once."""
 
     structure: Structure
@@ -102,15 +102,15 @@ def vibration_energy(structure: Structure, equilibrium: Float[Array, " n"], y: S
     return mechanical_energy(structure, displaced)
 
 
-def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Flows:
+def powers(energy_data: EnergyData, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Flows:
     """The flows at one instant, in W. If `mechanics` has a rest, only of forces beyond those at rest, except for
     `interface`.
     """
-    structure, rest = books.structure, mechanics.rest
+    structure, rest = energy_data.structure, mechanics.rest
     velocity = y[structure.size :]
     force, _ = physics.added_forces(mechanics, contact, load, y)
     total_force, _ = physics.contact_forces(mechanics, contact, load, y)
-    final_load = books.final_load if rest is None else books.final_load - rest.load
+    final_load = energy_data.final_load if rest is None else energy_data.final_load - rest.load
     from_belt = force * velocity[mechanics.tangential]
     none = jnp.zeros_like(from_belt)
     sliding = contact.status == Status.SLIDE
@@ -123,7 +123,7 @@ def powers(books: Books, mechanics: Mechanics, contact: Contact, load: Float[Arr
         slide=_sum(mechanics, slide),
         interface=_sum(mechanics, interface),
         damping=_form(structure.damping, velocity),
-        dampers={name: _form(part, velocity) for name, part in books.dampers.items()},
+        dampers={name: _form(part, velocity) for name, part in energy_data.dampers.items()},
         load=load * along_load,
         kick=(load - final_load) * along_load,
         by_contact={"stick": stick, "slide": slide, "interface": interface} if mechanics.several else {},
@@ -136,20 +136,20 @@ def _sum(mechanics: Mechanics, each: Float[Array, "*contacts"]) -> Float[Array, 
 
 
 def _work(
-    books: Books, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], within: Within
+    energy_data: EnergyData, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], within: Within
 ) -> tuple[Flows, Float[Array, ""]]:
     """The work of one advance by line, and the work of all forces beyond those at rest, in J."""
     rest = mechanics.rest
-    along = jax.vmap(lambda y: powers(books, mechanics, contact, load, y))(within.states)
+    along = jax.vmap(lambda y: powers(energy_data, mechanics, contact, load, y))(within.states)
     weights = within.weights
     beyond = jax.tree.map(
         lambda power: jnp.sum((weights if power.ndim == 1 else weights[:, None]) * power, axis=0), along
     )
     if rest is None:
         return beyond, beyond.mechanical
-    moved = within.weights @ within.states[:, books.structure.size :]
+    moved = within.weights @ within.states[:, energy_data.structure.size :]
     at_rest = rest.tangential_force * moved[mechanics.tangential]
-    by_load = rest.load * jnp.sum(books.structure.load_direction * moved)
+    by_load = rest.load * jnp.sum(energy_data.structure.load_direction * moved)
     stick = jnp.where(contact.status == Status.STICK, at_rest, 0.0)
     slide = jnp.where(contact.status == Status.SLIDE, at_rest, 0.0)
     by_contact = beyond.by_contact
@@ -171,14 +171,14 @@ def _work(
     return total, beyond.mechanical - missing
 
 
-def open_ledger(books: Books, y: State) -> Ledger:
+def open_ledger(energy_data: EnergyData, y: State) -> Ledger:
     """An empty ledger."""
     none, no = jnp.zeros((), y.dtype), jnp.zeros((), jnp.int32)
-    count = len(books.structure.places)
+    count = len(energy_data.structure.places)
     each, several = jnp.zeros(count, y.dtype), count > 1
     flows = dict.fromkeys(("stick", "slide", "interface"), each) if several else {}
     return Ledger(
-        work=Flows(none, none, none, none, dict.fromkeys(books.dampers, none), none, none, flows),
+        work=Flows(none, none, none, none, dict.fromkeys(energy_data.dampers, none), none, none, flows),
         impact=none,
         impact_dissipated=none,
         stick_time=none,
@@ -186,28 +186,28 @@ def open_ledger(books: Books, y: State) -> Ledger:
         events=no,
         crossings=no,
         beyond_rest=none,
-        start=_stored(books, y),
+        start=_stored(energy_data, y),
         worst=none,
         by_contact=dict.fromkeys(("impact", "stick_time", "detach_time"), each) if several else {},
     )
 
 
-def residual(books: Books, ledger: Ledger, y: State) -> Float[Array, ""]:
+def residual(energy_data: EnergyData, ledger: Ledger, y: State) -> Float[Array, ""]:
     """Growth of mechanical energy that no line accounts for, in J: the error of the computation.
 
     `y` is a total state or a deviation from rest, as in the mechanics with which the ledger was kept.
     """
-    grown = _stored(books, y) - ledger.start
+    grown = _stored(energy_data, y) - ledger.start
     return grown - (ledger.beyond_rest - ledger.impact)
 
 
-def _stored(books: Books, y: State) -> Float[Array, ""]:
+def _stored(energy_data: EnergyData, y: State) -> Float[Array, ""]:
     """Mechanical energy in J, without cancellation after a large rigid motion."""
-    return kinetic_energy(books.structure, y) + books.springs.energy(y[: books.structure.size])
+    return kinetic_energy(energy_data.structure, y) + energy_data.springs.energy(y[: energy_data.structure.size])
 
 
 def enter(
-    books: Books,
+    energy_data: EnergyData,
     method: AbstractStepper,
     mechanics: Mechanics,
     ledger: Ledger,
@@ -220,11 +220,11 @@ def enter(
 
     Corrections by rounding in a transition (a gap or a slip speed set to zero) have no line: they are in the residual.
     """
-    structure = books.structure
+    structure = energy_data.structure
     n, tangential, normal = structure.size, mechanics.tangential, mechanics.normal
     contact, load, y, after = segment.contact, segment.load, segment.y, segment.after
     within = method.within(mechanics, contact, load, y, after.h)
-    work, beyond_rest = _work(books, mechanics, contact, load, within)
+    work, beyond_rest = _work(energy_data, mechanics, contact, load, within)
     # While detached, velocities jump only at re-contact. The difference of squares is written without cancellation.
     before, behind = within.end[n:], after.y[n:]
     impulses = jnp.sum(structure.mass * (behind - before), axis=-1)
@@ -264,7 +264,7 @@ def enter(
         worst=ledger.worst,
         by_contact=by_contact,
     )
-    open_ = jax.lax.stop_gradient(jnp.abs(residual(books, entered, after.y)))
+    open_ = jax.lax.stop_gradient(jnp.abs(residual(energy_data, entered, after.y)))
     return eqx.tree_at(lambda ledger: ledger.worst, entered, jnp.maximum(ledger.worst, open_))
 
 
@@ -273,7 +273,7 @@ def _all(mechanics: Mechanics, each: Bool[Array, "*contacts"]) -> Bool[Array, ""
 
 
 def along_rows(
-    books: Books,
+    energy_data: EnergyData,
     mechanics: Mechanics,
     contacts: Contact,
     loads: Float[Array, " T"],
@@ -281,13 +281,13 @@ def along_rows(
     rows: Ledger,
 ) -> Energy:
     """The ledger of a trajectory, from its rows and the ledger at each of them."""
-    structure = books.structure
+    structure = energy_data.structure
     return Energy(
         kinetic=jax.vmap(lambda y: kinetic_energy(structure, y))(ys),
         elastic=jax.vmap(lambda y: elastic_energy(structure, y))(ys),
-        power=jax.vmap(lambda c, f, y: powers(books, mechanics, c, f, y))(contacts, loads, ys),
+        power=jax.vmap(lambda c, f, y: powers(energy_data, mechanics, c, f, y))(contacts, loads, ys),
         ledger=rows,
-        residual=jax.vmap(lambda ledger, y: residual(books, ledger, y))(rows, ys),
+        residual=jax.vmap(lambda ledger, y: residual(energy_data, ledger, y))(rows, ys),
     )
 
 

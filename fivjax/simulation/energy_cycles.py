@@ -22,7 +22,7 @@ from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
-from .energy import Books, Energy, Ledger
+from .energy import Energy, EnergyData, Ledger
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
 @compiled
 def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Callable, most: int):
     """The first `most` instants after each start, and before each end, at which the count rises."""
-    mechanics, books, method = Mechanics(scene), Books(scene), EventExact()
+    mechanics, energy_data, method = Mechanics(scene), EnergyData(scene), EventExact()
 
     def to_next(start: _Instant, end):
         def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
@@ -176,7 +176,7 @@ def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Calla
             stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
 
             def enter(total, segment: Segment):
-                return accounts.enter(books, method, mechanics, total[0], segment), segment.contact.status
+                return accounts.enter(energy_data, method, mechanics, total[0], segment), segment.contact.status
 
             found = follow(
                 method,

@@ -21,7 +21,7 @@ from ..steppers.base import AbstractStepper
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import for_derivatives
 from . import energy as accounts
-from .energy import Books, Ledger
+from .energy import EnergyData, Ledger
 
 MODES = ("both", "forward", "reverse", "none")
 
@@ -35,7 +35,7 @@ class Begin(eqx.Module):
     y: State
     h: Float[Array, ""]  # s
     ledger: Ledger | None
-    books: Books | None
+    energy_data: EnergyData | None
 
 
 End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
@@ -49,13 +49,13 @@ def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | N
 
 
 def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
-    mechanics, load, books = begin.mechanics, begin.load, begin.books
+    mechanics, load, energy_data = begin.mechanics, begin.load, begin.energy_data
     if derivatives is not None:
         # Anew in each stretch, because its reverse derivative may use nothing computed outside of it.
         method = for_derivatives(method, mechanics)
 
     def enter(ledger, segment: Segment):
-        return None if books is None else accounts.enter(books, method, mechanics, ledger, segment)
+        return None if energy_data is None else accounts.enter(energy_data, method, mechanics, ledger, segment)
 
     after = follow(
         method,

@@ -33,7 +33,7 @@ from ..steppers.event_exact import EventExact
 from . import energy as accounts
 from .compiled_sizes import compiled_rows, compiled_steps, with_step_as_array
 from .ending import ENDING, GROWTH, Ending
-from .energy import Books, Energy, Ledger
+from .energy import Energy, EnergyData, Ledger
 from .start import checked_start, snapped_to_belt, start_state
 from .stretches import MODES, Begin, go_on
 
@@ -295,8 +295,8 @@ def _simulate(
     modes: str | None,
 ) -> dict:
     mechanics = Mechanics(scene)
-    books = Books(scene) if energy else None
-    y, contacts, ledgers = states_at(scene, method, y0, saved, most, books, modes)
+    energy_data = EnergyData(scene) if energy else None
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, energy_data, modes)
     load = jax.vmap(scene.load)(saved)
     # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
     finite = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
@@ -319,7 +319,9 @@ def _simulate(
         "friction_force": friction_force,
         "load": load,
         "grown": grown,
-        "energy": None if books is None else accounts.along_rows(books, mechanics, contacts, load, y, ledgers),
+        "energy": None
+        if energy_data is None
+        else accounts.along_rows(energy_data, mechanics, contacts, load, y, ledgers),
     }
 
 
@@ -350,11 +352,11 @@ def states_at(
     y0: State,
     instants: Float[Array, " T"],
     most: int,
-    books: Books | None = None,
+    energy_data: EnergyData | None = None,
     derivatives: str | None = None,
 ) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
-    """States, contacts and, with `books`, ledgers at given instants (s, in non-decreasing order, the first is the start); NaN
-    from where `most` advances between two of them were not enough.
+    """States, contacts and, with `energy_data`, ledgers at given instants (s, in non-decreasing order, the first is the
+    start); NaN from where `most` advances between two of them were not enough.
 
     `derivatives`: differentiable (also by the instants and the load's jumps) in "both" modes, or faster in only "forward" or
     "reverse" mode; None, not at all. In "reverse" mode only the states at the instants are kept; the rest is computed again.
@@ -376,7 +378,7 @@ def states_at(
         # under the load just before the jump.
         before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
         drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
-        begin = Begin(mechanics, contact, load, y, h, ledger, books)
+        begin = Begin(mechanics, contact, load, y, h, ledger, energy_data)
         moved, following, ledger, reached = go_on(begin, method, most, derivatives)
         # States that were not reached are NaN; counts are kept.
         moved, ledger = jax.tree.map(
@@ -386,7 +388,7 @@ def states_at(
         return (end, y, following, ledger), (y, following, ledger)
 
     contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
-    ledger0 = None if books is None else accounts.open_ledger(books, y0)
+    ledger0 = None if energy_data is None else accounts.open_ledger(energy_data, y0)
     # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
     _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
