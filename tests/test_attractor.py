@@ -188,6 +188,31 @@ def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monk
     assert late["attractor_amplitude"].item() == pytest.approx(known["attractor_amplitude"].item(), rel=2e-3)
 
 
+LIFTED = dict(m1=1.1705998500054153, m2=1.0366168212905877, k1=17703.437395142304, k2=8284.41121293815)
+LIFTED |= dict(theta=0.18640286946565932, c1=0.43259793882288444, c2=0.21352554946179353)
+STIFF = dict(m1=3.813433456423056, m2=0.13315844873418314, k1=16048.39840306352, k2=34707.01725395299)
+STIFF |= dict(theta=0.0062365622360519265, c1=2.7561018022795265, c2=0.7685029042361845)
+
+
+@pytest.mark.parametrize(
+    ("mu", "v", "parts", "kicks"),
+    [
+        # As fast backwards in the air as forwards on the belt, but for a hundredth.
+        (0.2329211778316193, 1.0814617599888834, LIFTED, [2.2517, 2.3122, 2.5521, 2.6020]),
+        # Contact is soon lost and made again: advances have no peak of one of the signs.
+        (0.2978377987867165, 1.6695818905767865, STIFF, [2.6077, 2.9938, 3.4338, 3.7290]),
+    ],
+)
+def test_amplitudes_are_the_references_whichever_way_the_fastest_motion_is(mu, v, parts, kicks):
+    """Between the samples of a window the highest peak may stand beside none of the largest samples."""
+    scene = paper(mu, v, **parts)
+    m = fj.bistability_map(scene, mu=[mu], p=kicks, progress=False)
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=2000)
+    squeal = (m["verdict"].values[0] == fj.Verdict.LIMIT_CYCLE) & (theirs.fate == "sustained")
+    assert squeal.sum() >= 3
+    np.testing.assert_allclose(m["amplitude"].values[0, squeal], theirs.amplitude[squeal], rtol=1e-6)
+
+
 def test_a_belt_that_runs_backwards_is_the_mirrored_one(paper_scene):
     """Seen in a mirror the belt runs the other way and the incline has the other sign; the torus is the same."""
     mirrored = fj.Scene(fj.belt_oscillator(theta=-0.01), fj.Coulomb(0.227), -3.0, paper_scene.load)

@@ -176,7 +176,7 @@ def _peak(
     def near(sample):
         about = stacked(mechanics, contact, load, window.state_at(sample))
         speed = Series(prepared.series @ about, sizes, exact, n).speed(mechanics.tangential)
-        return highest(speed, jnp.maximum(-1.0 * sample, -1.0), steps - sample) / prepared.interval
+        return highest(speed, jnp.maximum(-1.0 * sample, -1.0), jnp.minimum(steps - sample, 1.0)) / prepared.interval
 
     # Parabolas may misjudge the fastest modes. The end lies between samples, and the speed there may be larger than at all.
     sampled = jnp.maximum(window.highest_sample(steps), jnp.abs(end[n + mechanics.tangential]))
