@@ -221,10 +221,10 @@ def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> 
         growth, _, at, beside, _ = _parted(maps, group[running], at, beside)
         parted[running] += PARTING_OVER * growth
         least, most = np.fmin(least, parted), np.fmax(most, parted)
-        furthest = np.fmax(furthest, parted - least)
         last.put(running, at)
         # Not a number is neither.
         with np.errstate(invalid="ignore"):
+            furthest = np.fmax(furthest, parted - least)
             left = ((parted - least < PARTED) & (most - parted < CLOSED_IN))[running]
         running, at, beside = running[left], at.rows(left), beside[left]
         if not len(running):
