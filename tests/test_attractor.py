@@ -7,6 +7,7 @@ import pytest
 import reference
 
 import fivjax as fj
+from fivjax.maps.tori import _on_one_torus
 from fivjax.verdicts import tube
 from fivjax.verdicts.ensemble import (
     KEPT,
@@ -51,6 +52,21 @@ def test_members_from_inside_and_outside_meet_on_a_torus():
 def test_members_that_meet_on_one_point_nominate_no_torus():
     """A periodic motion, or the ghost of one: nearly the same state again and again. Those are computed, or nothing."""
     assert met(ensemble(settling(0.4, final=0.01)), DECAY) is None
+
+
+def windings(centres, radius=1.0, returns=96, turn=GOLDEN):
+    """Eight motions, each about a circle of this radius round a centre of its own, from phases of their own."""
+    phase = 2 * np.pi * (turn * np.arange(returns) + GOLDEN * np.arange(8)[:, None])
+    return np.stack([10 + centres + radius * np.cos(phase), radius * np.sin(phase)], axis=-1)
+
+
+def test_motions_that_creep_along_a_line_of_states_are_on_no_common_torus():
+    """Each goes about a circle that is a little further on than its neighbour's, as in a fade of thousands of periods."""
+    assert _on_one_torus(windings(np.zeros((8, 1))))
+    assert not _on_one_torus(windings(np.linspace(-1.0, 1.0, 8)[:, None]))
+    creeping = np.linspace(0.0, 3.0, 96) + np.zeros((8, 1))
+    assert not _on_one_torus(windings(creeping, radius=0.01))
+    assert not _on_one_torus(np.where(np.arange(96)[:, None] > 90, np.nan, windings(np.zeros((8, 1)))))
 
 
 def test_members_on_circles_of_their_own_have_not_met():
@@ -264,6 +280,19 @@ def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_n
     assert np.all(fade["verdict"] == fj.Verdict.UNDECIDED) and not np.any(fade["chaotic"])
     theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in (1.7767, 1.9584)], periods=1e5)
     assert theirs.fate.tolist() == ["slides", "slides"]
+
+
+@pytest.mark.slow
+def test_a_whole_ensemble_that_fades_slowly_is_on_no_torus():
+    """Two parts in a hundred thousand below the stability limit: every start is back near where another was, and after 57 s this
+    one slides. It has been called a torus."""
+    fading = dict(m1=0.06365081536185815, m2=0.0010540930220670154, k1=13772.596298217866, k2=12866.452581465366)
+    fading |= dict(theta=0.08787005117146397, c1=1.7626262091376772, c2=0.0524614630067979)
+    scene, kicks = paper(0.09031944429179249, 0.053627612342134166, **fading), [0.2355, 1.8389, 3.4629, 5.4348]
+    m = fj.bistability_map(scene, p=kicks, progress=False)
+    assert not np.any(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=1e4)
+    assert theirs.fate.tolist() == ["slides"] * len(kicks)
 
 
 def test_a_slow_fade_near_the_stability_limit_is_no_limit_cycle():
