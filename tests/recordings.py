@@ -6,6 +6,8 @@ python tests/recordings.py notebooks/decay.csv    # writes the recording that RE
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import fivjax as fj
@@ -34,6 +36,51 @@ def clean(scene: fj.Scene, begin: float, end: float, y0=None, rate: float = RATE
     run = fj.simulate(scene, end, 1 / rate, y0=y0)
     first = round(begin * rate)
     return np.diff(run.velocity[first:, :2], axis=0) * rate
+
+
+def _of_two(c1, k1, coupling):
+    """The paper's oscillator and a softer one, whose second masses are coupled by a spring."""
+    first, second = (one.matrices for one in (fj.belt_oscillator(c1=c1, k1=k1), fj.belt_oscillator(k1=6e4, k2=6.1e4)))
+    zero, apart = jnp.zeros((3, 3)), jnp.array([0.0, 1, 0, 0, -1, 0])
+    mass, damping, stiffness = (
+        jnp.block([[one, zero], [zero, other]]) for one, other in zip(first[:3], second[:3], strict=True)
+    )
+    load = jnp.concatenate([first.load_direction, second.load_direction])
+    return mass, damping, stiffness + coupling * jnp.outer(apart, apart), load
+
+
+def pair(coupling: float, second_friction: float = 0.15, **changes) -> fj.Scene:
+    """Two contacts: the paper's scene, and a softer oscillator beside it; uncoupled without `coupling` (N/m)."""
+    contacts = [fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)]
+    structure = fj.Structure.from_parameters(_of_two, dict(c1=1.0, k1=100e3, coupling=coupling), contacts=contacts)
+    laws = [fj.Coulomb(0.2), fj.Coulomb(second_friction)]
+    return fj.Scene(structure, laws, 3.0, fj.Pulse(100.0, 1.2)).replace(**changes)
+
+
+def slid(scene: fj.Scene, begin: float, end: float, rate: float = RATE) -> np.ndarray:
+    """Accelerations of the sliding coordinates after a kick, as `clean` gives them, while all contacts slide: by eigenvalues
+    of matrices that are put together here."""
+    with jax.enable_x64(True):
+        mass, damping, stiffness, load = map(np.array, scene.structure.matrices)
+    contacts = scene.structure.contacts
+    for matrix in (mass, damping, stiffness, load):
+        for contact, law in zip(contacts, scene.friction.laws, strict=True):
+            matrix[contact.tangential] -= float(law.mu) * matrix[contact.normal]
+    free = np.setdiff1d(np.arange(len(load)), [contact.normal for contact in contacts])
+    mass, damping, stiffness = (matrix[np.ix_(free, free)] for matrix in (mass, damping, stiffness))
+    m = len(free)
+    lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
+    values, modes = np.linalg.eig(np.vstack([np.eye(m, 2 * m, m), lower]))
+    kick = scene.load
+    t = np.arange(round(begin * rate), round(end * rate) + 1)[:, None] / rate
+    raised = (
+        np.concatenate([np.linalg.solve(stiffness, load[free]), np.zeros(m)]) * float(kick.force) * (float(kick.p) - 1)
+    )
+    shares = np.linalg.solve(modes, raised)
+    since = [np.exp(np.maximum(t - instant, 0) * values) for instant in (0.0, float(kick.duration))]
+    # The response to the raised load begins at its jump, and that to its fall is the same with the other sign.
+    states = (shares * (since[1] - since[0])) @ modes.T
+    return np.diff(states[:, m:].real, axis=0) * rate
 
 
 def noisy(accelerations: np.ndarray, share: float, seed: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from recordings import FREE, SAMPLE, case, clean, noisy, off, paper, recording, scores, times
+from recordings import FREE, SAMPLE, case, clean, noisy, off, pair, paper, recording, scores, slid, times
 
 import fivjax as fj
 from fivjax import cli
@@ -52,6 +52,34 @@ def test_decaying_response_from_thirty_per_cent_off(decay, decay_fit):
     per_block = round(25_000 / (len(decay_fit.t[0]) / 1.0))
     expected = 0.02 * decay[1].values.std(axis=0) / np.sqrt(per_block)
     np.testing.assert_allclose(decay_fit.residuals[0].std(axis=0), expected, rtol=0.1)
+
+
+OF_FIRST = ["mu_0", "c1", "k1"]
+
+
+@pytest.fixture
+def known_to_slide(monkeypatch):
+    """Nothing stops sliding here. To check that would compile the response through events, for ten seconds."""
+    monkeypatch.setattr("fivjax.calibration.fit.slid_throughout", lambda *_: True)
+
+
+def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit, known_to_slide):
+    """Data of the first of two contacts give what the fit with one contact gives. Modes that the data cannot show are no
+    poles of the recording: noise was taken for them, and no parameter was found."""
+    fit = fj.calibrate(off(pair(0.0), OF_FIRST, 0), decay[1], OF_FIRST, starts=4, progress=False)
+    assert fit.outcome is FitOutcome.CONVERGED
+    for name, own in zip(FREE[3], OF_FIRST, strict=True):
+        assert fit.values[own] == pytest.approx(decay_fit.values[name], abs=0.01 * decay_fit.uncertainty[name])
+        assert fit.uncertainty[own] == pytest.approx(decay_fit.uncertainty[name], rel=1e-3)
+
+
+def test_coupled_contacts_from_thirty_per_cent_off(known_to_slide):
+    """The response of two coupled contacts, from eigenvalues of matrices that the library does not make."""
+    scene = pair(2e3)
+    data = recording(noisy(slid(scene, 0.0371, 1.0371)[:, :2], 0.02, 0), "kick")
+    fit = fj.calibrate(off(scene, OF_FIRST, 0), data, OF_FIRST, starts=4, progress=False)
+    assert fit.outcome is FitOutcome.CONVERGED and all(fit.identifiable.values())
+    assert max(scores(fit, scene).values()) < 4
 
 
 @pytest.mark.slow

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..contact import Contact, Status
+from ..contact.coordinates import at_places
+from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
-from .shooting import Cycle
+from .shooting import Cycle, first_tangential
 
 # A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
 CLOSED = 1e-7
@@ -31,15 +33,16 @@ def corrected(structure: Structure, cycle: Cycle, step, gap, contact: Contact) -
     """The cycle after a step of Newton's method, and the relative size of the step; or its state one period later, if the
     contact mode has changed.
     """
-    n = len(step) // 2
+    n, first = len(step) // 2, first_tangential(structure)
+    _, normal = contact_coordinates(structure)
     held = cycle.contact.status != Status.DETACH
-    constrained = jnp.array([structure.normal, n + structure.normal])
-    # On the belt the normal coordinate is exactly zero.
-    step = jnp.where(held, step.at[constrained].set(-cycle.y[constrained]), step)
+    # On the belt a normal coordinate is exactly zero.
+    constrained = at_places(2 * n, normal, held) | at_places(2 * n, n + normal, held)
+    step = jnp.where(constrained, -cycle.y, step)
     sizes = [jnp.full(n, jnp.max(jnp.abs(part))) for part in (cycle.y[:n], cycle.y[n:])]
-    sizes = jnp.concatenate(sizes).at[n + structure.tangential].set(cycle.period)
-    better = cycle.at(cycle.unknowns(structure.tangential) + step, structure.tangential)
-    changed = contact.status != cycle.contact.status
+    sizes = jnp.concatenate(sizes).at[n + first].set(cycle.period)
+    better = cycle.at(cycle.unknowns(first) + step, first)
+    changed = jnp.any(contact.status != cycle.contact.status)
     later = Cycle(cycle.y + gap, contact, cycle.period)
     # A period that has changed by a factor of two is no longer a guess.
     astray = (better.period < 0.5 * cycle.period) | (better.period > 2 * cycle.period)

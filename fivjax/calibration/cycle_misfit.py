@@ -15,7 +15,7 @@ from ..steppers.base import AbstractStepper
 from .harmonics import beating, fitted_harmonics, taper, without_lines
 from .misfit import AbstractMisfit, Compared, sliding_frequencies
 from .noise import noise_of_means
-from .shooting import Cycle, around, settled
+from .shooting import Cycle, around, settled, unclosed
 
 MOST_HARMONICS = 8
 # The smallest and the largest number of blocks per period: many, because contact after a landing may be short.
@@ -71,7 +71,7 @@ class CycleMisfit(AbstractMisfit):
         rough = times / jnp.maximum(self.fractions[:, 1], ROUGH_FRACTIONS)
         roughly = jnp.concatenate([(self.measured - found) / error, rough])
         residual = jnp.where(share < 1, roughly, exactly)
-        return Compared(residual, self._in_time(lines, own.period), after.y - own.y, after.contact)
+        return Compared(residual, self._in_time(lines, own.period), unclosed(scene, own, after), after.contact)
 
     def _averaged(self, lines, period):
         """Fourier coefficients of the channels' means over blocks."""

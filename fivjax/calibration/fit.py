@@ -17,13 +17,14 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..io.recordings import Averaged, Recording, averaged
 from ..linear.linearisation import linear_sliding
-from ..model.scene import Scene, refuse_several_contacts, sliding_equilibrium
+from ..model.scene import Scene, refuse_vector_contacts, sliding_equilibrium
+from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .conclusion import concluded, not_tried
 from .cycle_misfit import BEATS, cycle_rate, misfit_of_cycle
 from .initial_guesses import latin_hypercube, near_frequencies
-from .parameters import FreeParameters
+from .parameters import FreeParameters, refuse_one_for_each_contact
 from .problem import Problem
 from .result import Calibration, FitOutcome
 from .search import Search
@@ -60,7 +61,8 @@ def calibrate(
 
     - `scene`: the scene that was measured, with a first guess of the free parameters; all others are taken as known.
     - `data`: a `Recording`, or several, each with the parameters known for its run.
-    - `free`: names of parameters, any of `scene.parameters`.
+    - `free`: names of parameters, any of `scene.parameters` that is a single number. Friction laws in a list have a name for
+      each contact: `mu_0`, `mu_1`, …
     - `bounds`: pairs by name. Unless given, a parameter is kept positive (`theta` and `belt_speed` may have any value).
     - `starts`: the number of first guesses: the scene's own, and others within `spread` (relative) around it, drawn with
       `seed`. For limit cycles there are at least 32, with sliding modes at the measured frequency.
@@ -84,7 +86,7 @@ def calibrate(
         'CONVERGED'
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "`calibrate`")
+    refuse_vector_contacts(scene.structure, "`calibrate`")
     recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, list | tuple) else data
     if not isinstance(recordings, tuple) or not recordings:
         raise TypeError(f"Argument `data` must be a Recording or a list of them, but is {arguments.describe(data)}.")
@@ -176,13 +178,19 @@ def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
                 f"Recording {k} states a parameter `{name}` that the scene does not have; it has: "
                 f"{', '.join(sorted(scene.parameters))}."
             )
-    n, normal = scene.structure.size, scene.structure.normal
+        refuse_one_for_each_contact(scene, name, f"stated by recording {k}")
+    n, (_, normal) = scene.structure.size, contact_coordinates(scene.structure)
+    if len(scene.structure.contacts) > 1 and not (recording.sticking is None and recording.detached is None):
+        raise ValueError(
+            f"Recording {k} states a fraction of time, but with several contacts it is not known of which. Leave `sticking` "
+            f"and `detached` out."
+        )
     for channel in recording.channels:
         if channel.coordinate >= n:
             raise ValueError(
                 f"Recording {k} has a channel `{channel}`, but the structure's coordinates are 0 to {n - 1}."
             )
-        if recording.regime == "sliding" and channel.coordinate == normal:
+        if recording.regime == "sliding" and np.any(channel.coordinate == np.asarray(normal)):
             raise ValueError(
                 f"Recording {k} has a channel `{channel}`: the normal coordinate does not move while sliding."
             )

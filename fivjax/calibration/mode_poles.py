@@ -12,6 +12,8 @@ from jaxtyping import Complex, Float
 
 # The most rows of the Hankel matrix: enough to separate two modes that beat within the recording, few enough to be fast.
 MOST_ROWS = 240
+# A pole has more than this energy, in units of what noise adds to a fit of one more pole.
+ABOVE_NOISE = 25.0
 
 
 class Poles(NamedTuple):
@@ -22,8 +24,13 @@ class Poles(NamedTuple):
     explained: float  # share of the signal's energy that these poles explain
 
 
-def strongest_poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> Poles:
-    """The `count` strongest pairs of poles of signals sampled every `dt` s; fewer if there are fewer."""
+def strongest_poles(
+    means: Float[np.ndarray, "B k"], dt: float, count: int, sigma: Float[np.ndarray, " k"] | None = None
+) -> Poles:
+    """The `count` strongest pairs of poles of signals sampled every `dt` s; fewer if there are fewer.
+
+    Modes of parts that are not measured do not show. If the noise `sigma` is given, poles within it are left out.
+    """
     size = np.sqrt(np.mean(means**2, axis=0))
     if not np.all(size > 0):
         return Poles(np.zeros(0, complex), np.zeros((0, means.shape[1]), complex), 0.0)
@@ -49,4 +56,8 @@ def strongest_poles(means: Float[np.ndarray, "B k"], dt: float, count: int) -> P
     left = signals - (waves @ shares).real
     energy = np.linalg.norm(waves[:, : len(upper)], axis=0) * np.linalg.norm(shares[: len(upper)], axis=1)
     order = np.argsort(-energy)
+    if sigma is not None:
+        # A pole has two real numbers, and two more for each channel. Its conjugate carries as much energy.
+        least = ABOVE_NOISE * (2 + 2 * len(size)) * float(np.mean((sigma / size) ** 2))
+        order = order[2 * energy[order] ** 2 > least]
     return Poles(upper[order], (shares[: len(upper)] * size)[order], 1.0 - float(np.mean(left**2)))

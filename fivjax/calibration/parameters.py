@@ -48,6 +48,7 @@ class FreeParameters(eqx.Module):
                 )
         lower, upper, size, kinds = [], [], [], []
         for name in names:
+            refuse_one_for_each_contact(scene, name, "free")
             value = float(known[name])
             low, high = _bound(name, bounds.get(name))
             if not low < value < high:
@@ -95,6 +96,16 @@ class FreeParameters(eqx.Module):
         """The scene with these parameters."""
         values = self.values(u)
         return scene.replace(**{name: values[k] for k, name in enumerate(self.names)})
+
+
+def refuse_one_for_each_contact(scene: Scene, name: str, what: str) -> None:
+    """Refuse a parameter that holds a value for each contact, where a single number is needed."""
+    shape = np.shape(scene.parameters[name])
+    if shape:
+        raise ValueError(
+            f"Parameter `{name}` cannot be {what}: the scene has one value for each of {shape[0]} contacts. Give the scene one "
+            f"number for all contacts, or leave it out."
+        )
 
 
 def _bound(name: str, bound) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from .cycle_misfit import CycleMisfit
 from .least_squares import Evaluated
 from .misfit import OFFSET_UNIT, AbstractMisfit
 from .parameters import FreeParameters
-from .shooting import Cycle
+from .shooting import Cycle, first_tangential
 
 # Regularisation towards the start, for coarse residuals: one standard deviation per change by exp(this), so that parameters
 # that these residuals do not determine stay where they are.
@@ -95,7 +95,8 @@ class Problem(eqx.Module):
 
     @property
     def tangential(self) -> int:
-        return self.scene.structure.tangential
+        """The coordinate whose velocity chooses a point of a cycle."""
+        return first_tangential(self.scene.structure)
 
 
 class About(NamedTuple):

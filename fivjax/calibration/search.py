@@ -166,8 +166,7 @@ class Search:
     @property
     def growth(self) -> float:
         """Size of the largest multiplier of the cycles; 0 without cycles."""
-        structure = self.problem.scene.structure
-        where = structure.size + structure.tangential
+        where = self.problem.scene.structure.size + self.problem.tangential
         systems = self.best.at.about.systems
         return max((growth_of_disturbances(np.asarray(system), where) for system in systems), default=0.0)
 

@@ -4,9 +4,10 @@ A state of a limit cycle returns to itself after one period. With $Φ(y, T)$ the
 
 $$Φ(y, T) - y = 0$$
 
-determines the period and all components of the state but one: the tangential velocity, whose value only chooses a point of the
-cycle. Newton's method solves it to rounding even if the motion settles slowly, and the same equation gives the derivatives,
-over a single period. (In the derivative of a transient, the phase would change by thousands of degrees.)
+determines the period and all components of the state but one: the tangential velocity, of several contacts that of the first,
+whose value only chooses a point of the cycle. Newton's method solves it to rounding even if the motion settles slowly, and the
+same equation gives the derivatives, over a single period. (In the derivative of a transient, the phase would change by
+thousands of degrees.)
 
 Fourier coefficients are integrals over exactly one period. Where the contact closes, velocities jump and accelerations are
 impulses; the coefficients of an acceleration follow from those of its velocity by differentiation.
@@ -16,10 +17,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status, status_from_forces
+from ..contact.coordinates import at_places
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import contact_coordinates
+from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import for_derivatives
@@ -58,6 +63,11 @@ class Around(NamedTuple):
     fractions: Float[Array, "2"]  # of time, sticking and detached
 
 
+def first_tangential(structure: Structure) -> int:
+    """The tangential coordinate of the only or the first contact."""
+    return int(np.ravel(contact_coordinates(structure)[0])[0])
+
+
 def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
     """A guess of the limit cycle under the final load: the motion that starts with 0.9 of the belt's speed, after it has
     settled.
@@ -66,9 +76,9 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     to that state again.
     """
     mechanics, load = Mechanics(scene), scene.load.final
-    n, tangential = scene.structure.size, scene.structure.tangential
+    n, tangential = scene.structure.size, first_tangential(scene.structure)
     q, _ = steady_sliding(scene, load)
-    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + tangential].set(0.9 * scene.belt_speed)
+    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + mechanics.tangential].set(0.9 * scene.belt_speed)
 
     def to_next(carry, h):
         y, contact = carry
@@ -88,7 +98,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS)
     back = jnp.argmin(jnp.where(tried & jnp.isfinite(apart), apart, jnp.inf))
     # A motion that has died out is no cycle.
-    moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.abs(scene.belt_speed))
+    moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.max(jnp.abs(scene.belt_speed)))
     period = jnp.where(moves, (back - begin) / (LOOKS * frequency), jnp.nan)
     return Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
 
@@ -101,7 +111,9 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
     def add(total, segment: Segment):
         lines, spent = total
         within = method.within(mechanics, segment.contact, load, segment.y, segment.after.h)
-        spent = spent + jnp.where(segment.contact.status == codes, segment.after.h, 0.0)
+        # With several contacts, those of the first; fractions in a recording are refused then.
+        status = segment.contact.status[0] if mechanics.several else segment.contact.status
+        spent = spent + jnp.where(status == codes, segment.after.h, 0.0)
         return lines + _integrals(within, segment.t, cycle.period, count), spent
 
     total = (jnp.zeros((count, 2, scene.structure.size)), jnp.zeros(2))
@@ -109,6 +121,26 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
     lines, spent = after.total
     lines = (2 / cycle.period) * (lines[:, 0] - 1j * lines[:, 1])
     return Around(jnp.where(after.enough, after.y, jnp.nan), after.contact, lines, spent / cycle.period)
+
+
+def unclosed(scene: Scene, cycle: Cycle, after: Around) -> State:
+    """What closes the cycle where it is zero: the state after the period less that before it.
+
+    With several contacts, one of them may have no event in the whole period. What it holds then returns whatever it was, which
+    is no equation. So for contacts that begin and end in the same status, it is that the gap is closed and nothing slips.
+    """
+    gap = after.y - cycle.y
+    tangential, normal = contact_coordinates(scene.structure)
+    if not isinstance(normal, np.ndarray):
+        return gap
+    n, status = scene.structure.size, cycle.contact.status
+    same = status == after.contact.status
+    touching, sticking = same & (status != Status.DETACH), same & (status == Status.STICK)
+    held = at_places(2 * n, normal, touching) | at_places(2 * n, n + normal, touching)
+    # The velocity of the first contact is no unknown.
+    stuck = at_places(2 * n, n + tangential, sticking & (np.arange(len(normal)) > 0))
+    belt = jnp.zeros(2 * n).at[n + tangential].set(scene.belt_speed)
+    return jnp.where(stuck, belt - cycle.y, jnp.where(held, -cycle.y, gap))
 
 
 def _integrals(within: Within, t, period, count: int) -> Float[Array, "count 2 n"]:

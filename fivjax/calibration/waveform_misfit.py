@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float
 from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import sliding_coordinates
+from ..model.sliding import contact_coordinates, sliding_coordinates
 from ..simulation.trajectory import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from .characteristic import characteristic_residual
@@ -57,7 +57,7 @@ class SlidingMisfit(AbstractWaveformMisfit):
         m = matrix.shape[0] // 2
         width = self.edges[1] - self.edges[0]
         states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
-        keep = sliding_coordinates(scene.structure.size, scene.structure.normal).tolist()
+        keep = sliding_coordinates(scene.structure.size, contact_coordinates(scene.structure)[1]).tolist()
         columns = []
         for quantity, coordinate in self.channels:
             row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
@@ -97,12 +97,9 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
 
 
 def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
-    """The same for constant friction, if the contact never stops sliding: exact, from one jump of the load to the next."""
-    matrix, keep = (
-        linear_sliding(scene).matrix,
-        sliding_coordinates(scene.structure.size, scene.structure.normal).tolist(),
-    )
-    n = scene.structure.size
+    """The same for constant friction, if no contact ever stops sliding: exact, from one jump of the load to the next."""
+    n, matrix = scene.structure.size, linear_sliding(scene).matrix
+    keep = sliding_coordinates(n, contact_coordinates(scene.structure)[1]).tolist()
     steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
 
     def equilibrium(force):
@@ -148,9 +145,10 @@ def misfit_of_waveform(
     width = blocks.edges[1] - blocks.edges[0]
     # The response to a kick may be a small motion again towards its end.
     tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
-    found = strongest_poles(tail, width, scene.structure.size - 1)
+    modes = scene.structure.size - len(scene.structure.contacts)
+    found = strongest_poles(tail, width, modes, sigma)
     # Padded to the largest number of poles, so that all recordings of this length share compiled programs.
-    values = np.full(scene.structure.size - 1, np.nan, complex)
+    values = np.full(modes, np.nan, complex)
     shapes = np.full((len(values), len(recording.channels)), np.nan, complex)
     if found.explained > LEAST_EXPLAINED:
         values[: len(found.values)], shapes[: len(found.values)] = found.values, found.shapes
@@ -164,5 +162,5 @@ def misfit_of_waveform(
         "channels": recording.channels,
     }
     if recording.regime == "sliding":
-        return SlidingMisfit(**common, projected=2 * (scene.structure.size - 1))
+        return SlidingMisfit(**common, projected=2 * modes)
     return KickMisfit(**common, method=method, uneventful=uneventful)
