@@ -66,7 +66,7 @@ def slid(scene: fj.Scene, begin: float, end: float, rate: float = RATE) -> np.nd
     for matrix in (mass, damping, stiffness, load):
         for contact, law in zip(contacts, scene.friction.laws, strict=True):
             matrix[contact.tangential] -= float(law.mu) * matrix[contact.normal]
-    free = np.setdiff1d(np.arange(len(load)), [contact.normal for contact in contacts])
+    free = np.setdiff1d(np.arange(len(load)), np.array([contact.normal for contact in contacts], int))
     mass, damping, stiffness = (matrix[np.ix_(free, free)] for matrix in (mass, damping, stiffness))
     m = len(free)
     lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))

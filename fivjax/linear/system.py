@@ -31,7 +31,7 @@ def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
         raise ValueError("Argument `mu` must not be given with a scene; use `scene.replace(mu=...)`.")
     if direction != 1:
         raise ValueError("Argument `direction` must not be given with a scene: the sign of its belt speed says it.")
-    if is_known(system.belt_speed) and system.belt_speed == 0:
+    if is_known(system.belt_speed) and np.any(np.asarray(system.belt_speed) == 0):
         raise ValueError("Argument `belt_speed` must not be zero: nothing slides steadily on a belt at rest.")
     return system
 

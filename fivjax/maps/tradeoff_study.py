@@ -18,7 +18,7 @@ from ..io.datasets import labelled
 from ..linear.cea import eigenvalues
 from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
-from ..model.scene import Scene, refuse_painleve, refuse_several_contacts
+from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
 from ..simulation.energy import EnergyData
 from ..simulation.start import start_state
 from ..simulation.trajectory import states_at
@@ -155,7 +155,7 @@ def table(dataset: xr.Dataset) -> str:
 
 def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "`tradeoff`")
+    refuse_vector_contacts(scene.structure, "`tradeoff`")
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
     for name, method in methods.items():
@@ -236,8 +236,10 @@ def _timed(function: Callable) -> float:
 
 def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStepper], dict[str, float]]:
     """A function that gives a method's errors in p_crit and in the verdicts of a row of kicks; none if there is no p_crit."""
-    now = np.asarray(scene.belt_speed)[None]
-    found = critical_perturbation(scene, belt_speed=now, p_step=0.05, tolerance=1e-7, progress=False)
+    # One value of some axis; each of several contacts may have its own belt speed, which is none.
+    name = "force" if np.ndim(scene.belt_speed) else "belt_speed"
+    now = {name: np.asarray(scene.parameters[name])[None]}
+    found = critical_perturbation(scene, **now, p_step=0.05, tolerance=1e-7, progress=False)
     p_crit = float(found["p_crit"][0])
     if not np.isfinite(p_crit) and p is None:
         return lambda method: {}
@@ -252,7 +254,7 @@ def _boundary(scene: Scene, exact: AbstractStepper, p) -> Callable[[AbstractStep
             return shares
         near = (max(0.0, p_crit - 0.05), p_crit + 0.05)
         own = critical_perturbation(
-            scene, belt_speed=now, p_range=near, p_step=0.01, tolerance=1e-5, method=method, t_max=10.0, progress=False
+            scene, **now, p_range=near, p_step=0.01, tolerance=1e-5, method=method, t_max=10.0, progress=False
         )
         return {**shares, "p_crit_error": abs(float(own["p_crit"][0]) - p_crit)}
 

@@ -13,7 +13,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..linear.critical import critical_friction
 from ..maps.bistability import bistability_map
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.scene import Scene, refuse_vector_contacts
 from ..simulation.trajectory import Trajectory, simulate
 from ..verdicts.verdict import Verdict
 from .map_picture import MapPicture
@@ -39,7 +39,8 @@ def explorer(
         fj.explorer(scene, fj.bistability_map(scene, mu=…, p=…))  # a click on the map opens that trajectory
 
     A map belongs to the parameters for which it was computed: when other sliders change, it is greyed out, and a button
-    computes it anew.
+    computes it anew. With several contacts, each has its colour and its row of statuses; parameters that hold a value for each
+    contact have no slider.
 
     **Arguments:** `scene`, which gives the first values of the sliders; `dataset`, a map over two of the scene's parameters;
     `t1`, the time to simulate, in s; `ranges`, the ends of sliders by name of parameter.
@@ -54,7 +55,7 @@ def explorer(
         >>> explorer = fj.explorer(scene, t1=0.5)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_several_contacts(scene.structure, "`explorer`")
+    refuse_vector_contacts(scene.structure, "`explorer`")
     arguments.real_number("t1", t1, above=0)
     if dataset is not None:
         arguments.instance("dataset", dataset, xr.Dataset, "a map, such as `bistability_map` returns")
@@ -78,9 +79,15 @@ class Explorer:
             )
         self._map = None if dataset is None else MapPicture(dataset, scene)
         axes = {} if self._map is None else self._map.values
+        shaped = [name for name in ranges if np.ndim(scene.parameters[name])]
+        if shaped:
+            raise ValueError(
+                f"Argument `ranges` must name parameters that are single numbers, but `{shaped[0]}` holds one for each "
+                f"contact. Give the scene one number for all contacts."
+            )
         self._exact = {name: float(scene.parameters[name]) for name in parameters_shown(scene, {**ranges, **axes})}
         self.sliders = {name: slider(widgets, name, value, ranges, axes) for name, value in self._exact.items()}
-        self._panels = drawing_panels(t1)
+        self._panels = drawing_panels(t1, len(scene.structure.contacts))
         self.picture = picture(name="response", layout=PICTURE)
         self.said = widgets.HTML()
         self.map = self.anew = None
@@ -205,10 +212,18 @@ def _in_words(known: tuple[Verdict, float] | None) -> str:
 def _said(run: Trajectory) -> list[str]:
     assert run.energy is not None
     ledger = run.energy.ledger
-    limit = float(critical_friction(run.scene.structure, direction=1 if run.scene.belt_speed > 0 else -1))
+    structure, count = run.scene.structure, len(run.scene.structure.contacts)
+    if count == 1:
+        durations = [f"sticks {1e3 * ledger.stick_time[-1]:.1f} ms, detached {1e3 * ledger.detach_time[-1]:.1f} ms"]
+    else:
+        stick, detach = (1e3 * np.asarray(ledger.by_contact[name][-1]) for name in ("stick_time", "detach_time"))
+        durations = [f"contact {i} sticks {stick[i]:.1f} ms, detached {detach[i]:.1f} ms" for i in range(count)]
+    ways = np.unique(np.sign(np.asarray(run.scene.belt_speed)))
+    # Linear theory has one friction for all contacts, on belts that move the same way.
+    limits = [f"{float(critical_friction(structure, direction=int(way))):.4f}" for way in ways]
     return [
-        f"μ_crit = {limit:.4f} (linear theory, this structure)",
+        *(f"μ_crit = {limit} (linear theory, this structure)" for limit in limits if len(limits) == 1),
         f"{int(ledger.events[-1])} contact events in {run.t[-1]:g} s",
-        f"sticks {1e3 * ledger.stick_time[-1]:.1f} ms, detached {1e3 * ledger.detach_time[-1]:.1f} ms",
+        *durations,
         f"mechanical energy at the end {run.energy.mechanical[-1]:.4g} J",
     ]

@@ -33,7 +33,7 @@ class MapPicture:
         """Parameters, other than the map's axes, in which a scene differs from the map's: by name, the map's value and the
         scene's.
         """
-        ours, theirs = ({name: float(x) for name, x in one.parameters.items()} for one in (self.scene, scene))
+        ours, theirs = (_numbers(one) for one in (self.scene, scene))
         names = [name for name in dict.fromkeys([*ours, *theirs]) if name not in self.values]
         return {name: (ours.get(name), theirs.get(name)) for name in names if ours.get(name) != theirs.get(name)}
 
@@ -70,6 +70,17 @@ class MapPicture:
             name: float(values[np.argmin(np.abs(values - value))])
             for (name, values), value in zip(self.values.items(), at, strict=True)
         }
+
+
+def _numbers(scene: Scene) -> dict[str, float]:
+    """The parameters of a scene, those with a value for each contact one by one."""
+    found = {}
+    for name, value in scene.parameters.items():
+        if np.ndim(value):
+            found |= {f"{name}_{i}": float(x) for i, x in enumerate(value)}
+        else:
+            found[name] = float(value)
+    return found
 
 
 def stale(different: dict[str, tuple[float | None, float | None]]) -> str:

@@ -10,56 +10,72 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
 from ..contact import Status
+from ..model.sliding import contact_coordinates
 from ..plot import STATUS_NAMES
-from ..plot.style import BLACK, BLUE, GREEN, VERMILION
+from ..plot.style import BLACK, BLUE, COLOURS, GREEN, VERMILION
 from ..simulation.trajectory import Trajectory
 
 # The smallest range of a panel's axis, as a share of the load over the mass, the belt speed, the displacement or the energy of
 # steady sliding. Far below it there is only rounding.
 LEAST = 1e-2
+# The distance of the statuses of one contact from those of the next, in a panel where stick and slide are 1 apart.
+APART = 0.5
 
 
-def drawing_panels(t1: float) -> Callable[[Trajectory], bytes]:
-    """A function that draws a trajectory up to `t1` (s) and returns PNG."""
+def drawing_panels(t1: float, contacts: int = 1) -> Callable[[Trajectory], bytes]:
+    """A function that draws a trajectory of so many contacts up to `t1` (s) and returns PNG.
+
+    Each of several contacts has its colour, and its row of dots beside each status.
+    """
     figure = Figure(figsize=(8.4, 4.8), dpi=80)
     canvas = FigureCanvasAgg(figure)
     response, status, energy, phase = _axes(figure, t1)
-    (wave,) = response.plot([], [], color=BLUE, lw=0.7)
-    (steps,) = status.plot([], [], ".", color=VERMILION, ms=2)
+    colours = [BLUE] if contacts == 1 else [COLOURS[1 + i % (len(COLOURS) - 1)] for i in range(contacts)]
+    waves = [response.plot([], [], color=colour, lw=0.7, label=f"contact {i}")[0] for i, colour in enumerate(colours)]
+    dots = [VERMILION] if contacts == 1 else colours
+    steps = [status.plot([], [], ".", color=colour, ms=2)[0] for colour in dots]
+    offsets = APART * (np.arange(contacts) - 0.5 * (contacts - 1)) / contacts
     (mechanical,) = energy.plot([], [], color=BLACK, lw=1.0, label="mechanical energy")
     (contact,) = energy.plot([], [], color=GREEN, lw=1.0, ls="--", label="from the contact, less damping")
     # The last point is marked, so that a motion at rest is visible.
-    (orbit,) = phase.plot([], [], color=BLUE, lw=0.8, marker="o", ms=3, markevery=[-1])
-    belt = phase.axhline(0, color=BLACK, ls=":", lw=0.8)
+    curves = [phase.plot([], [], color=colour, lw=0.8, marker="o", ms=3, markevery=[-1])[0] for colour in colours]
+    belts = [phase.axhline(0, color=BLACK if contacts == 1 else colour, ls=":", lw=0.8) for colour in colours]
     # Between two panels, where it covers no curve.
     place = {"loc": "lower right", "bbox_to_anchor": (1, 0.97), "borderaxespad": 0, "borderpad": 0.3}
     energy.legend(**place, ncols=2, fontsize="small", frameon=False)
+    if contacts > 1:
+        response.legend(**place, ncols=min(contacts, 5), fontsize="small", frameon=False)
 
     def draw(run: Trajectory) -> bytes:
-        tangential = run.scene.structure.tangential
-        late = np.asarray(run.t) > 0.7 * t1
+        structure, late = run.scene.structure, np.asarray(run.t) > 0.7 * t1
+        places = np.ravel(contact_coordinates(structure)[0])
         assert run.energy is not None
-        lines = (
-            (wave, run.t, run.acceleration[:, tangential]),
-            (steps, run.t, run.status),
-            (mechanical, run.t, run.energy.mechanical),
-            (contact, run.t, run.energy.work.contact - run.energy.work.damping),
-            (orbit, 1e3 * run.displacement[late, tangential], run.velocity[late, tangential]),
-        )
-        for line, x, y in lines:
-            line.set_data(x, y)
-        belt.set_ydata([float(run.scene.belt_speed)] * 2)
-        force, mass = float(run.scene.load.force), float(run.scene.structure.mass[tangential, tangential])
-        response.set_ylim(limits(wave.get_ydata(), LEAST * force / mass))
-        stored = np.concatenate([mechanical.get_ydata(), contact.get_ydata()])
+        mechanical.set_data(run.t, run.energy.mechanical)
+        contact.set_data(run.t, run.energy.work.contact - run.energy.work.damping)
+        statuses = np.reshape(run.status, (len(run.t), contacts))
+        speeds = np.broadcast_to(np.asarray(run.scene.belt_speed), contacts)
+        for i, place in enumerate(places):
+            waves[i].set_data(run.t, run.acceleration[:, place])
+            steps[i].set_data(run.t, statuses[:, i] + offsets[i])
+            curves[i].set_data(1e3 * run.displacement[late, place], run.velocity[late, place])
+            belts[i].set_ydata([float(speeds[i])] * 2)
+        force, mass = float(run.scene.load.force), float(structure.mass[places[0], places[0]])
+        response.set_ylim(limits(_every(waves), LEAST * force / mass))
+        stored = _every([mechanical, contact])
         energy.set_ylim(limits(stored, LEAST * np.nanmax(np.abs(stored))))
-        phase.set_xlim(limits(orbit.get_xdata(), LEAST * np.nanmax(np.abs(orbit.get_xdata()))))
+        across = _every(curves, "get_xdata")
+        phase.set_xlim(limits(across, LEAST * np.nanmax(np.abs(across))))
         # A belt speed far from the motion's is left out, because it would shrink the motion in the picture.
-        phase.set_ylim(limits(orbit.get_ydata(), LEAST * abs(float(run.scene.belt_speed))))
+        phase.set_ylim(limits(_every(curves), LEAST * float(np.max(np.abs(speeds)))))
         canvas.draw()
         return png(canvas)
 
     return draw
+
+
+def _every(lines, data: str = "get_ydata") -> np.ndarray:
+    """The values of all lines."""
+    return np.concatenate([getattr(line, data)() for line in lines])
 
 
 def limits(values, least: float) -> tuple[float, float]:

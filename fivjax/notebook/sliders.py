@@ -1,5 +1,6 @@
 """The explorer's sliders: which parameters have one, their ranges and steps, and their layout."""
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -25,13 +26,20 @@ PICTURE = {"flex": "1 1 480px", "max_width": "680px"}
 
 def parameters_shown(scene: Scene, also: Mapping) -> list[str]:
     """The names of the parameters that have a slider, in order."""
-    names = [name for name in FIRST if name in scene.parameters] + list(scene.structure.parameters)
-    return list(dict.fromkeys([*names, *also]))
+    # A parameter with a value for each contact has none.
+    single = [name for name, value in scene.parameters.items() if np.ndim(value) == 0]
+    first = [name for kind in FIRST for name in single if name == kind or _kind(name) == kind]
+    return list(dict.fromkeys([*first, *scene.structure.parameters, *also]))
+
+
+def _kind(name: str) -> str:
+    """The name without the contact's number: `mu` of `mu_1`."""
+    return re.sub(r"_\d+$", "", name)
 
 
 def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     """A slider for one parameter; its range includes the scene's value and both ends of the map's axis of that name."""
-    low, high = ranges.get(name) or RANGES.get(name) or tuple(share * value for share in SHARES)
+    low, high = ranges.get(name) or RANGES.get(_kind(name)) or tuple(share * value for share in SHARES)
     reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:
@@ -42,7 +50,7 @@ def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     step = float(power * max(k for k in (1, 2, 5) if k <= finest / power * (1 + 1e-9)))
     # A browser rounds to steps from the lower end, so the scene's value must be a whole number of steps from it.
     low = max(low, float(np.round(value - step * np.floor((value - low) / step + 1e-9), 12)))
-    unit = QUANTITIES[name][1] if name in QUANTITIES else "1"
+    unit = next((QUANTITIES[one][1] for one in (name, _kind(name)) if one in QUANTITIES), "1")
     return widgets.FloatSlider(
         value,
         min=low,

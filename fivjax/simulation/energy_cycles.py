@@ -3,6 +3,9 @@
 A cycle lasts from one instant at which the tangential velocity rises through zero to the next; these are turning points of the
 motion. From the row before such an instant the trajectory is stepped again up to it, so times, energies and durations are those
 of the instant itself. The same is done for contact events.
+
+With several contacts, the velocity that rises is the weighted sum of `steppers.section`, and events at one instant are one
+row (or two, where rounding puts one of them behind the other).
 """
 
 from collections.abc import Callable
@@ -18,7 +21,8 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled, power_of_4
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.scene import Scene, refuse_vector_contacts
+from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
 from . import energy as accounts
@@ -48,8 +52,9 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
     (the sum of `stick_work` and `slide_work`), `interface_work`, `damping_work` (also by damper where the structure names
     them), `load_work`, `impact_loss`, `impact_dissipated`, and `energy_gain`, the growth of mechanical energy. Durations in s:
     `stick_time`, `slide_time`, `detach_time`. At the start of the cycle: `mechanical_energy`, and the tangential displacement
-    `turning_point` in m. Coordinates `cycle_start` and `cycle_end` in s. Exact for `EventExact`; for other methods,
-    the ends of cycles have the error of the method.
+    `turning_point` in m. With several contacts, durations and turning points also have an axis `contact`, and works at the
+    contacts are also given one by one (`stick_work_0`, …). Coordinates `cycle_start` and `cycle_end` in s. Exact for
+    `EventExact`; for other methods, the ends of cycles have the error of the method.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
 
@@ -68,15 +73,18 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
         "impact_loss": found.ledger.impact,
         "impact_dissipated": found.ledger.impact_dissipated,
         "energy_gain": energy,
-        "stick_time": found.ledger.stick_time,
-        "slide_time": found.t - found.ledger.stick_time - found.ledger.detach_time,
-        "detach_time": found.ledger.detach_time,
     }
+    several = len(run.scene.structure.contacts) > 1
+    t, times = found.t[:, None] if several else found.t, found.ledger.by_contact if several else vars(found.ledger)
+    stick, detach = times["stick_time"], times["detach_time"]
+    lasted = {"stick_time": stick, "slide_time": t - stick - detach, "detach_time": detach}
+    of_each = ("cycle", "contact") if several else "cycle"
     over = {name: ("cycle", np.diff(line)) for name, line in lines.items() if name != "kick_work"}
+    over |= {name: (of_each, np.diff(line, axis=0)) for name, line in lasted.items()}
     count = max(len(found.t) - 1, 0)
     at = {
         "mechanical_energy": ("cycle", energy[:count]),
-        "turning_point": ("cycle", found.y[:count, run.scene.structure.tangential]),
+        "turning_point": (of_each, found.y[:count, contact_coordinates(run.scene.structure)[0]]),
     }
     coords = {
         "cycle": np.arange(count),
@@ -95,9 +103,9 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     **Arguments:** `run`, from `simulate(..., energy=True)`.
 
     **Returns:** a dataset over `event`: `event_time` in s; `status_before` and `status_after` (equal for a rebound, and where
-    slip reverses without sticking); `impact_loss` and `impact_dissipated` in J, zero except for re-contacts; and
-    `mechanical_energy` just after the event, in J. Exact for `EventExact`; for other methods, times have the error of the
-    method.
+    slip reverses without sticking), over several contacts with an axis `contact`; `impact_loss` and `impact_dissipated` in J,
+    zero except for re-contacts; and `mechanical_energy` just after the event, in J. Exact for `EventExact`; for other methods,
+    times have the error of the method.
 
     **Raises:** `TypeError` for anything but a trajectory, `ValueError` for one without a ledger.
 
@@ -109,9 +117,13 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     """
     _check(run)
     found, before = _marks(run, _events)
+    several = len(run.scene.structure.contacts) > 1
+    of_each = ("event", "contact") if several else "event"
+    status = {
+        "status_before": (of_each, before.astype(np.int8)),
+        "status_after": (of_each, found.contact.status.astype(np.int8)),
+    }
     variables = {
-        "status_before": before.astype(np.int8),
-        "status_after": found.contact.status.astype(np.int8),
         "impact_loss": np.diff(found.ledger.impact, prepend=0.0),
         "impact_dissipated": np.diff(found.ledger.impact_dissipated, prepend=0.0),
         "mechanical_energy": _mechanical(run.scene, found),
@@ -119,7 +131,7 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     coords = {"event": np.arange(len(found.t)), "event_time": ("event", found.t)}
     import xarray as xr
 
-    return labelled(xr.Dataset({name: ("event", x) for name, x in variables.items()}, coords), run.scene)
+    return labelled(xr.Dataset(status | {name: ("event", x) for name, x in variables.items()}, coords), run.scene)
 
 
 # Named functions, so that programs compiled for them are found again.
@@ -133,7 +145,7 @@ def _events(ledger: Ledger) -> Array:
 
 def _check(run) -> None:
     arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
-    refuse_several_contacts(run.scene.structure, "A table of cycles or events")
+    refuse_vector_contacts(run.scene.structure, "A table of cycles or events")
     if run.energy is None:
         raise ValueError(
             "Argument `run` must come with its ledger, but has none; ask for it: `simulate(..., energy=True)`."
@@ -161,6 +173,9 @@ def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant,
     found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
     wanted = np.zeros((padded_rows, most), bool)
     wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
+    # Events of several contacts at one instant are one row.
+    reached = np.asarray(count(found.ledger))
+    wanted &= np.diff(reached, axis=1, prepend=np.asarray(count(starts.ledger))[:, None]) > 0
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
 
 

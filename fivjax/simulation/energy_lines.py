@@ -62,7 +62,7 @@ class Ledger(eqx.Module):
     stick_time: Float[Array, "..."]  # time spent sticking, s; with several contacts, while all of them do
     detach_time: Float[Array, "..."]  # time spent detached, s; with several contacts, while all of them are
     events: Int[Array, "..."]  # status changes, rebounds and reversals of slip
-    crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity
+    crossings: Int[Array, "..."]  # upward zero crossings of the tangential velocity; see `steppers.section`
     beyond_rest: Float[Array, "..."]  # work of all forces but impacts beyond those at rest, J; see `energy`
     start: Float[Array, "..."]  # mechanical energy at the start, of displacements from rest, J
     worst: Float[Array, "..."]  # largest size of the residual so far, J
