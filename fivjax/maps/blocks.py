@@ -52,7 +52,7 @@ def in_blocks(
         size = LARGE_BLOCK_ON_CPU if len(group) >= MANY else BLOCK_ON_CPU
     rows, devices = max(1, size // width), jax.local_devices()
 
-    def run(start: int, numbers: np.ndarray | None) -> Flattened:
+    def run(start: int) -> tuple[np.ndarray, np.ndarray, tuple]:
         # The last block is padded with copies of its first row.
         chosen = np.arange(start, start + rows)
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
@@ -61,14 +61,22 @@ def in_blocks(
         with jax.enable_x64(True), jax.default_device(device):  # each thread has its own settings
             own = Flattened(shared.numbers[group[place[:, 0]]], shared.form)
             result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
-            part = np.asarray(result.numbers)
-        numbers = np.empty((len(group), part.shape[-1])) if numbers is None else numbers
-        # Written into the result at once, so that the parts do not take memory as well.
-        numbers[place[real]] = part[real]
-        return Flattened(numbers, result.form)
+            return place[real], np.asarray(result.numbers)[real], result.form
 
-    results = trajectories if in_place else run(0, None)
-    for _ in pool.map(lambda start: run(start, results.numbers), range(0 if in_place else rows, len(slots), rows)):
+    starts, results = range(0, len(slots), rows), trajectories
+    if not in_place:
+        # The first blocks say what the results look like.
+        begun, starts = list(pool.map(run, starts[: workers()])), starts[workers() :]
+        results = Flattened(np.empty((len(group), begun[0][1].shape[-1])), begun[0][2])
+        for place, numbers, _ in begun:
+            results.numbers[place] = numbers
+
+    def run_and_keep(start: int) -> None:
+        # Written into the result at once, so that the parts do not take memory as well.
+        place, numbers, _ = run(start)
+        results.numbers[place] = numbers
+
+    for _ in pool.map(run_and_keep, starts):
         pass
     return results
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
 from ..cycles.closing import CLOSED, EXACT
-from ..verdicts.capture import LARGEST, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
+from ..verdicts.capture import LARGEST, PROBED, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
 from ..verdicts.capture_of_several import free_directions, trial_of_several
 from .section import ReturnMaps, Section
 
@@ -71,14 +71,19 @@ def stable_cycles(
         return []
     now, lag = last.rows(near), lag[near]
     closed = _closed(maps, group[near], now, lag)
-    # Of those that are the same, the first stands for all.
+    stable = np.flatnonzero(closed.residual <= CLOSED)
+    if not len(stable):
+        return []
+    _, points = maps.path(group[near[stable]], closed.at.rows(stable), int(np.max(lag[stable])))
+    points = np.concatenate([closed.at.y[stable][:, None], points], axis=1)
+    points_of = {row: points[k, : lag[row]] for k, row in enumerate(stable)}
+    # Of those that are the same, at whichever of its crossings, the first stands for all.
     kept: list[int] = []
     rows_of: list[list[int]] = []
-    for row in np.flatnonzero(closed.residual <= CLOSED):
-        size = np.linalg.norm(weights * closed.at.y[row])
+    for row in stable:
         for k, other in enumerate(kept):
             same = group[near[other]] == group[near[row]] and lag[other] == lag[row]
-            if same and np.linalg.norm(weights * (closed.at.y[other] - closed.at.y[row])) < SAME * size:
+            if same and _passes(maps, closed.at.y[row], points_of[other]):
                 rows_of[k].append(near[row])
                 break
         else:
@@ -104,12 +109,11 @@ def stable_cycles(
     smallest = np.where((lag[chosen] > CROSSINGS) & (not settled), SMALLEST_OF_MANY, SMALLEST)
     neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable], smallest)
     amplitude = maps.peaks(own, centre, lag[chosen])
-    _, points = maps.path(own, centre, int(np.max(lag[chosen])))
-    points = np.concatenate([centre.y[:, None], points], axis=1)
     for k, (place, row) in enumerate(zip(stable, chosen, strict=True)):
         if neighbourhoods[k] is not None:
-            states = points[k, : lag[row]]
-            cycle = Cycle(states, float(closed.period[row]), largest[place], float(amplitude[k]), neighbourhoods[k])
+            cycle = Cycle(
+                points_of[row], float(closed.period[row]), largest[place], float(amplitude[k]), neighbourhoods[k]
+            )
             found.append((int(own[k]), np.array(rows_of[place]), cycle))
     return found
 
@@ -121,11 +125,13 @@ def is_new(maps: ReturnMaps, cycle: Cycle, known: list[Cycle]) -> bool:
 
 def _passing(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle]) -> Cycle | None:
     """The one of these cycles that has this state among its points."""
-    size = np.linalg.norm(maps.weights * y)
-    for cycle in cycles:
-        if np.min(np.linalg.norm(maps.weights * (cycle.points - y), axis=1)) < SAME * size:
-            return cycle
-    return None
+    return next((cycle for cycle in cycles if _passes(maps, y, cycle.points)), None)
+
+
+def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether this state is among those points."""
+    apart = np.min(np.linalg.norm(maps.weights * (points - y), axis=1))
+    return bool(apart < SAME * np.linalg.norm(maps.weights * y))
 
 
 class _Closed(NamedTuple):
@@ -194,11 +200,13 @@ def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial], sma
     found: list[Neighbourhood | None] = [None] * len(trials)
     open_ = list(range(len(trials)))
     while open_:
-        few = _passed(maps, group, crossings, [trials[k].probe() for k in open_], radius, open_)
-        promising = [k for k, passed in zip(open_, few, strict=True) if passed is not None]
-        all_ = _passed(maps, group, crossings, [trials[k] for k in promising], radius, promising)
-        for k, passed in zip(promising, all_, strict=True):
-            found[k] = passed
+        promising = open_
+        for one_in in (*PROBED, 1):
+            tried = [trials[k].probe(one_in) for k in promising]
+            passed = dict(zip(promising, _passed(maps, group, crossings, tried, radius, promising), strict=True))
+            promising = [k for k in promising if passed[k] is not None]
+        for k in promising:
+            found[k] = passed[k]
         open_ = [k for k in open_ if found[k] is None]
         radius[open_] *= 0.5
         open_ = [k for k in open_ if radius[k] >= smallest[k]]

@@ -24,6 +24,8 @@ COST_OF_STANDING_ALONE = 4
 # The most trajectories of a job, with `Windowed` and with other steppers: some seconds of work, because an interrupt loses as
 # much; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
+# The most groups of a job, for the same reason: most of the work on a small group are its attractors.
+GROUPS_IN_A_JOB = 256
 # Memory that a job may take, bytes: trajectories in small groups take much.
 OF_A_JOB = 2.5e8
 
@@ -53,8 +55,9 @@ def planned(
     states = {} if states is None else dict(states)
     trajectories = values if isinstance(values, Grid) else Listed(values, tuple(states))
     followed = method if energy else in_bulk(method, scene)
-    each = bytes_per_trajectory(scene, trajectories.total / trajectories.group_count)
-    jobs = trajectories.jobs(places, in_a_job(followed, each))
+    of_group = trajectories.total / trajectories.group_count
+    each = bytes_per_trajectory(scene, of_group)
+    jobs = trajectories.jobs(places, in_a_job(followed, each, of_group))
     counts, later = np.zeros(trajectories.group_count, np.int64), []
     for number, own in enumerate(jobs):
         groups, here = np.unique(trajectories.groups(own), return_counts=True)
@@ -81,7 +84,7 @@ def planned(
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def in_a_job(method: AbstractStepper | Windowed, each: float) -> int:
-    """The most trajectories of a job, if each takes `each` bytes."""
+def in_a_job(method: AbstractStepper | Windowed, each: float, of_group: float) -> int:
+    """The most trajectories of a job, if each takes `each` bytes and so many, on average, are of one group."""
     by_time = IN_A_JOB if isinstance(method, Windowed) else IN_A_LONG_JOB
-    return max(1, min(by_time, int(OF_A_JOB // each)))
+    return max(1, min(by_time, int(OF_A_JOB // each), int(GROUPS_IN_A_JOB * of_group)))

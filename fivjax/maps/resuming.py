@@ -38,6 +38,7 @@ def keeper_at(
     }
     if not is_store(path):
         return Checkpoint(path, run)
-    each = bytes_per_trajectory(scene, grid.total / grid.group_count)
-    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each))
+    of_group = grid.total / grid.group_count
+    each = bytes_per_trajectory(scene, of_group)
+    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group))
     return Store(path, run, grid, tile, energy)

@@ -32,9 +32,10 @@ SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
 PARTING_TIMES, PARTED, CLOSED_IN, AS_ON_A_TORUS = 128, 30.0, 15.0, 7.0
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
-# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share while the motions
-# settled for so many returns. Else they settle again, so often at most: a set whose amplitude still drifts is not accepted.
-PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 32, 128, 1e-3, 12
+# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share since before it was
+# asked whether neighbours part. Else the motions settle for so many returns, again and again, so often at most: a set whose
+# amplitude still drifts is not accepted.
+PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 32, 2 * PARTING_OVER, 7.5e-4, 16
 
 
 class Torus(NamedTuple):
@@ -65,16 +66,21 @@ def tori_among(
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
     group, at = own[chosen // tube.STARTS], last.rows(chosen)
+    peak, at = _highest(maps, group, at)
     growth, period, later, path = _parting(maps, group, at)
     growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
     lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
-    closing_in = np.flatnonzero(np.repeat(growth < LOCKED, FURTHER))[:: FURTHER // NOMINATED]
+    closing_in = np.flatnonzero(growth < LOCKED)
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
-    if len(closing_in):
-        of_group = {int(groups[k]): known[k] for k, _ in sets}
-        for _, rows, cycle in stable_cycles(maps, group[closing_in], at.rows(closing_in), of_group, MORE_CROSSINGS):
-            of_torus = closing_in[rows] // FURTHER
+    of_group = {int(groups[k]): known[k] for k, _ in sets}
+    # One motion of each after the other, because most lead to the same cycle.
+    for nominee in range(0, FURTHER, FURTHER // NOMINATED):
+        asks = FURTHER * closing_in[~np.isin(closing_in, locked)] + nominee
+        if not len(asks):
+            break
+        for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS):
+            of_torus = asks[rows] // FURTHER
             cycles.append((sets[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
@@ -82,7 +88,7 @@ def tori_among(
     if not len(kept):
         return {}, cycles
     rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
-    peak = _settled_peak(maps, group[rows], later.rows(rows))
+    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept])
     tori = {}
     for k, mean, highest in zip(kept, period[kept], peak, strict=True):
         place, states = sets[back[k]]
@@ -183,14 +189,21 @@ def _parted(maps: ReturnMaps, group, at: Section, beside):
     return growth, time, at, beside, np.concatenate(path, axis=1)
 
 
-def _settled_peak(maps: ReturnMaps, group, at: Section) -> Float[np.ndarray, " t"]:
-    """The largest tangential speed (m/s) of motions on tori, `FURTHER` on each; not a number where it does not settle."""
-    peak, last = np.full(len(group) // FURTHER, np.nan), np.full(len(group) // FURTHER, np.nan)
+def _highest(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " t"], Section]:
+    """The largest tangential speed (m/s) in the next `PEAK_OVER` returns of motions on tori, `FURTHER` on each; and where the
+    motions are then.
+    """
+    highest, end = maps.peaks_and_ends(group, at, PEAK_OVER)
+    return np.max(highest.reshape(-1, FURTHER), axis=1), end
+
+
+def _settled_peak(maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """The same once it has settled, from what it was `before`; not a number where it does not settle."""
+    peak, last = np.full(len(before), np.nan), before.copy()
     running = np.arange(len(peak))
     for _ in range(SETTLE_TIMES):
         rows = (FURTHER * running[:, None] + np.arange(FURTHER)).ravel()
-        highest, end = maps.peaks_and_ends(group[rows], at.rows(rows), PEAK_OVER)
-        now = np.max(highest.reshape(-1, FURTHER), axis=1)
+        now, end = _highest(maps, group[rows], at.rows(rows))
         done = np.abs(now / last[running] - 1) <= SETTLED
         peak[running[done]], last[running] = now[done], now
         open_ = ~done & np.isfinite(now)

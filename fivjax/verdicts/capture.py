@@ -50,8 +50,8 @@ LARGEST, SMALLEST = 0.5, 1e-8
 # Sizes of the ellipsoids on which the return map is checked, relative to the radius; and the number of directions on each.
 SHELLS = (1.0, 0.5, 0.25, 0.125)
 DIRECTIONS = 64
-# One in so many points of a radius is tried first.
-PROBED = 8
+# One in so many points of a radius is tried first, then one in so many.
+PROBED = (32, 8)
 
 
 class Neighbourhood(NamedTuple):
@@ -125,9 +125,9 @@ class Trial(NamedTuple):
     allowed: float  # the contraction κ that is required
     largest: float  # the first radius to try
 
-    def probe(self) -> "Trial":
-        """The same with few points: most radii that are too large fail already at these."""
-        return self._replace(steps=self.steps[::PROBED], sizes=self.sizes[::PROBED])
+    def probe(self, one_in: int) -> "Trial":
+        """The same with one in so many points: most radii that are too large fail already at few."""
+        return self._replace(steps=self.steps[::one_in], sizes=self.sizes[::one_in])
 
     def states(self, radius: float) -> Float[np.ndarray, "point state"]:
         """The states at which the return map is to be evaluated: the centre, for comparison, and the points."""
