@@ -266,6 +266,20 @@ def test_late_trajectories_have_the_references_amplitudes_and_their_verdict_alon
 
 
 @pytest.mark.slow
+def test_two_tori_beside_each_other_capture_each_trajectory_alone_too(paper_scene):
+    """At 2.4 m/s the paper's oscillator has a smaller torus inside of the one on which kicks end, so close that the ensemble
+    meets on both, and that a tube of a hundredth of their size holds motions of both. This kick was undecided by itself.
+    """
+    scene, kicks = paper_scene.replace(mu=0.1568, belt_speed=2.4), [2.0, 2.0727]
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=3e3)
+    assert theirs.fate.tolist() == ["sustained"] * 2
+    for chosen in ([0], [0, 1]):
+        m = fj.bistability_map(scene, p=np.array(kicks)[chosen], progress=False)
+        assert np.all(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
+        np.testing.assert_allclose(m["amplitude"], theirs.amplitude[chosen], rtol=1e-3)
+
+
+@pytest.mark.slow
 def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_not():
     """Neighbours part by one per cent per crossing in the one and by nothing in the other; neither is a limit cycle."""
     chaos = fj.bistability_map(paper(0.6393391935903446, 9.602345607398314, **RARE), p=[0.5, 1.5], progress=False)

@@ -22,7 +22,7 @@ MOST_CROSSINGS = 512
 TIMES = 4
 # States on the section that make the set tried as a torus, and radii of the tube about it. Starts have to come closer than
 # elsewhere, by so much: next to a slow fade there is a direction in which they come back hardly at all.
-SET, RADII, CLOSER = 4096, (tube.RADIUS, tube.RADIUS / 4), 0.5
+SET, RADII, CLOSER = 4096, (tube.RADIUS, tube.RADIUS / 4, tube.RADIUS / 16), 0.5
 # Their mean may change with time by so much of their extent. A fade that takes thousands of periods is such a set, too, and
 # starts further in are home while they pass it.
 DRIFT = 5e-3
