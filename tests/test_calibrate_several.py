@@ -27,6 +27,20 @@ def test_a_small_motion_tells_both_frictions_and_the_spring_between():
 
 
 @pytest.mark.slow
+def test_a_kick_through_the_events_of_both_contacts():
+    """A hundred and thirty of them: the derivatives of the fit go through all."""
+    scene = pair(300.0, 0.2, p=2.0)
+    accelerations = noisy(clean(scene, 0.0372, 0.4372, rate=5000.0), 0.02, 3)
+    channels = {"a0": accelerations[:, 0], "a1": accelerations[:, 1]}
+    # The first sample is the mean over its step.
+    data = fj.Recording(5000.0, channels, "kick", offset=0.0372 + 0.5 / 5000)
+    start = scene.replace(mu_0=0.23, c1=0.85, k1=107e3)
+    fit = fj.calibrate(start, data, ["mu_0", "c1", "k1"], starts=2, progress=False)
+    assert fit.outcome is FitOutcome.CONVERGED and all(fit.identifiable.values())
+    assert max(scores(fit, scene).values()) < 4
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("coupling", "friction"), [(0.0, 0.3), (300.0, 0.35)], ids=["uncoupled", "coupled"])
 def test_a_limit_cycle_beside_a_contact_without_events(coupling, friction):
     """The second contact slides on through the whole cycle: that its gap stays closed is no equation that could close it, and
