@@ -100,6 +100,8 @@ def test_what_is_no_parameter_or_no_bound_is_refused():
         fj.continue_cycle(scene, "mu", (0.3, 0.4))
     with pytest.raises(ValueError, match="pair of numbers"):
         fj.continue_cycle(scene, "mu", 0.3)
+    with pytest.raises(TypeError, match="whole number"):
+        fj.cycle_at(None, 1.5)
 
 
 @pytest.mark.slow

@@ -69,6 +69,12 @@ def test_a_crossing_is_narrowed_to_the_tolerance(paper_scene, monkeypatch):
     assert found["only_crossing"]
 
 
+def test_a_tolerance_below_rounding_still_gives_a_number(paper_scene, monkeypatch):
+    """Two neighbouring numbers cannot come closer; their middle used to be NaN as if something were undecided between."""
+    found = found_by(monkeypatch, paper_scene, lambda p, _: int(p > 1.23456789), tolerance=1e-17)
+    assert float(found["p_crit"]) == pytest.approx(1.23456789, abs=1e-15)
+
+
 def test_undecided_trajectories_stop_the_narrowing_and_leave_no_number(paper_scene, monkeypatch):
     def verdict_of(p, _):
         return -1 if 1.33 < p < 1.57 else int(p >= 1.57)

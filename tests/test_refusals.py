@@ -9,6 +9,7 @@ import sys
 import time
 
 import diffrax
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -309,7 +310,10 @@ def test_bad_starts(paper_scene, y0, error, fragments):
         fj.simulate(paper_scene, 0.01, y0=y0)
 
 
-@pytest.mark.parametrize("y0", [np.zeros(6), [0.0] * 6, (np.zeros(3), np.zeros(3)), ([0.0] * 3, [0.0] * 3)])
+@pytest.mark.parametrize(
+    "y0",
+    [np.zeros(6), [0.0] * 6, [0.0, 1e-3, -1e-31, 0.0, 0.4, -1e-18], (np.zeros(3), np.zeros(3)), ([0.0] * 3, [0.0] * 3)],
+)
 def test_good_starts(paper_scene, y0):
     """A start may be one vector or a pair, of arrays or lists, so that a run can go on from the end of another."""
     with pytest.raises(EngineReached):
@@ -535,3 +539,26 @@ def test_an_axis_without_end(tmp_path, capsys):
     """An infinite axis is refused in a sentence, not by a NumPy warning about a multiplication."""
     message = refused_on_the_command_line(capsys, ["map", "--x", "mu=0:inf:3", "--out", tmp_path / "out"])
     assert "finite" in message
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda scene, mu: fj.limit_cycle(scene.replace(mu=mu)),
+        lambda scene, mu: fj.saddle_cycle(scene.replace(mu=mu)),
+        lambda scene, mu: fj.continue_cycle(scene.replace(mu=mu), "mu", (0.1, 0.3)),
+        lambda scene, mu: fj.bistability_map(scene, mu=[mu]),
+        lambda scene, mu: fj.critical_perturbation(scene.replace(mu=mu)),
+        lambda scene, mu: fj.smallest_kick(scene.replace(mu=mu)),
+    ],
+)
+def test_a_scene_traced_by_jax_is_refused_in_a_sentence(paper_scene, call):
+    """A search whose course depends on the numbers cannot be traced: the sentence says so, and what gives derivatives."""
+    with refused(TypeError, "traced", "Call this function outside"):
+        jax.jit(lambda mu: (call(paper_scene, mu), mu)[1])(0.2)
+
+
+def test_a_saddle_about_unstable_sliding_is_refused(paper_scene):
+    """Where sliding is unstable no boundary surrounds it; the search used to end minutes later, and to suspect a torus."""
+    with refused(ValueError, "sliding", "unstable"):
+        fj.saddle_cycle(paper_scene.replace(mu=0.3))

@@ -87,6 +87,7 @@ def continue_cycle(
     import xarray as xr
 
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_several_contacts(scene.structure, "`continue_cycle`")
     final = under_final_load(scene)
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
@@ -146,6 +147,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
         >>> fj.cycle_at(branch, 0).kind
         'periodic'
     """
+    if isinstance(i, bool) or not isinstance(i, int | np.integer):
+        raise TypeError(f"Argument `i` must be the index of a point, a whole number, but is {arguments.describe(i)}.")
     try:
         name, row = branch.attrs["parameter"], branch.isel(point=i)
         value = float(row["parameter"])

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..linear.spectrum import eigenvalues
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
 from ..steppers.event_exact import EventExact
 from .closing import close
@@ -27,6 +28,8 @@ APART = 1e-4
 ROUNDS = 24
 # A trajectory has reached the cycle when it is this close to it, relative to the cycle's size.
 CAPTURED = 1e-2
+# Sliding counts as unstable above this growth rate, relative to the largest eigenvalue; below, the sign may be one of rounding.
+UNSTABLE = 1e-6
 FADED = 1e-2
 
 
@@ -39,8 +42,8 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
 
     **Returns:** a `LimitCycle` with exactly one multiplier outside the unit circle.
 
-    **Raises:** `NoLimitCycle` (a `ValueError`) if there is no limit cycle, or if the attractor within the boundary is not
-    periodic; `ValueError` for a scene without sliding equilibrium or beyond Painlevé's limit.
+    **Raises:** `NoLimitCycle` (a `ValueError`) if there is no limit cycle, if steady sliding is unstable, or if the attractor
+    within the boundary is not periodic; `ValueError` for a scene without sliding equilibrium or beyond Painlevé's limit.
 
     **Example:**
 
@@ -49,9 +52,11 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
         1
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_vector_contacts(scene.structure, "`saddle_cycle`")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
+    _refuse_unstable_sliding(under_final_load(scene))
     cycle = limit_cycle(scene) if cycle is None else cycle
     stepper = EventExact()
     fates = _Fates(scene, stepper, cycle)
@@ -67,6 +72,16 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
         "No saddle cycle was met: what attracts on the boundary does not repeat within "
         f"{MOST_CROSSINGS} crossings of the section. It may be a torus."
     )
+
+
+def _refuse_unstable_sliding(scene: Scene) -> None:
+    rates = np.asarray(eigenvalues(scene))
+    if np.max(rates.real) > UNSTABLE * np.max(np.abs(rates)):
+        raise NoLimitCycle(
+            f"Steady sliding is unstable: small deviations grow at {np.max(rates.real):.3g} 1/s, so that no boundary lies "
+            "between it and a limit cycle. Choose parameters with stable sliding; `continue_cycle` follows other unstable "
+            "cycles."
+        )
 
 
 class _Fates:

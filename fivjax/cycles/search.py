@@ -41,6 +41,7 @@ TORUS_AFTER = 8
 
 # Why a motion that closes is not returned as a limit cycle.
 FAMILY_MET = "periodic, but one of a family of such motions: a second multiplier is 1"
+SUSTAINED = "sustained, neither periodic nor a torus"
 
 
 class NoLimitCycle(ValueError):
@@ -84,9 +85,11 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
         met = attractors_met(scene, stepper, _released(scene, ()))
         if not met or met[0].cycle is None:
             family = " Some came to periodic motions that are one of a family each: a second multiplier is 1."
+            irregular = " Some stayed in motion, but near neither a cycle nor a torus that could be computed."
             raise NoLimitCycle(
                 f"No limit cycle was met: none of the {len(RELEASES)} trajectories released ended on one."
-                f"{family if any(one.why == FAMILY_MET for one in met) else ''} "
+                f"{family if any(one.why == FAMILY_MET for one in met) else ''}"
+                f"{irregular if any(one.why == SUSTAINED for one in met) else ''} "
                 f"If you know a motion near one, give it as `start`."
             )
         return met[0].cycle
@@ -180,7 +183,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             open_ = np.flatnonzero(keep)
     given_up = len(open_)
     met = [Met(cycle, "computed") for cycle in sorted(found, key=lambda cycle: -cycle.amplitude)]
-    met += [Met(None, "sustained, neither periodic nor a torus")] * given_up
+    met += [Met(None, SUSTAINED)] * given_up
     return met + [Met(None, FAMILY_MET)] * families
 
 
@@ -195,6 +198,7 @@ def _merged(parts: list[list[Met]]) -> list[Met]:
 
 def _check(scene: Scene) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_vector_contacts(scene.structure, "A search for limit cycles")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))

@@ -207,6 +207,7 @@ def _concluded(scene, first, last, target, names, start, taken, why, p_range, p_
 
 def _checked(scene: Scene, by, free, bounds):
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p is raised")
     arguments.real_number("by", by, above=0)
     bounds = dict(bounds or {})

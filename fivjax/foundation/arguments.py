@@ -45,6 +45,7 @@ def whole_number(name: str, value, *, minimum: int) -> None:
 
 def numeric_array(name: str, value) -> np.ndarray:
     """`value` as a NumPy array of real numbers, or a sentence about what it is instead."""
+    known(name, value)
     try:
         array = np.asarray(value)
     except (ValueError, TypeError):
@@ -73,6 +74,16 @@ def axis(name: str, values) -> np.ndarray:
             f"(values {at} and {at + 1}). Sort it and drop repeats, for instance with `numpy.unique`."
         )
     return array
+
+
+def known(name: str, value) -> None:
+    """Refuse numbers that a JAX transformation traces, in functions whose course depends on the numbers themselves."""
+    if not is_known(jax.tree.leaves(value)):
+        raise TypeError(
+            f"Argument `{name}` must hold known numbers, but is traced by `jax.jit`, `jax.vmap` or a derivative around this "
+            "call. Call this function outside of them. Many parameters go on the axes of `bistability_map`; derivatives are "
+            "given by `cycle_derivatives` and by `critical_perturbation(..., derivatives=True)`."
+        )
 
 
 def instance(name: str, value, kinds: type | tuple[type, ...], example: str) -> None:

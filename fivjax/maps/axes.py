@@ -59,6 +59,7 @@ def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Gri
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     refuse_vector_contacts(scene.structure, "A map")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     if t_max is not None:

@@ -66,6 +66,7 @@ def boundary_section(
     import xarray as xr
 
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p leads to the boundary")
     arguments.real_number("reach", reach, above=0)
     arguments.whole_number("points", points, minimum=3)

@@ -127,6 +127,7 @@ def smallest_kick(
         True
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
     refuse_several_contacts(scene.structure, "`smallest_kick`")
     if not scene.friction.constant:

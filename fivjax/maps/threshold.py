@@ -255,7 +255,8 @@ def _narrowed(
             if narrower and width > tolerance and not contradicted[place]:
                 still.append(place)
         open_ = np.array(still, int)
-    close = found.high - found.low <= tolerance
+    # Two kicks that are neighbours in rounding cannot come closer.
+    close = found.high - found.low <= np.maximum(tolerance, np.spacing(found.high))
     middle = np.where(close, 0.5 * (found.low + found.high), found.middle)
     middle = np.where(~close & np.isfinite(found.low), np.nan, middle)
     found = found._replace(

@@ -20,7 +20,13 @@ def start_state(scene: Scene, y0) -> State:
         return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
     y = checked_start(n, y0)
     if is_known(y):
+        # Rounding may put the state of a cycle, or of a run before, a little below the belt.
+        rounding = 64 * np.finfo(np.float64).eps * np.max(np.abs(np.asarray(y).reshape(2, n)), axis=1)
         for normal in map(int, np.ravel(contact_coordinates(scene.structure)[1])):
+            if -rounding[0] <= y[normal] < 0:
+                y = y.at[normal].set(0.0)
+            if y[normal] == 0 and -rounding[1] <= y[n + normal] < 0:
+                y = y.at[n + normal].set(0.0)
             if y[normal] < 0:
                 raise ValueError(
                     f"Argument `y0` must not start below the belt, but its displacement {normal} (the gap) is "
