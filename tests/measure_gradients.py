@@ -24,6 +24,8 @@ CASES = {
     "v = 3, p = 2, 0.3 s": ({"belt_speed": 3.0, "p": 2.0}, 0.3 + START),
     "v = 0.5, p = 1.1, 0.4 s": ({"belt_speed": 0.5, "p": 1.1}, 0.4 + START),
 }
+# Relative steps of differences: so small that the sequence of events stays, so large that rounding does not show.
+STEPS = {"c1": 2e-3, "c2": 2e-3, "start": 2e-4, "theta": 2e-4, "belt_speed": 2e-4, "force": 1e-4}
 NAMES = ("mu", "belt_speed", "force", "p", "duration", "start", "m1", "m2", "c1", "c2", "k1", "k2", "theta")
 
 
@@ -47,8 +49,7 @@ def differences(scene, t1, names=NAMES):
     with jax.enable_x64(True):
         for name in names:
             size = max(abs(float(scene.parameters[name])), 1e-2)
-            # Small enough that the sequence of events stays, large enough for rounding.
-            step = size * (2e-3 if name in ("c1", "c2") else 2e-4 if name in ("start", "theta") else 2e-5)
+            step = size * STEPS.get(name, 2e-5)
             value, error = richardson(
                 lambda x, name=name: last_state(fj.simulate(scene.replace(**{name: x}), t1, t1)),
                 float(scene.parameters[name]),
