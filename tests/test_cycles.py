@@ -53,6 +53,18 @@ def test_block_on_a_belt_has_the_closed_form_s_period_and_multipliers():
     assert cycle.stable
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [0.2, 1e-3])
+def test_a_slow_belt_sticks_for_hundreds_of_natural_periods(speed):
+    """The section is crossed once in a thousand seconds, and the next crossing was waited for a hundred natural periods."""
+    structure = fj.Structure(
+        np.eye(2), np.zeros((2, 2)), np.eye(2), np.array([0.0, -1.0]), contacts=[fj.ContactPoint(0, 1)]
+    )
+    cycle = fj.limit_cycle(fj.Scene(structure, fj.Coulomb(0.5, mu_static=1.0), speed, fj.ConstantLoad(1.0)))
+    assert cycle.period == pytest.approx(2 * (np.pi - np.arctan(0.5 / speed)) + 1.0 / speed, rel=1e-12)
+    np.testing.assert_allclose(cycle.multipliers, [1.0, 0.0], atol=1e-10)
+
+
 def test_the_paper_s_cycle_is_the_reference_s(cycle):
     expected = next(case for case in REFERENCE["paper"]["periodic"] if case["belt_speed"] == 1.0)
     assert cycle.kind == "periodic" and cycle.stable and cycle.residual < 1e-12

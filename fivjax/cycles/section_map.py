@@ -21,6 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, Rest, State
 from ..foundation.compiling import compiled
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import contact_coordinates, sliding_coordinates
+from ..model.structure import Structure
 from ..steppers.core import Followed, Segment, Total, follow
 from ..steppers.event_exact import EventExact, for_derivatives
 
@@ -64,11 +66,30 @@ def sliding_state(scene: Scene, load: Float[Array, ""]) -> State:
     return jnp.concatenate([q, jnp.zeros_like(q)])
 
 
-def longest_return(scene: Scene) -> Float[Array, ""]:
-    """A time (s) within which any sustained motion crosses the section: a hundred of the slowest natural periods."""
-    structure = scene.structure
+def slowest_period(structure: Structure) -> Float[Array, ""]:
+    """The period (s) of the slowest coordinate, if all others were held."""
     rates = jnp.diag(structure.stiffness) / jnp.diag(structure.mass)
-    return 100 * 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
+    return 2 * math.pi / jnp.sqrt(jnp.min(jnp.where(rates > 0, rates, jnp.inf)))
+
+
+def longest_return(scene: Scene) -> Float[Array, ""]:
+    r"""A time (s) within which any sustained motion crosses the section.
+
+    A hundred of the slowest natural periods, and twice the time for which a contact sticks on a slow belt, from one edge of the
+    friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness $k$ along the belt.
+    """
+    structure = scene.structure
+    tangential, normal = contact_coordinates(structure)
+    free = sliding_coordinates(structure.size, normal)
+    stiffness = structure.stiffness[jnp.ix_(free, free)]
+    along = np.searchsorted(free, tangential)
+    compliance = jnp.linalg.solve(stiffness, jnp.eye(len(free))[:, along])[along]
+    compliance = jnp.diag(compliance) if jnp.ndim(compliance) else compliance
+    _, force = steady_sliding(scene, scene.load.final)
+    sticking = 2 * scene.friction.static * jnp.abs(force) * compliance / jnp.abs(scene.belt_speed)
+    # Nothing is known of a structure that is held by no spring.
+    sticking = jnp.max(jnp.where(jnp.isfinite(sticking), sticking, 0.0))
+    return 100 * slowest_period(structure) + 2 * sticking
 
 
 def to_crossing(

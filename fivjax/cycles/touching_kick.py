@@ -27,7 +27,7 @@ from ..model.scene import Scene
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact, for_derivatives
 from .kick_response import directions_of
-from .section_map import MOST_SEGMENTS, longest_return, mechanics_about_sliding
+from .section_map import MOST_SEGMENTS, longest_return, mechanics_about_sliding, slowest_period
 
 # The most events that are compared; and the longest time in which two motions separate, in slowest periods.
 MOST_EVENTS, MOST_TIME = 1024, 20.0
@@ -64,7 +64,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters.
     """
     stepper, (low, high) = EventExact(), bracket
-    period = float(longest_return(scene)) / 100
+    period = float(slowest_period(scene.structure))
     # Padded to a fixed number of directions, so that one program is compiled.
     directions = directions_of(scene, ("p", *names) + ("p",) * (-(len(names) + 1) % 16))
 
