@@ -211,7 +211,7 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     if isinstance(normal, np.ndarray):
         q = jnp.zeros(structure.size, reduced.dtype).at[sliding_coordinates(structure.size, normal)].set(reduced)
     else:
-        q = jnp.insert(reduced, normal, 0.0)
+        q = jnp.concatenate([reduced[:normal], jnp.zeros(1, reduced.dtype), reduced[normal:]])
     matrices = structure.matrices
     normal_force = matrices.stiffness[normal] @ q
     normal_force = normal_force - matrices.load_direction[normal] * force

@@ -18,8 +18,12 @@ def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
     """
     rate = fastest_rate(mechanics)
-    _, exponent = jnp.frexp(rate)
-    return jnp.ldexp(jnp.ones_like(rate), -exponent)
+    # The power of two below the rate is its exponent alone. `jnp.frexp` would be right as well, but some versions of JAX lower it
+    # after double precision has been switched off again.
+    bits = jnp.uint64 if rate.dtype == jnp.float64 else jnp.uint32
+    exponent = jax.lax.bitcast_convert_type(jnp.array(jnp.inf, rate.dtype), bits)
+    below = jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(rate, bits) & exponent, rate.dtype)
+    return jnp.where((below > 0) & jnp.isfinite(below), 0.5 / below, 1.0)
 
 
 def fastest_rate(mechanics: Mechanics) -> Float[Array, ""]:
