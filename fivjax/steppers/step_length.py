@@ -18,8 +18,8 @@ def time_unit(mechanics: Mechanics) -> Float[Array, ""]:
     In seconds the coefficients of a series grow like powers of the fastest rate, out of the range of single precision.
     """
     rate = fastest_rate(mechanics)
-    # The power of two below the rate is its exponent alone. `jnp.frexp` would be right as well, but some versions of JAX lower it
-    # after double precision has been switched off again.
+    # The power of two below the rate is its exponent alone. Not by `jnp.frexp`: some versions of JAX lower that after double
+    # precision has been switched off again.
     bits = jnp.uint64 if rate.dtype == jnp.float64 else jnp.uint32
     exponent = jax.lax.bitcast_convert_type(jnp.array(jnp.inf, rate.dtype), bits)
     below = jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(rate, bits) & exponent, rate.dtype)
