@@ -30,6 +30,18 @@ class LimitCycle(eqx.Module):
     On the section the tangential velocity rises through zero. A multiplier is the factor by which a small deviation changes in
     one period; one multiplier of a periodic motion is 1, for a deviation along the cycle.
 
+    **Fields:**
+
+    - `kind`: "periodic" or "torus"; `stable`; `multipliers`, by size (of a torus, exp of its Lyapunov exponents per return).
+    - `period` in s and `frequency` in Hz (of a torus, of its mean return); `word`, the contact modes with their durations in s.
+    - `state`, displacements (m) and velocities (m/s) on the section, and `contact`, the contact mode there; `points`, all states on
+      the section, and `deviation`, `state` itself, as deviations from steady sliding; `crossings`, the number in one period.
+    - `amplitude`, the peak tangential speed, in m/s; `harmonics`, Fourier coefficients of the velocities in m/s, by order and
+      coordinate; `energy`, per period and by line of the ledger, in J.
+    - `residual`, how far the return is from the start, relative to the cycle's size (of a torus, of its points from the curve
+      through the others); `return_jacobian`, the derivative of the return map over one period; `rotation_number` of a torus, in
+      turns per return.
+
     **Example:**
 
         >>> cycle = fj.limit_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
