@@ -34,8 +34,8 @@ class LimitCycle(eqx.Module):
 
     - `kind`: "periodic" or "torus"; `stable`; `multipliers`, by size (of a torus, exp of its Lyapunov exponents per return).
     - `period` in s and `frequency` in Hz (of a torus, of its mean return); `word`, the contact modes with their durations in s.
-    - `state`, displacements (m) and velocities (m/s) on the section, and `contact`, the contact mode there; `points`, all states on
-      the section, and `deviation`, `state` itself, as deviations from steady sliding; `crossings`, the number in one period.
+    - `state`, displacements (m) and velocities (m/s) on the section, and `contact`, the contact mode there. As deviations from
+      steady sliding: `deviation`, this state, and `points`, all states on the section. `crossings`: their number in one period.
     - `amplitude`, the peak tangential speed, in m/s; `harmonics`, Fourier coefficients of the velocities in m/s, by order and
       coordinate; `energy`, per period and by line of the ledger, in J.
     - `residual`, how far the return is from the start, relative to the cycle's size (of a torus, of its points from the curve
