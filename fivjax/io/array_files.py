@@ -14,7 +14,7 @@ def matrix_market(path: Path) -> dict[str, FileMatrix]:
 
     # The reader raises many kinds of errors for damaged files; all become one sentence.
     try:
-        matrix = mmread(path)
+        matrix = mmread(path, spmatrix=False)
     except (ValueError, OSError, EOFError, OverflowError, IndexError, TypeError) as error:
         raise _unreadable(path, "Matrix Market", error) from None
     return {path.stem: FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`")}
@@ -25,7 +25,7 @@ def matlab(path: Path) -> dict[str, FileMatrix]:
     import scipy.io
 
     try:
-        loaded = scipy.io.loadmat(path)
+        loaded = scipy.io.loadmat(path, spmatrix=False)
     except NotImplementedError:  # version 7.3 is HDF5
         loaded = _matlab_73(path)
     except (ValueError, TypeError, OSError, EOFError, KeyError, scipy.io.matlab.MatReadError) as error:

@@ -186,7 +186,7 @@ def _matlab(path: Path):
     # The reader of MATLAB files also raises errors of its own class.
     unreadable = (ValueError, TypeError, OSError, EOFError, scipy.io.matlab.MatReadError)
     try:
-        loaded = scipy.io.loadmat(path, squeeze_me=True)
+        loaded = scipy.io.loadmat(path, squeeze_me=True, spmatrix=False)
     except NotImplementedError:  # version 7.3 is HDF5
         import h5py
 
