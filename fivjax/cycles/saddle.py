@@ -28,9 +28,9 @@ APART = 1e-4
 ROUNDS = 24
 # A trajectory has reached the cycle when it is this close to it, relative to the cycle's size.
 CAPTURED = 1e-2
+FADED = 1e-2
 # Sliding counts as unstable above this growth rate, relative to the largest eigenvalue; below, the sign may be one of rounding.
 UNSTABLE = 1e-6
-FADED = 1e-2
 
 
 @in_double_precision

@@ -63,20 +63,18 @@ def in_blocks(
             result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
             return place[real], np.asarray(result.numbers)[real], result.form
 
+    def keep(place: np.ndarray, numbers: np.ndarray, _: tuple) -> None:
+        results.numbers[place] = numbers
+
     starts, results = range(0, len(slots), rows), trajectories
     if not in_place:
         # The first blocks say what the results look like.
         begun, starts = list(pool.map(run, starts[: workers()])), starts[workers() :]
         results = Flattened(np.empty((len(group), begun[0][1].shape[-1])), begun[0][2])
-        for place, numbers, _ in begun:
-            results.numbers[place] = numbers
-
-    def run_and_keep(start: int) -> None:
-        # Written into the result at once, so that the parts do not take memory as well.
-        place, numbers, _ = run(start)
-        results.numbers[place] = numbers
-
-    for _ in pool.map(run_and_keep, starts):
+        for block in begun:
+            keep(*block)
+    # Written into the result at once, so that the parts do not take memory as well.
+    for _ in pool.map(lambda start: keep(*run(start)), starts):
         pass
     return results
 

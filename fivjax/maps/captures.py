@@ -71,16 +71,16 @@ def stable_cycles(
         return []
     now, lag = last.rows(near), lag[near]
     closed = _closed(maps, group[near], now, lag)
-    stable = np.flatnonzero(closed.residual <= CLOSED)
-    if not len(stable):
+    periodic = np.flatnonzero(closed.residual <= CLOSED)
+    if not len(periodic):
         return []
-    _, points = maps.path(group[near[stable]], closed.at.rows(stable), int(np.max(lag[stable])))
-    points = np.concatenate([closed.at.y[stable][:, None], points], axis=1)
-    points_of = {row: points[k, : lag[row]] for k, row in enumerate(stable)}
+    _, points = maps.path(group[near[periodic]], closed.at.rows(periodic), int(np.max(lag[periodic])))
+    points = np.concatenate([closed.at.y[periodic][:, None], points], axis=1)
+    points_of = {row: points[k, : lag[row]] for k, row in enumerate(periodic)}
     # Of those that are the same, at whichever of its crossings, the first stands for all.
     kept: list[int] = []
     rows_of: list[list[int]] = []
-    for row in stable:
+    for row in periodic:
         for k, other in enumerate(kept):
             same = group[near[other]] == group[near[row]] and lag[other] == lag[row]
             if same and _passes(maps, closed.at.y[row], points_of[other]):
