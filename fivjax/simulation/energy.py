@@ -53,7 +53,7 @@ from ..model.springs import Springs
 from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment
-from ..steppers.section import before_section
+from ..steppers.section import rise_between
 from .energy_lines import Energy as Energy
 from .energy_lines import Flows as Flows
 from .energy_lines import Ledger as Ledger
@@ -240,11 +240,8 @@ def enter(
     reversed_ = (status == following) & (contact.direction != after.contact.direction)
     reversed_ = reversed_ & (status == Status.SLIDE)
     happened = (following != status) | bounced | reversed_
-    section = mechanics.places[0][0]
-    crossed = (y[n + section] < 0) & (after.y[n + section] >= 0)
     by_contact = {}
     if mechanics.several:
-        crossed = before_section(mechanics, y) & ~before_section(mechanics, after.y)
         # Impulses act only at the contacts, so each contact has its own part of the loss.
         own = impulses * (before + behind)
         own = jnp.where(jnp.any(landed), -0.5 * (own[tangential] + own[normal]), 0.0)
@@ -261,7 +258,7 @@ def enter(
         stick_time=ledger.stick_time + jnp.where(_all(mechanics, sticks), after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(_all(mechanics, detached), after.h, 0.0),
         events=ledger.events + (jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened),
-        crossings=ledger.crossings + crossed,
+        crossings=ledger.crossings + rise_between(mechanics, y, after.y).happened,
         beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
         worst=ledger.worst,
