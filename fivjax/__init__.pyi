@@ -10,6 +10,8 @@ from .cycles.continuation import cycle_at as cycle_at
 from .cycles.cycle import LimitCycle as LimitCycle
 from .cycles.differentiation import CycleDerivatives as CycleDerivatives
 from .cycles.differentiation import cycle_derivatives as cycle_derivatives
+from .cycles.nearby import NearbyCycle as NearbyCycle
+from .cycles.nearby import nearby_cycle as nearby_cycle
 from .cycles.saddle import saddle_cycle as saddle_cycle
 from .cycles.search import NoLimitCycle as NoLimitCycle
 from .cycles.search import limit_cycle as limit_cycle

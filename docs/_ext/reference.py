@@ -80,6 +80,8 @@ GROUPS = {
             "NoLimitCycle",
             "cycle_derivatives",
             "CycleDerivatives",
+            "nearby_cycle",
+            "NearbyCycle",
             "continue_cycle",
             "cycle_at",
             "tori_along",

@@ -15,7 +15,7 @@ from ..foundation.polynomial import extremum, value_and_slope
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
-from ..steppers.core import Segment, follow
+from ..steppers.core import Followed, Segment, follow
 from ..steppers.event_exact import EventExact
 from .section_map import Point, flow_with_jacobian, mechanics_about_sliding, to_crossing
 
@@ -83,10 +83,11 @@ def peak_speed_along(
     crossings: Int[Array, ""],
     longest: Float[Array, ""],
     most: int,
-) -> Float[Array, ""]:
-    """The largest tangential speed in m/s, to rounding, of a motion from a point to its `crossings`-th crossing of the section.
+) -> tuple[Float[Array, ""], Followed]:
+    """The largest tangential speed in m/s, to rounding, of a motion from a point to its `crossings`-th crossing of the section;
+    and the end of that motion.
 
-    NaN if that takes longer than `longest` (s), or more than `most` segments. The segments are not kept.
+    The speed is NaN if that takes longer than `longest` (s), or more than `most` segments. The segments are not kept.
     """
 
     def observe(peak, segment: Segment):
@@ -94,8 +95,8 @@ def peak_speed_along(
         return jnp.maximum(peak, own)
 
     zero = jnp.zeros((), point.y.dtype)
-    crossed, _, peak = to_crossing(stepper, mechanics, point, crossings, longest, zero, observe, most)
-    return jnp.where(crossed, peak, jnp.nan)
+    crossed, after, peak = to_crossing(stepper, mechanics, point, crossings, longest, zero, observe, most)
+    return jnp.where(crossed, peak, jnp.nan), after
 
 
 def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: Contact, h) -> Float[Array, ""]:
@@ -111,10 +112,12 @@ def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Fl
     samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
     values, _ = value_and_slope(speeds, samples)
     # To first order the value at the peak does not depend on the instant of the peak.
-    largest = jax.lax.stop_gradient(samples[jnp.argmax(jnp.abs(values))])
+    sizes = jnp.abs(values)
+    # Not `argmax`, which JAX lowers in single precision when a caller's own `jit` is in it.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.where(sizes == jnp.max(sizes), samples, 0.0)))
     x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, end, PEAK_STEPS))
     refined, _ = value_and_slope(speeds, x)
-    ends = jnp.stack([jnp.max(jnp.abs(values)), jnp.abs(refined)])
+    ends = jnp.stack([jnp.max(sizes), jnp.abs(refined)])
     return jnp.where(h > 0, jnp.max(ends), 0.0)
 
 

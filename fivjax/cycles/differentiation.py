@@ -6,23 +6,21 @@ $l^H (dJ/dθ)\, r / l^H r$. Only one period is differentiated, through its event
 grazing event, and at a fold, there is no derivative.
 """
 
-import math
 from collections.abc import Iterable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from ..foundation import arguments
-from ..foundation.compiling import compiled, power_of_4
+from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact, for_derivatives
-from .around import once_around, peak_speed, seen_around
 from .cycle import LimitCycle, point_of
-from .section_map import Point, mechanics_about_sliding, section_return, sliding_state
+from .nearby import next_to
+from .section_map import Point
 
 
 class CycleDerivatives(eqx.Module):
@@ -68,26 +66,12 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
             f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
             f"{', '.join(sorted(cycle.scene.parameters))}."
         )
-    stepper, point = EventExact(), point_of(cycle)
     arguments.truth("multipliers", multipliers)
-    segments = int(seen_around(cycle.scene, stepper, point, cycle.period, 60).segments.count)
-    segments += math.ceil(cycle.period / float(_step(cycle.scene, stepper)))
-    correction = jnp.linalg.inv(jnp.eye(len(point.y)) - jnp.asarray(cycle.return_jacobian))
-    slopes = _slopes(
-        cycle.scene,
-        stepper,
-        names,
-        point,
-        jnp.asarray(cycle.crossings, jnp.int32),
-        correction,
-        power_of_4(segments + 4),
-        bool(multipliers),
+    slopes = _slopes(cycle.scene, names, point_of(cycle), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))
+    # The parameters are the last axis.
+    period, amplitude, state, moved = (
+        dict(zip(names, np.moveaxis(np.asarray(one), -1, 0), strict=True)) for one in slopes
     )
-    period, amplitude, state, jacobian = (dict(zip(names, np.asarray(part), strict=True)) for part in slopes)
-    values, right = np.linalg.eig(cycle.return_jacobian)
-    order = np.argsort(-np.abs(values), kind="stable")
-    left = np.linalg.pinv(right)
-    moved = {name: np.einsum("ki,ij,jk->k", left, slope, right)[order] for name, slope in jacobian.items()}
     return CycleDerivatives(
         {name: float(slope) for name, slope in period.items()},
         {name: float(slope) for name, slope in amplitude.items()},
@@ -97,47 +81,10 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
 
 
 @compiled
-def _step(scene: Scene, stepper: EventExact) -> Float[Array, ""]:
-    return jnp.asarray(for_derivatives(stepper, mechanics_about_sliding(scene)).dt)
-
-
-@compiled
-def _slopes(
-    scene: Scene,
-    stepper: EventExact,
-    names: tuple[str, ...],
-    point: Point,
-    crossings,
-    correction,
-    most: int,
-    twice: bool,
-):
+def _slopes(scene: Scene, names: tuple[str, ...], point: Point, crossings, multipliers: bool):
     def of(values):
         own = scene.replace(**dict(zip(names, values, strict=True)))
-        mechanics = mechanics_about_sliding(own)
-        short = for_derivatives(stepper, mechanics)
+        found = next_to(own, scene, point, crossings, 0, multipliers)
+        return found.period, found.amplitude, found.state, found.multipliers if multipliers else found.state
 
-        def image(y):
-            return section_return(short, own, mechanics, Point(y, point.contact), crossings)
-
-        # A step of Newton's method from the root gives the same root, with its derivative. For the derivative of the return
-        # map's Jacobian a second step is needed.
-        y = point.y
-        for _ in range(1 + twice):
-            gap = image(y).point.y - y
-            y = y + correction @ (gap - jax.lax.stop_gradient(gap))
-        back = image(y)
-        jacobian = jnp.zeros((len(y), len(y)), y.dtype)
-        if twice:
-            units = jnp.eye(len(y), dtype=y.dtype)
-            jacobian = jax.vmap(lambda unit: jax.jvp(lambda y: image(y).point.y, (y,), (unit,))[1], out_axes=1)(units)
-        around = once_around(short, mechanics, Point(y, point.contact), back.time, most)
-        peak = peak_speed(short, mechanics, around)
-        return back.time, peak, y + sliding_state(own, own.load.final), jacobian
-
-    values = jnp.stack([jnp.asarray(scene.parameters[name]) for name in names])
-
-    def along(direction):
-        return jax.jvp(of, (values,), (direction,))[1]
-
-    return jax.vmap(along)(jnp.eye(len(names), dtype=values.dtype))
+    return jax.jacfwd(of)(jnp.stack([jnp.asarray(scene.parameters[name]) for name in names]))

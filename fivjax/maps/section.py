@@ -238,6 +238,6 @@ def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, y, status, direction, crossings):
         mechanics, longest = shared
         point = Point(y, Contact(status.astype(jnp.int32), direction))
-        return peak_speed_along(EventExact(), mechanics, point, crossings, longest * crossings, MOST_SEGMENTS)
+        return peak_speed_along(EventExact(), mechanics, point, crossings, longest * crossings, MOST_SEGMENTS)[0]
 
     return _of_block(one, shared, rows)
