@@ -1,4 +1,5 @@
-"""Executors of a map's jobs: the same bits everywhere, workers that are killed, the cost of processes and Dask, store and memory.
+"""Executors of a map's jobs: the same bits everywhere, workers that are killed, the cost of processes, Dask and loky, store and
+memory.
 
     python tests/measure_executors.py [overhead] [killed] [killed_dask] [size]
 
@@ -6,6 +7,7 @@
 folder: every worker is a new process.
 """
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -44,29 +46,54 @@ def same(one, other) -> bool:
 
 
 def overhead() -> None:
-    """Processor time and wall time of a map whose code is compiled: threads, two processes, two Dask workers."""
+    """Wall and processor time of a map whose code is compiled everywhere: by each executor in turn with threads, twice."""
+    the_map(POINTS)
+    for name, opened in EXECUTORS.items():
+        try:
+            opening = opened()
+        except ImportError as error:
+            print(f"{name}: {error}", flush=True)
+            continue
+        with opening as executor:
+            for _ in range(2):  # so that every worker compiles
+                whole = the_map(POINTS, executor=executor)
+            walls, cores = ({"threads": 0.0, name: 0.0} for _ in range(2))
+            for _ in range(2):
+                for kind, options in (("threads", {}), (name, {"executor": executor})):
+                    begin, before = time.perf_counter(), time.process_time() + _cores_of_children()
+                    m = the_map(POINTS, **options)
+                    walls[kind] += time.perf_counter() - begin
+                    cores[kind] += time.process_time() + _cores_of_children() - before
+        print(
+            f"{name}: {walls[name]:.1f} s, {walls[name] / walls['threads']:.3f} of threads; {cores[name]:.1f} s of cores, "
+            f"{cores[name] / cores['threads']:.3f} of threads; same bits: {same(m, whole)}",
+            flush=True,
+        )
+
+
+@contextlib.contextmanager
+def _dask():
+    import dask
     from distributed import Client, LocalCluster
 
-    the_map(96)
-    begin, cores = time.perf_counter(), time.process_time()
-    whole = the_map(POINTS)
-    walls = {"threads": time.perf_counter() - begin}
-    print(f"threads: {walls['threads']:.1f} s ({time.process_time() - cores:.1f} s of cores)", flush=True)
-    with (
-        processes() as pool,
-        LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster,
-        Client(cluster) as client,
-    ):
-        for name, executor in (("processes", pool), ("Dask", client)):
-            the_map(192, executor=executor)  # several jobs, so that each worker compiles
-            begin, before = time.perf_counter(), _cores_of_children()
-            m = the_map(POINTS, executor=executor)
-            walls[name] = time.perf_counter() - begin
-            print(
-                f"{name}: {walls[name]:.1f} s, {walls[name] / walls['threads']:.3f} of threads "
-                f"({_cores_of_children() - before:.1f} s of the workers' cores); same bits: {same(m, whole)}",
-                flush=True,
-            )
+    # Dask has its workers give freed memory back at once, and a map frees and takes blocks all the time.
+    dask.config.set({"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 2**30})
+    with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def _loky():
+    import loky
+
+    executor = loky.get_reusable_executor(max_workers=WORKERS, timeout=600)
+    try:
+        yield executor
+    finally:
+        executor.shutdown()
+
+
+EXECUTORS = {"processes": processes, "Dask": _dask, "loky": _loky}
 
 
 def _descendants() -> list[int]:

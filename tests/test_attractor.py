@@ -7,7 +7,8 @@ import pytest
 import reference
 
 import fivjax as fj
-from fivjax.maps.tori import _on_one_torus
+from fivjax.maps.captures import Cycle
+from fivjax.maps.tori import _holds_one_of, _on_one_torus
 from fivjax.verdicts import tube
 from fivjax.verdicts.ensemble import (
     KEPT,
@@ -240,10 +241,27 @@ def test_a_belt_that_runs_backwards_is_the_mirrored_one(paper_scene):
     assert there["attractor_kind"].values.tolist() == ["torus"]
 
 
+def test_a_set_that_holds_a_known_cycle_is_no_torus():
+    """A ring of states about a cycle of two crossings, and one beside it; and a set of which only one crossing is near."""
+
+    class Maps:
+        weights = np.array([2.0, 1.0])
+
+    turns = 2 * np.pi * np.arange(200) / 200
+    ring = np.stack([4 + 0.5 * np.cos(turns), 0.5 * np.sin(turns)], axis=-1)
+    on_it = np.array([[4.5, 0.0], [3.5, 0.01]]) / Maps.weights
+    for points, expected in ((on_it, True), (on_it * [[1.0, 1.0], [1.2, 1.0]], False)):
+        cycle = Cycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
+        assert _holds_one_of(Maps, ring, [cycle], tube.RADIUS) == expected  # type: ignore[arg-type]
+    assert not _holds_one_of(Maps, ring, [], tube.RADIUS)  # type: ignore[arg-type]
+
+
 MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)
 MANY |= dict(theta=0.2852258747704728, c1=5.276279472159822, c2=0.8020836517718353)
 PASSING = dict(m1=0.969426838229293, m2=0.010182597880315619, k1=13492.702752569177, k2=25362.931711655165)
 PASSING |= dict(theta=0.10388554288577523, c1=0.787197661431328, c2=3.4813158892322353)
+SLOW = dict(m1=2.7406599669898473, m2=0.058716779613550686, k1=932319.7460892957, k2=940107.8563691415)
+SLOW |= dict(theta=0.06137391058437148, c1=32.97056223981668, c2=9.160815606920163)
 RARE = dict(m1=1.0198503182174699, m2=0.02779954695588265, k1=147094.27066485942, k2=126925.55483150625)
 RARE |= dict(theta=0.22013984675203263, c1=0.8390953754335995, c2=0.457083396430323)
 
@@ -263,6 +281,18 @@ def test_late_trajectories_have_the_references_amplitudes_and_their_verdict_alon
     for place in (1, 4):
         alone = fj.bistability_map(scene, p=kicks[place : place + 1], progress=False)
         assert alone["amplitude"].item() == pytest.approx(theirs.amplitude[place], rel=1e-2)
+
+
+@pytest.mark.slow
+def test_a_slow_approach_to_a_cycle_is_no_torus():
+    """For hundreds of returns the motion stays where its speeds are 2.5 % too high, and everything about it comes back to it, on
+    its way to a cycle of eight crossings. It has been called a torus although the cycle was known.
+    """
+    scene, kicks = paper(0.7139242445761025, 1.9298605700607168, **SLOW), [2.283155, 2.858622]
+    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks])
+    m = fj.bistability_map(scene, p=kicks, progress=False)
+    assert m["attractor_kind"].values.tolist() == ["periodic"]
+    np.testing.assert_allclose(m["amplitude"], theirs.amplitude, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -159,6 +159,19 @@ def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):
 
 
 @pytest.mark.slow
+def test_a_branch_over_restitution_begins_without_any():
+    """Ever more impacts follow each landing. A first step of Newton's method to one of them led a thousand periods on, and no
+    end of the branch was in sight.
+    """
+    branch = fj.continue_cycle(paper(1.0, 0.227), "restitution", (0.0, 0.2))
+    assert branch.begins == "The bound restitution = 0 is reached."
+    assert branch.ends == "The bound restitution = 0.2 is reached."
+    assert specials(branch).count("impact inserted") >= 10
+    scene = {**reference.of_scene(paper(1.0, 0.227)), "p": 3.0, "restitution": 0.2}
+    assert float(branch.amplitude[-1]) == pytest.approx(reference.fate([scene]).amplitude[0], rel=1e-6)
+
+
+@pytest.mark.slow
 def test_the_torus_beside_a_branch_is_what_the_independent_solver_comes_to():
     branch = fj.continue_cycle(paper(1.8, 0.227), "belt_speed", (1.79, 3.0), start=fj.limit_cycle(paper(1.8, 0.227)))
     assert specials(branch) == ["Neimark–Sacker"]

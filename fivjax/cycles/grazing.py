@@ -16,6 +16,8 @@ from .pseudo_arclength import Curve, Place, assembled
 
 MOST_ITERATIONS = 12
 EXACT = 1e-13
+# The longest first step, in sizes and periods of the cycle: a phase of thousands of periods takes minutes to follow.
+FIRST_STEP = 4.0
 
 NAMES = {
     (Status.SLIDE, 0): "grazing of N",
@@ -124,7 +126,7 @@ def grazing_near(curve: Curve, guess: Place, touch: Touch) -> Grazing | None:
         if (size < EXACT and abs(shift) < 1e-9 * curve.time) or (last < 1e-10 and size > 0.5 * last):
             place = Place(u, rows / sizes[:-1, None], found, phases, parameter, iteration)
             return Grazing(place, touch, row / sizes[-1])
-        if size > 0.5 and iteration > 0:
+        if size > (FIRST_STEP if iteration == 0 else 0.5):
             return None
         u, last = u + step, size
         if touch.bend > 0:

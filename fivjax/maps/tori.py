@@ -33,9 +33,10 @@ PARTING_TIMES, PARTED, CLOSED_IN, AS_ON_A_TORUS = 128, 30.0, 15.0, 7.0
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 # The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share since before it was
-# asked whether neighbours part. Else the motions settle for so many returns, again and again, so often at most: a set whose
-# amplitude still drifts is not accepted.
-PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 32, 2 * PARTING_OVER, 7.5e-4, 16
+# asked whether neighbours part, or in as many returns as starts about the torus have to come back in, if these are more. Else
+# the motions settle, each time for twice as long, so often at most: a set whose amplitude still drifts is not accepted. (What
+# shrinks slowly beats more than it shrinks in a short time, and may seem to stand still.)
+PEAK_OVER, SETTLED, SETTLE_TIMES = 32, 7.5e-4, 6
 
 
 class Torus(NamedTuple):
@@ -60,6 +61,9 @@ def tori_among(
     locked. `known` are the cycles of each group; starts about a torus, in a tube of this relative
     `radius`, have to be back `within` so many crossings, in the inner half of one of `end_radius`.
     """
+    sets = [(k, states) for k, states in sets if not _holds_one_of(maps, states, known[k], radius)]
+    if not sets:
+        return {}, []
     own = np.array([groups[k] for k, _ in sets])
     back, last = _back(maps, own, [states for _, states in sets], within, report, radius, end_radius)
     if not len(back):
@@ -88,13 +92,19 @@ def tori_among(
     if not len(kept):
         return {}, cycles
     rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
-    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept])
+    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept], within)
     tori = {}
     for k, mean, highest in zip(kept, period[kept], peak, strict=True):
         place, states = sets[back[k]]
         if np.isfinite(mean) and np.isfinite(highest):
             tori[place] = Torus(states, float(highest), float(mean))
     return tori, cycles
+
+
+def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: list[Cycle], radius: float) -> bool:
+    """Whether a stable cycle lies in the inner half of the tube about a set: motions there may come to that instead."""
+    reach = 0.5 * radius * tube.mean_size(states)
+    return any(np.all(nearest(maps.weights * cycle.points, states) <= reach) for cycle in cycles)
 
 
 def _back(
@@ -197,10 +207,14 @@ def _highest(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
     return np.max(highest.reshape(-1, FURTHER), axis=1), end
 
 
-def _settled_peak(maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+def _settled_peak(
+    maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"], within: int
+) -> Float[np.ndarray, " t"]:
     """The same once it has settled, from what it was `before`; not a number where it does not settle."""
     peak, last = np.full(len(before), np.nan), before.copy()
-    running = np.arange(len(peak))
+    running, over = np.arange(len(peak)), 2 * PARTING_OVER
+    if within > over:
+        at, over = maps.returns(group, at, within - over).at, within
     for _ in range(SETTLE_TIMES):
         rows = (FURTHER * running[:, None] + np.arange(FURTHER)).ravel()
         now, end = _highest(maps, group[rows], at.rows(rows))
@@ -210,7 +224,8 @@ def _settled_peak(maps: ReturnMaps, group, at: Section, before: Float[np.ndarray
         running, left = running[open_], np.repeat(open_, FURTHER)
         if not len(running):
             break
-        at.put(rows[left], maps.returns(group[rows[left]], end.rows(left), SETTLE_OVER).at)
+        over *= 2
+        at.put(rows[left], maps.returns(group[rows[left]], end.rows(left), over).at)
     return peak
 
 
