@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 from ..io.recordings import Channel
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
-from ..model.sliding import contact_coordinates, sliding_coordinates
+from ..model.sliding import free_in_sliding
 from .misfit import finite
 
 # The units of coarse residuals: mode shapes are known to some per cent, poles ten times better.
@@ -30,7 +30,7 @@ def characteristic_residual(
     m = matrix.shape[0] // 2
     found = jnp.isfinite(poles.real)
     poles, shapes = jnp.where(found, poles, 1j), jnp.where(found[:, None], shapes, 1.0)
-    keep = sliding_coordinates(scene.structure.size, contact_coordinates(scene.structure)[1]).tolist()
+    keep = free_in_sliding(scene.structure).tolist()
 
     def dynamic(pole):
         return jnp.eye(m) * pole**2 - matrix[m:, m:] * pole - matrix[m:, :m]

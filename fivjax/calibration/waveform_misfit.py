@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float
 from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import contact_coordinates, sliding_coordinates
+from ..model.sliding import free_in_sliding
 from ..simulation.trajectory import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from .characteristic import characteristic_residual
@@ -57,7 +57,7 @@ class SlidingMisfit(AbstractWaveformMisfit):
         m = matrix.shape[0] // 2
         width = self.edges[1] - self.edges[0]
         states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
-        keep = sliding_coordinates(scene.structure.size, contact_coordinates(scene.structure)[1]).tolist()
+        keep = free_in_sliding(scene.structure).tolist()
         columns = []
         for quantity, coordinate in self.channels:
             row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
@@ -99,7 +99,7 @@ def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array
 def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
     """The same for constant friction, if no contact ever stops sliding: exact, from one jump of the load to the next."""
     n, matrix = scene.structure.size, linear_sliding(scene).matrix
-    keep = sliding_coordinates(n, contact_coordinates(scene.structure)[1]).tolist()
+    keep = free_in_sliding(scene.structure).tolist()
     steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
 
     def equilibrium(force):

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, Rest, State
 from ..foundation.compiling import compiled
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import contact_coordinates, sliding_coordinates
+from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from ..steppers.core import Followed, Segment, Total, follow
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -79,8 +79,8 @@ def longest_return(scene: Scene) -> Float[Array, ""]:
     friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness $k$ along the belt.
     """
     structure = scene.structure
-    tangential, normal = contact_coordinates(structure)
-    free = sliding_coordinates(structure.size, normal)
+    tangential, _ = contact_coordinates(structure)
+    free = free_in_sliding(structure)
     stiffness = structure.stiffness[jnp.ix_(free, free)]
     along = np.searchsorted(free, tangential)
     compliance = jnp.linalg.solve(stiffness, jnp.eye(len(free))[:, along])[along]

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import contact_coordinates, sliding_coordinates, sliding_matrices, sliding_rows
+from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
 from ..model.structure import Structure
 from .gradients import significant_growth
 from .linearisation import linear_sliding, state_matrix
@@ -35,8 +35,7 @@ def one_contact(structure: Structure) -> bool:
 
 def free_coordinates(structure: Structure) -> np.ndarray:
     """The coordinates, of `in_contact_coordinates`, that closed contacts leave free."""
-    structure = in_contact_coordinates(structure)
-    return sliding_coordinates(structure.size, contact_coordinates(structure)[1])
+    return free_in_sliding(in_contact_coordinates(structure))
 
 
 def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"]]:

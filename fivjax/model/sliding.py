@@ -29,6 +29,11 @@ def sliding_coordinates(size: int, normal: Places) -> np.ndarray:
     return np.delete(np.arange(size), normal)
 
 
+def free_in_sliding(structure: Structure) -> np.ndarray:
+    """The coordinates of a structure that sliding at all its contacts leaves free."""
+    return sliding_coordinates(structure.size, contact_coordinates(structure)[1])
+
+
 def sliding_states(size: int, normal: Places) -> np.ndarray:
     """Places of these coordinates in a state: displacements first, then velocities."""
     free = sliding_coordinates(size, normal)
@@ -47,17 +52,17 @@ def sliding_rows(
     index = np.arange(structure.size)
     if isinstance(tangential, np.ndarray):
         pulls = jnp.asarray(index[:, None] == tangential, matrix.dtype) * friction
-        return (matrix - pulls @ matrix[normal])[sliding_coordinates(structure.size, normal)]
+        return (matrix - pulls @ matrix[normal])[free_in_sliding(structure)]
     # A product with a constant rather than an update in place: in a batch it stays elementwise.
     along = jnp.asarray(index == tangential, matrix.dtype)[:, None]
-    return (matrix - along * (friction * matrix[normal]))[sliding_coordinates(structure.size, normal)]
+    return (matrix - along * (friction * matrix[normal]))[free_in_sliding(structure)]
 
 
 def sliding_matrices(
     structure: Structure, friction: Float[Array, "*contacts"]
 ) -> tuple[Float[Array, "m m"], Float[Array, "m m"], Float[Array, "m m"]]:
     """M, C and K of the sliding motion (Eq. 3) under constant friction σμ, in kg, N·s/m and N/m."""
-    free = sliding_coordinates(structure.size, contact_coordinates(structure)[1])
+    free = free_in_sliding(structure)
     mass, damping, stiffness = (sliding_rows(structure, matrix, friction)[:, free] for matrix in structure.matrices[:3])
     return mass, damping, stiffness
 
