@@ -1,6 +1,6 @@
 """Derivatives through contact, against differences and closed forms: `python tests/measure_gradients.py`.
 
-    python tests/measure_gradients.py [state] [closed] [where] [cost]
+    python tests/measure_gradients.py [state] [closed] [where] [cost] [cycles]
 
 Each word picks one study; without any, all run (some minutes on two cores). Errors are relative, of the worst component of
 the state, each component's derivative in proportion to its own size.
@@ -182,8 +182,37 @@ def cost():
             print(f"{name}: {1e3 * times[name]:.1f} ms, {ratio:.1f} simulations; with compilation {first:.1f} s")
 
 
+def cycles():
+    """64 limit cycles by one program of `nearby_cycle`, with and without their derivatives, against one call for each."""
+    base = paper(belt_speed=1.0, mu=0.227)
+    known = fj.limit_cycle(base)
+    mus = np.linspace(0.2, 0.228, 64)
+
+    def amplitude(mu):
+        return fj.nearby_cycle(base.replace(mu=mu), known).amplitude
+
+    with jax.enable_x64(True):
+        x = jnp.asarray(mus)
+        programs = {
+            "64 cycles": jax.jit(jax.vmap(amplitude)),
+            "with derivatives": jax.jit(jax.vmap(jax.value_and_grad(amplitude))),
+        }
+        for name, program in programs.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(program(x))
+            first = time.perf_counter() - begin
+            begin = time.perf_counter()
+            found = jax.block_until_ready(program(x))
+            print(f"{name}: {time.perf_counter() - begin:.2f} s; with compilation {first:.0f} s")
+    fj.limit_cycle(base.replace(mu=0.21), known)
+    begin = time.perf_counter()
+    one_by_one = [fj.limit_cycle(base.replace(mu=mu), known).amplitude for mu in mus]
+    off = np.max(np.abs(np.asarray(found[0]) / one_by_one - 1))
+    print(f"`limit_cycle` for each: {time.perf_counter() - begin:.2f} s; amplitudes differ by {off:.0e} at most")
+
+
 if __name__ == "__main__":
-    studies = {"state": state, "closed": closed, "where": where, "cost": cost}
+    studies = {"state": state, "closed": closed, "where": where, "cost": cost, "cycles": cycles}
     for name in sys.argv[1:] or studies:
         print(f"--- {name}: {studies[name].__doc__}", flush=True)
         studies[name]()
