@@ -49,12 +49,12 @@ def overhead() -> None:
     """Wall and processor time of a map whose code is compiled everywhere: by each executor in turn with threads, twice."""
     the_map(POINTS)
     for name, opened in EXECUTORS.items():
-        try:
-            opening = opened()
-        except ImportError as error:
-            print(f"{name}: {error}", flush=True)
-            continue
-        with opening as executor:
+        with contextlib.ExitStack() as stack:
+            try:
+                executor = stack.enter_context(opened())
+            except ImportError as error:
+                print(f"{name}: {error}", flush=True)
+                continue
             for _ in range(2):  # so that every worker compiles
                 whole = the_map(POINTS, executor=executor)
             walls, cores = ({"threads": 0.0, name: 0.0} for _ in range(2))

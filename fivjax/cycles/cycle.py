@@ -207,7 +207,7 @@ def under_final_load(scene: Scene) -> Scene:
 def point_of(cycle: LimitCycle) -> Point:
     """The cycle's point on the section, in the form that the return map takes."""
     contact = Contact(jnp.asarray(cycle.contact.status, jnp.int32), jnp.asarray(cycle.contact.direction, jnp.float64))
-    return Point(jnp.asarray(cycle.deviation, jnp.float64), contact)
+    return Point(jnp.asarray(cycle.points[0], jnp.float64), contact)
 
 
 @in_double_precision

@@ -21,7 +21,7 @@ from ..model.scene import Scene, refuse_vector_contacts
 from ..steppers.event_exact import EventExact, for_derivatives
 from .around import peak_speed_along
 from .closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
-from .cycle import LimitCycle, under_final_load
+from .cycle import LimitCycle, point_of, under_final_load
 from .section_map import MOST_TO_CROSSING, Point, longest_return, mechanics_about_sliding, sliding_state
 
 
@@ -90,9 +90,7 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
             "Argument `cycle` must be of a scene with as many coordinates, and friction and impacts of the same kind, as "
             "`scene`; compute one with `fivjax.limit_cycle(scene)`."
         )
-    contact = Contact(jnp.asarray(cycle.contact.status, jnp.int32), jnp.asarray(cycle.contact.direction, jnp.float64))
-    point = Point(jnp.asarray(cycle.points[0], jnp.float64), contact)
-    found = next_to(after, before, point, jnp.asarray(cycle.crossings, jnp.int32), stages, bool(multipliers))
+    found = next_to(after, before, point_of(cycle), jnp.asarray(cycle.crossings, jnp.int32), stages, bool(multipliers))
     return jax.tree.map(known_to_numpy, found)
 
 

@@ -103,8 +103,7 @@ def tori_among(
 
 def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: list[Cycle], radius: float) -> bool:
     """Whether a stable cycle lies in the inner half of the tube about a set: motions there may come to that instead."""
-    reach = 0.5 * radius * tube.mean_size(states)
-    return any(np.all(nearest(maps.weights * cycle.points, states) <= reach) for cycle in cycles)
+    return any(tube.home(states, maps.weights * cycle.points[:, None], radius).item() for cycle in cycles)
 
 
 def _back(
