@@ -36,7 +36,7 @@ class Follower(NamedTuple):
     """How trajectories are begun and followed (`rounds`)."""
 
     begun: Callable
-    follow: Callable
+    observed: Callable
 
 
 def search(
@@ -80,16 +80,15 @@ def search(
         seen = nominating.Ensemble(*(part[:looks, mine] for part in whole[:-1]), moving=moving[mine])
         return nominating.met(seen, decay[groups[k]], thin=near is not None)
 
-    while len(running) and looks < most:
+    for stop in sorted({*NEWTON_AT, *tests}):
+        if not len(running) or stop > most:
+            break
         report(0)
-        rounds.follow(batch, shared, own[running], trajectories, nominating.SEEN)
+        seen = rounds.observed(shared, own[running], trajectories, stop - looks)
         _, now = trajectories.tree
-        recent = slice(looks, looks + nominating.SEEN)
-        deviations[recent, running] = np.moveaxis(now.approach.seen, 1, 0)[::-1]
-        times[recent, running] = now.t
-        # As of the last of these looks: enough to tell whether there were any since the looks before.
-        events[recent, running] = now.events
-        looks += nominating.SEEN
+        for whole, part in zip((deviations, times, events), seen, strict=True):
+            whole[looks:stop, running] = part.swapaxes(0, 1)
+        looks = stop
         moving[running] = now.verdict == Verdict.UNDECIDED
         if looks in NEWTON_AT:
             _add_cycles(maps, own, running, moving, now, found, members, NEWTON_AT[looks])

@@ -42,6 +42,7 @@ class Progress(eqx.Module):
     approach: Approach
     verdict: Int[Array, ""]
     energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
+    steps: "LoadSteps | None" = None  # for a kernel
 
 
 class Setting(eqx.Module):
@@ -63,7 +64,20 @@ class EnergyRecord(eqx.Module):
     vibration: Float[Array, ""]  # energy of the vibration just after the last jump of the load, J; NaN before
 
 
-def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool) -> Progress:
+class LoadSteps(eqx.Module):
+    """The load of one trajectory as numbers."""
+
+    jumps: Float[Array, " k"]  # s
+    loads: Float[Array, " k+1"]  # before, between and after them, as deviations from the final load, N
+
+    def __init__(self, load: AbstractLoad):
+        self.jumps = load.jumps
+        ends = jnp.concatenate([self.jumps[:1] - 1.0, self.jumps, self.jumps[-1:] + 1.0])
+        between = 0.5 * (ends[:-1] + ends[1:]) if self.jumps.shape[0] else jnp.zeros(1)
+        self.loads = jax.vmap(load)(between) - load.final
+
+
+def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool, for_kernel: bool) -> Progress:
     """A trajectory at the sliding equilibrium of its scene, before the kick."""
     q, _ = steady_sliding(scene, scene.load.force)
     equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
@@ -86,6 +100,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool)
         approach=attractors.no_approach(y),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
+        steps=LoadSteps(scene.load) if for_kernel else None,
     )
 
 
@@ -151,6 +166,7 @@ def step(setting: Setting, now: Progress) -> Progress:
         approach=now.approach,
         verdict=now.verdict,
         energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
+        steps=now.steps,
     )
 
 

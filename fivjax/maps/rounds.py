@@ -5,6 +5,7 @@ After each round of steps the decided ones leave and the undecided ones are comp
 verdict is open.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.kept_programs import kept
+from ..verdicts.ensemble import SEEN
 from ..verdicts.verdict import Verdict
 from . import attractors
 from .at_last import Narrow, fates
@@ -20,6 +22,7 @@ from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
 from .conclusion import STEPS_PER_LOOK, conclude, distance_to_torus, look
 from .flattened import Flattened, flatten
+from .kernels import Kernels, Looks
 from .progress import Setting, begin, placed, released, step
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
@@ -66,7 +69,8 @@ def follow_all(
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(verdicts.pending[index])
     trajectories = _begun(batch, shared, group[pending], columns[pending])
-    basins = Basins(batch, shared, distinct, group)
+    kernels = Kernels(shared, batch.pool) if batch.by_kernel else None
+    basins = Basins(batch, shared, kernels, distinct, group)
     known_from = KNOWN_FROM * batch.method.round
     own_from = OWN_FROM * batch.method.round
     limit = np.maximum(LEAST_TIME, LEAST_PERIODS * shared.tree.modes.slowest_period) if t_max is None else t_max
@@ -106,7 +110,7 @@ def follow_all(
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
         looks = -(-steps // STEPS_PER_LOOK)
-        _follow(batch, shared, group[pending], trajectories, looks)
+        _follow(batch, kernels, shared, group[pending], trajectories, looks)
         done += looks * STEPS_PER_LOOK
 
 
@@ -117,8 +121,11 @@ def _rows(tree, chosen: np.ndarray):
 class Basins:
     """The attractors of the groups that are followed together, and which trajectories have entered where they capture."""
 
-    def __init__(self, batch: Batch, shared: Flattened, distinct: np.ndarray, group: np.ndarray):
-        self.batch, self.shared, self.distinct, self.group = batch, shared, distinct, group
+    def __init__(
+        self, batch: Batch, shared: Flattened, kernels: Kernels | None, distinct: np.ndarray, group: np.ndarray
+    ):
+        self.batch, self.shared, self.kernels, self.distinct, self.group = batch, shared, kernels, distinct, group
+        self.follower = Follower(_begun, functools.partial(_observed, batch, kernels))
         self.maps: ReturnMaps | None = None
         self.cycles: list[Cycle] = []
         self.of_group: dict[int, list[int]] = {}  # places in `cycles`
@@ -131,14 +138,14 @@ class Basins:
 
     def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
         """Finds the attractors of these groups, where they are not `known`."""
-        self.maps = ReturnMaps(self.batch, self.shared)
+        self.maps = ReturnMaps(self.batch, self.shared, self.kernels)
         keys = [row.tobytes() for row in self.distinct]
         _, first = np.unique(self.group, return_index=True)
         unknown = np.array([g for g in groups if keys[g] not in known], int)
         for start in range(0, len(unknown), ENSEMBLES):
             part = unknown[start : start + ENSEMBLES]
-            follower = Follower(_begun, _follow)
-            found = attractors.search(self.batch, self.shared, self.maps, follower, part, columns[first[part]], report)
+            given = columns[first[part]]
+            found = attractors.search(self.batch, self.shared, self.maps, self.follower, part, given, report)
             known.update((keys[g], one) for g, one in zip(part, found, strict=True))
         for g in groups:
             one = known[keys[g]]
@@ -170,11 +177,11 @@ class Basins:
         chosen = alone[first]
         for start in range(0, len(groups), ENSEMBLES):
             part = slice(start, start + ENSEMBLES)
-            follower, near = Follower(_begun, _follow), latest[chosen[part]]
+            near = latest[chosen[part]]
             given = columns[pending[chosen[part]]]
             cycles = [self._cycles_of(g) for g in groups[part]]
             found = attractors.search(
-                self.batch, self.shared, self.maps, follower, groups[part], given, report, near, cycles
+                self.batch, self.shared, self.maps, self.follower, groups[part], given, report, near, cycles
             )
             for g, one, before in zip(groups[part], found, cycles, strict=True):
                 self._add(g, one.cycles[len(before) :])
@@ -259,13 +266,18 @@ def _begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarr
     releases = np.full(len(group), np.nan) if releases is None else releases
 
     def function(*block):
-        return _begin_block(batch.scene, batch.names, batch.history, batch.states, batch.energy, *block)
+        return _begin_block(batch.scene, batch.names, batch.history, batch.states, batch.energy, batch.by_kernel, *block)
 
     return in_blocks(function, shared, group, flatten((columns, releases)), batch.width, batch.pool, size=_block(batch))
 
 
-def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int) -> None:
+def _follow(
+    batch: Batch, kernels: Kernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int
+) -> None:
     """Trajectories `looks` looks further, in place."""
+    if kernels is not None:
+        _follow_by_kernel(batch, kernels, shared, group, trajectories, looks)
+        return
     follow_block = _follow_block_of_many if batch.many else _follow_block
 
     def function(*block):
@@ -274,19 +286,52 @@ def _follow(batch: Batch, shared: Flattened, group: np.ndarray, trajectories: Fl
     in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True, size=_block(batch))
 
 
+def _follow_by_kernel(
+    batch: Batch, kernels: Kernels, shared: Flattened, group, trajectories, looks: int, recorded: bool = False
+) -> Looks:
+    began = np.array(trajectories.tree[1].t)
+    after, reached, record = kernels.follow(group, trajectories, looks, recorded)
+
+    def function(*block):
+        return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
+
+    rows = flatten((*after.tree, began, reached))
+    concluded = in_blocks(function, shared, group, rows, batch.width, batch.pool)
+    trajectories.numbers[:] = concluded.numbers
+    return record
+
+
+def _observed(
+    batch: Batch, kernels: Kernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int
+) -> Looks:
+    """Trajectories `looks` looks further, in place; and what was seen of them."""
+    if kernels is not None:
+        return _follow_by_kernel(batch, kernels, shared, group, trajectories, looks, recorded=True)
+    parts = []
+    for start in range(0, looks, SEEN):
+        _follow(batch, None, shared, group, trajectories, min(SEEN, looks - start))
+        now = trajectories.tree[1]
+        each = np.ones((1, SEEN))
+        # As of the last of these looks: enough to tell whether there were any since the looks before.
+        parts.append(Looks(now.approach.seen[:, ::-1].copy(), now.t[:, None] * each, now.events[:, None] * each))
+    return Looks(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+
+
 def _block(batch: Batch) -> int | None:
     return BLOCK_OF_SEVERAL if len(batch.scene.structure.contacts) > 1 else None
 
 
 @kept
-def _begin_block(scene, names, history, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _begin_block(
+    scene, names, history, states, energy: bool, for_kernel: bool, shared: Flattened, trajectories: Flattened
+) -> Flattened:
     def group(shared, columns, releases):
         own = with_values(scene, names, shared.values)
 
         def one(row, release):
             scene = with_values(own, history, row)
             begun = placed(
-                begin(scene, shared.mechanics, shared.modes, energy), scene, shared, states, row[len(history) :]
+                begin(scene, shared.mechanics, shared.modes, energy, for_kernel), scene, shared, states, row[len(history) :]
             )
             return released(own, shared.modes, begun, release)
 
@@ -299,29 +344,7 @@ def _begin_block(scene, names, history, states, energy: bool, shared: Flattened,
 def _followed(scene, method, names, history, looks, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
     everything = shared.tree
-
-    def of_all(function):
-        """A function of a setting and of what is one trajectory's, for all trajectories of the block."""
-
-        def of_group(shared, columns, *own):
-            scene_of_group = with_values(scene, names, shared.values)
-
-            def of_one(row, *own):
-                setting = Setting(
-                    with_values(scene_of_group, history, row),
-                    method,
-                    shared.mechanics,
-                    shared.prepared,
-                    shared.modes,
-                    shared.drift,
-                    shared.attractor,
-                )
-                return function(setting, *own)
-
-            return jax.vmap(of_one)(columns, *own)
-
-        return lambda *own: jax.vmap(of_group)(everything, columns, *own)
-
+    of_all = functools.partial(_of_all, scene, method, names, history, everything, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
     a_step, a_distance, a_look, concluded = map(of_all, (step, distance_to_torus, look, conclude))
@@ -339,3 +362,32 @@ def _followed(scene, method, names, history, looks, shared: Flattened, trajector
 
 
 _follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_compiled=False)
+
+
+@kept
+def _conclude_block(scene, method, names, history, shared: Flattened, trajectories: Flattened) -> Flattened:
+    columns, after, began, reached = trajectories.tree
+    concluded = _of_all(scene, method, names, history, shared.tree, columns, conclude)
+    return flatten((columns, concluded(began, after, reached)), row_axes=2)
+
+
+def _of_all(scene, method, names, history, everything, columns, function):
+    """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
+    def of_group(shared, columns, *own):
+        scene_of_group = with_values(scene, names, shared.values)
+
+        def of_one(row, *own):
+            setting = Setting(
+                with_values(scene_of_group, history, row),
+                method,
+                shared.mechanics,
+                shared.prepared,
+                shared.modes,
+                shared.drift,
+                shared.attractor,
+            )
+            return function(setting, *own)
+
+        return jax.vmap(of_one)(columns, *own)
+
+    return lambda *own: jax.vmap(of_group)(everything, columns, *own)

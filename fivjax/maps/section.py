@@ -24,6 +24,7 @@ from ..steppers.windowed import Windowed
 from ..verdicts.capture import free_on_section
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
+from .kernels import Kernels
 from .sharing import Batch
 from .windowed_returns import KEPT, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
 
@@ -63,8 +64,8 @@ class Images(NamedTuple):
 class ReturnMaps:
     """The return maps of all groups of a batch."""
 
-    def __init__(self, batch: Batch, shared: Flattened):
-        tree = shared.tree
+    def __init__(self, batch: Batch, shared: Flattened, kernels: Kernels | None = None):
+        tree, self.kernels = shared.tree, kernels
         longest = np.asarray(tree.longest_return)
         self.mechanics = flatten((tree.mechanics, longest))
         self.windows = flatten((tree.prepared, longest)) if isinstance(batch.method, Windowed) else None
@@ -163,6 +164,8 @@ class ReturnMaps:
         return peak, Section(*found[:3])
 
     def _in_windows(self, group, at: Section, crossings, peaks: bool = False):
+        if self.kernels is not None:
+            return self.kernels.returns(group, *at, crossings, peaks)
         rows = _rows(at, crossings, np.full(len(at.y), peaks))
         return in_blocks(moved_in_windows, self.windows, group, rows, SIDE_BY_SIDE, self.pool, size=self.block).tree
 

@@ -17,10 +17,12 @@ from ..contact import Mechanics
 from ..cycles.section_map import longest_return, mechanics_about_sliding
 from ..foundation.kept_programs import kept
 from ..linear.linearisation import linear_sliding
+from ..model.friction import Coulomb
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.propagation import MATRIX_ROWS
+from ..steppers.scalar_windows import MOST_COORDINATES, is_installed
 from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
 from ..verdicts.ensemble import Attractor
@@ -43,6 +45,7 @@ class Shared(eqx.Module):
     modes: SlidingModes
     drift: StickingDrift | None  # None with several contacts
     attractor: Attractor
+    weights: Float[Array, " state"]  # see `Structure.weights`
     longest_return: Float[Array, ""]  # of the section's return map, s
 
 
@@ -59,11 +62,20 @@ class Batch(NamedTuple):
     many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
     pool: ThreadPoolExecutor
 
+    @property
+    def by_kernel(self) -> bool:
+        """Whether kernels follow the trajectories."""
+        return isinstance(self.method, Windowed) and self.method.by_kernel
+
 
 def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
     """The stepper that gives the same motion of many trajectories in less time, if there is one."""
     one = len(scene.structure.contacts) == 1
-    return Windowed() if method == EventExact() and scene.friction.constant and one else method
+    if method != EventExact() or not scene.friction.constant or not one:
+        return method
+    small = scene.structure.size <= MOST_COORDINATES
+    # Only of a law that is known can it be said that a kernel can be made of it.
+    return Windowed(by_kernel=small and isinstance(scene.friction, Coulomb) and is_installed())
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
@@ -99,11 +111,11 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
     numbers = form = None
     for start in range(0, len(distinct), size):
         # Written into the result one by one, because they are large and should not be in memory twice.
-        mechanics, prepared, _, drifts, longest = parts.pop(0)
+        mechanics, prepared, _, drifts, weights, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown, longest))
+        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown, weights, longest))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)
@@ -115,7 +127,8 @@ def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)
         drift = None if mechanics.several else sticking_drift(own)
-        return mechanics, method.prepare(mechanics), linear_sliding(own), drift, longest_return(own)
+        weights = own.structure.weights
+        return mechanics, method.prepare(mechanics), linear_sliding(own), drift, weights, longest_return(own)
 
     return jax.vmap(one)(values)
 

@@ -40,14 +40,10 @@ class Window(eqx.Module):
         start, hull, control, _ = self.parts
         limits, uncubic = self.sizes[:6].reshape(3, 2, -1), self.sizes[6:]
         safe = jnp.minimum(jnp.minimum(control[0], control[1]), control[2]) > uncubic  # [interval, guard, trajectory]
-        # In the first interval a guard may start at zero, because the status has just begun.
-        zeros, lead = _start(start, limits, self.exact)
-        first_safe = (lead > 0) & (least(hull[2:]) > 0)
-        first_safe = first_safe & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
         index = jnp.arange(INTERVALS)[:, None]
         safe = safe[:, 0] & safe[:, 1] | (index == 0)
         first = least(jnp.where(safe, INTERVALS, index).astype(jnp.int32))
-        first = jnp.where(first_safe[0] & first_safe[1], first, 0)
+        first = jnp.where(first_is_safe(start, hull, limits, self.exact), first, 0)
         return jnp.minimum(first, jnp.floor(steps).astype(jnp.int32))
 
     def state_at(self, interval: Int[Array, " l"]) -> Float[Array, "state l"]:
@@ -78,13 +74,7 @@ class Window(eqx.Module):
 
         The sample that is largest may belong to a lower peak: peaks are told by the parabolas through three samples.
         """
-        speed, index = sign * self.speed, jnp.arange(INTERVALS + 1)[:, None]
-        rise, bend = 0.5 * (speed[2:] - speed[:-2]), speed[2:] - 2.0 * speed[1:-1] + speed[:-2]
-        bends = (bend < 0) & (jnp.abs(rise) <= -bend) & (rise <= -bend * (steps - index[1:-1]))
-        above = jnp.where(bends, -0.5 * rise**2 / jnp.where(bends, bend, 1.0), 0.0)
-        none = jnp.zeros_like(speed[:1])
-        peak = jnp.where(index <= steps, speed + jnp.concatenate([none, above, none]), -jnp.inf)
-        return least(jnp.where(peak == -least(-peak), index, INTERVALS).astype(jnp.int32))
+        return fastest(sign * self.speed, steps)
 
 
 class Bracket(eqx.Module):
@@ -116,18 +106,7 @@ class Series(eqx.Module):
         none.
         """
         c, end, _ = self.parts
-        zeros, lead = _start(c, self.sizes[:6].reshape(3, 2, -1), self.exact)
-        spent = inside & (lead < 0)
-        crosses = inside & (lead >= 0) & (end <= 0)
-        slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
-        bend = end - lead - slope
-        guess = parabola_root(lead, slope, bend)
-        bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
-        # The factors allow for the difference from a parabola.
-        dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
-        dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
-        guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
-        return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+        return bracketed(c, end, self.sizes[:6].reshape(3, 2, -1), self.exact, inside)
 
     def without_zeros(self, zeros: Int[Array, "2 l"]) -> Float[Array, "k 2 l"]:
         """The coefficients of the guards; the first `zeros`, which are zero up to rounding, are exactly zero."""
@@ -141,6 +120,52 @@ class Series(eqx.Module):
     def state(self, x: Float[Array, " l"]) -> Float[Array, "state l"]:
         """Displacements, and velocities in m per interval."""
         return jnp.concatenate(value_and_slope(self.parts[2], x))
+
+
+def first_is_safe(
+    start: Float[Array, "4 2 l"], hull: Float[Array, "k 2 l"], limits: Float[Array, "3 2 l"], exact: Bool[Array, "2 l"]
+) -> Bool[Array, " l"]:
+    """Whether the first interval is certain to have no event: a guard may start at zero there, because the status has just
+    begun. From the first coefficients of the guards, the control points of their series, and the bounds on rounding.
+    """
+    zeros, lead = _start(start, limits, exact)
+    safe = (lead > 0) & (least(hull[2:]) > 0) & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
+    return safe[0] & safe[1]
+
+
+def bracketed(
+    c: Float[Array, "k 2 l"],
+    end: Float[Array, "2 l"],
+    limits: Float[Array, "3 2 l"],
+    exact: Bool[Array, "2 l"],
+    inside: Bool[Array, " l"],
+) -> Bracket:
+    """The brackets of both guards from the first five coefficients of their series or more, their values at the `end`, and the
+    bounds on rounding; none for trajectories that are not `inside` an interval.
+    """
+    zeros, lead = _start(c, limits, exact)
+    spent = inside & (lead < 0)
+    crosses = inside & (lead >= 0) & (end <= 0)
+    slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
+    bend = end - lead - slope
+    guess = parabola_root(lead, slope, bend)
+    bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
+    # The factors allow for the difference from a parabola.
+    dips = inside & (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
+    dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
+    guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
+    return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+
+
+def fastest(speed: Float[Array, "i l"], steps: Float[Array, " l"]) -> Int[Array, " l"]:
+    """The sample next to the highest peak within the first `steps` intervals, from all samples."""
+    index = jnp.arange(INTERVALS + 1)[:, None]
+    rise, bend = 0.5 * (speed[2:] - speed[:-2]), speed[2:] - 2.0 * speed[1:-1] + speed[:-2]
+    bends = (bend < 0) & (jnp.abs(rise) <= -bend) & (rise <= -bend * (steps - index[1:-1]))
+    above = jnp.where(bends, -0.5 * rise**2 / jnp.where(bends, bend, 1.0), 0.0)
+    none = jnp.zeros_like(speed[:1])
+    peak = jnp.where(index <= steps, speed + jnp.concatenate([none, above, none]), -jnp.inf)
+    return least(jnp.where(peak == -least(-peak), index, INTERVALS).astype(jnp.int32))
 
 
 def _parts(rows: Array, *shapes: tuple[int, ...]) -> list[Array]:

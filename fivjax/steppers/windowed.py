@@ -38,6 +38,9 @@ class Windowed(eqx.Module):
     `prepare` and `advance` are those of a stepper.
     """
 
+    # Whether maps leave the stepping to a kernel (`scalar_windows`).
+    by_kernel: bool = eqx.field(static=True, default=False)
+
     dt: ClassVar = np.inf
     round: ClassVar = 16
 
