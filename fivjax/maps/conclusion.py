@@ -3,13 +3,14 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..verdicts import ensemble as attractors
 from ..verdicts.sliding_proof import slides_forever
 from ..verdicts.slow_growth import slid_on
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
+from .flattened import Flattened
 from .progress import Progress, Setting
 
 # Steps between two comparisons of a trajectory with a known torus: one or two cycles for the fastest method.
@@ -30,6 +31,16 @@ def look(
     crossing = setting.scene.structure.weights * now.crossing
     approach, reached_now = attractors.approached(now.approach, crossing, distance)
     return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
+
+
+def may_be_concluded(shared: Flattened, group: Int[np.ndarray, " m"], before: Progress, now: Progress) -> np.ndarray:
+    """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
+    steps: those whose mode has not changed in it, and those that have not moved, are too large or are not finite. Cheap.
+    """
+    tree = shared.tree
+    yardstick = np.max(np.abs(tree.weights * tree.modes.linear.equilibrium), axis=1)
+    largest = np.max(np.abs(tree.weights[group] * now.y), axis=1)
+    return (now.events == before.events) | (now.t <= before.t) | ~(largest <= GROWTH * yardstick[group])
 
 
 def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: Bool[Array, ""]) -> Progress:

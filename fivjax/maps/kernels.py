@@ -43,6 +43,8 @@ class Kernels:
         form = Form.of(mechanics, leading=1)
         self.pool, self.shared, self.wp = pool, shared, wp
         self.types, self.programs = functions(form), _programs(form)
+        # The proofs that are not left to kernels do not need the matrices.
+        self.for_conclusions = flatten(jax.tree.map(np.asarray, (tree.values, mechanics, tree.modes, tree.drift)))
         self.longest = np.asarray(tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)

@@ -20,13 +20,13 @@ from .at_last import Narrow, fates
 from .attractors import Attractors, Follower
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
-from .conclusion import STEPS_PER_LOOK, conclude, distance_to_torus, look
+from .conclusion import STEPS_PER_LOOK, conclude, distance_to_torus, look, may_be_concluded
 from .flattened import Flattened, flatten
 from .kernels import Kernels, Looks
 from .progress import Setting, begin, placed, released, step
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
-from .sharing import Batch, grouped, shared_by, with_values
+from .sharing import Batch, Shared, grouped, shared_by, with_values
 from .tori import Torus, followed_on
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
@@ -289,15 +289,22 @@ def _follow(
 def _follow_by_kernel(
     batch: Batch, kernels: Kernels, shared: Flattened, group, trajectories, looks: int, recorded: bool = False
 ) -> Looks:
-    began = np.array(trajectories.tree[1].t)
     after, reached, record = kernels.follow(group, trajectories, looks, recorded)
+    before = trajectories.tree[1]
+    began = np.array(before.t)
+    # While its mode changes again and again, nothing can be proved of a trajectory.
+    asks = np.flatnonzero(reached | may_be_concluded(shared, group, before, after.tree[1]))
+    trajectories.numbers[:] = after.numbers
+    if not len(asks):
+        return record
 
     def function(*block):
         return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
 
-    rows = flatten((*after.tree, began, reached))
-    concluded = in_blocks(function, shared, group, rows, batch.width, batch.pool)
-    trajectories.numbers[:] = concluded.numbers
+    rows = flatten((*_rows(after.tree, asks), began[asks], reached[asks]))
+    # They are few of each group, and what they share is little.
+    concluded = in_blocks(function, kernels.for_conclusions, group[asks], rows, 1, batch.pool)
+    trajectories.numbers[asks] = concluded.numbers
     return record
 
 
@@ -367,7 +374,9 @@ _follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_
 @kept
 def _conclude_block(scene, method, names, history, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, after, began, reached = trajectories.tree
-    concluded = _of_all(scene, method, names, history, shared.tree, columns, conclude)
+    values, mechanics, modes, drift = shared.tree
+    everything = Shared(values, mechanics, None, modes, drift, None, None, None)  # pyright: ignore[reportArgumentType]
+    concluded = _of_all(scene, method, names, history, everything, columns, conclude)
     return flatten((columns, concluded(began, after, reached)), row_axes=2)
 
 

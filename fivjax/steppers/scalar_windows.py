@@ -23,7 +23,7 @@ from ..contact import Contact, Mechanics, Status
 from ..contact.rounding import RESTING
 from ..foundation.scalar_source import scalar_source
 from .propagation import INTERVALS, ORDER, Propagators
-from .window import bracketed, fastest, first_is_safe
+from .window import bracketed, fastest, first_is_safe, leading
 from .window_roots import MOST_ROOT_STEPS, PEAK_STEPS, RISE_STEPS
 
 # Structures with more degrees of freedom make kernels that take long to compile.
@@ -48,48 +48,60 @@ def warp() -> Any:
     return wp
 
 
-class Rows(NamedTuple):
-    """Where the parts of a mode's matrices begin, in rows; of a structure with `n` degrees of freedom."""
+# Rows of a block of a matrix: two vectors of a processor. A block is contiguous, column by column.
+BLOCK = 8
 
-    hull: int  # control points of the guards' series in the first interval
+
+class Blocks(NamedTuple):
+    """Where the parts of a mode's matrices begin, in blocks; of a structure with `n` degrees of freedom."""
+
     intervals: int  # control points of both guards in each interval, and the tangential velocity at its end
+    hull: int  # control points of the guards' series in the first interval
     samples: int
-    series: int  # of the guards, then their values at the end of the interval
+    guards: int  # their series, and their values at the end of the interval
     displacements: int  # their series, coordinate by coordinate
     sizes: int
     total: int
 
 
-# Rows for each interval.
-OF_INTERVAL = 8
+def blocks_of(n: int) -> Blocks:
+    lengths = 2 * ORDER, (INTERVALS + 1) * padded(2 * n), 2 * (ORDER + 2), n * (ORDER + 2), BLOCK
+    return Blocks(0, *np.cumsum([INTERVALS, *(padded(length) // BLOCK for length in lengths)]).tolist())
 
 
-def rows_of(n: int) -> Rows:
-    lengths = (2 * ORDER, OF_INTERVAL * INTERVALS, 2 * n * (INTERVALS + 1), 2 * (ORDER + 2), n * (ORDER + 2), 8)
-    return Rows(0, *np.cumsum(lengths).tolist())
+def padded(rows: int) -> int:
+    """The next multiple of a block's length."""
+    return -(-rows // BLOCK) * BLOCK
 
 
-def matrices(prepared: Propagators, n: int, tangential: int, normal: int) -> Float[np.ndarray, "groups modes c rows"]:
-    """The matrices of several scenes (leading axis), mode by mode: sticking, sliding in either direction, detached.
+def places_of(n: int, normal: int) -> list[int]:
+    """The places in (state, load, one) of the columns: first those that are not zero in contact."""
+    closed = [place for place in range(2 * n + 2) if place not in (normal, n + normal)]
+    return [*closed, normal, n + normal]
 
-    All modes have all columns (state, load, one), and a column is contiguous: a product with a state is a sum of columns.
-    """
+
+def matrices(prepared: Propagators, n: int, tangential: int, normal: int) -> Float[np.ndarray, "groups m"]:
+    """The matrices of several scenes (leading axis), mode by mode: sticking, sliding in either direction, detached."""
     window, series, sizes = (np.asarray(part) for part in (prepared.window, prepared.series, prepared.sizes))
-    count, every = len(window), 2 * n * (INTERVALS + 1)
+    count = len(window)
     hull, control, samples = np.split(window[:, 8:], np.cumsum((2 * ORDER, 6 * INTERVALS)), axis=1)
     guards, displacements = np.split(series, [2 * (ORDER + 2)], axis=1)
     control = control.reshape(count, 3, INTERVALS, 2, -1).transpose(0, 2, 1, 3, 4).reshape(count, INTERVALS, 6, -1)
-    speed = samples.reshape(count, INTERVALS + 1, 2 * n, -1)[:, 1:, n + tangential]
-    parts = np.stack([speed, np.zeros_like(speed)], axis=2)
-    intervals = np.concatenate([control, parts], axis=2).reshape(count, OF_INTERVAL * INTERVALS, -1)
+    samples = samples.reshape(count, INTERVALS + 1, 2 * n, -1)
     displacements = displacements.reshape(count, ORDER + 2, n, -1).swapaxes(1, 2).reshape(count, n * (ORDER + 2), -1)
-    rows = np.concatenate([hull, intervals, samples[:, :every], guards, displacements, sizes], axis=1)
-    found = np.zeros((count, 4, 2 * n + 2, rows.shape[1]))
-    closed = np.delete(np.arange(2 * n + 2), [normal, n + normal])
+    intervals = np.concatenate([control, samples[:, 1:, n + tangential, None]], axis=2)
+    parts = [_in_blocks(part) for part in (intervals, hull, samples, guards, displacements, sizes)]
+    rows = np.concatenate([part.reshape(count, -1, BLOCK, part.shape[-1]) for part in parts], axis=1)
+    found = np.zeros((count, 4, rows.shape[1], 2 * n + 2, BLOCK))
     for mode in range(3):
-        found[:, mode, closed] = rows[:, :, 2 * n * mode : 2 * n * (mode + 1)].swapaxes(1, 2)
-    found[:, 3] = rows[:, :, 6 * n :].swapaxes(1, 2)
-    return found
+        found[:, mode, :, : 2 * n] = rows[..., 2 * n * mode : 2 * n * (mode + 1)].swapaxes(-1, -2)
+    found[:, 3] = rows[..., 6 * n :][..., places_of(n, normal)].swapaxes(-1, -2)
+    return found.reshape(count, -1)
+
+
+def _in_blocks(rows: Float[np.ndarray, "*parts rows c"]) -> Float[np.ndarray, "*parts padded c"]:
+    more = padded(rows.shape[-2]) - rows.shape[-2]
+    return np.pad(rows, [(0, 0)] * (rows.ndim - 2) + [(0, more), (0, 0)])
 
 
 class Form(NamedTuple):
@@ -143,25 +155,34 @@ def functions(form: Form) -> Functions:
     tangential, normal = like.tangential, like.normal
     n = like.free_load.shape[0]
     velocity = n + tangential
-    at = rows_of(n)
-    hulls, intervals, samples, guards, displacements, bounds, total = at
+    at = blocks_of(n)
+    intervals, hulls, samples, guards, displacements, bounds, total = at
+    of_sample = padded(2 * n) // BLOCK
     state, row, numbers = (wp.types.vector(size, real) for size in (2 * n, 2 * n + 2, form.count))
     mode_type, pair = (wp.types.vector(2, real) for _ in range(2))
-    how_type, sizes_type, polynomial = (wp.types.vector(size, real) for size in (4, 8, ORDER + 1))
-    few, hull_type, bracket_type = (wp.types.vector(size, real) for size in (10, 2 * ORDER, 12))
-    guards_type, series_type = wp.types.vector(2 * (ORDER + 2), real), wp.types.vector(n * (ORDER + 2), real)
-    speeds_type, one_type = wp.types.vector(INTERVALS + 1, real), wp.types.vector(1, real)
-    matrices_type = wp.array(dtype=real)
+    how_type, block_type, polynomial = (wp.types.vector(size, real) for size in (4, BLOCK, ORDER + 1))
+    few, bracket_type, one_type = (wp.types.vector(size, real) for size in (10, 12, 1))
+    hull_type, sample_type, guards_type, series_type = (
+        wp.types.vector(padded(size), real) for size in (2 * ORDER, 2 * n, 2 * (ORDER + 2), n * (ORDER + 2))
+    )
+    speeds_type, matrices_type = wp.types.vector(INTERVALS + 1, real), wp.array(dtype=real)
+    # A row is (state, load, one) with what is zero in contact at its end.
+    of_row = wp.types.vector(2 * n + 2, int)(*places_of(n, normal))
+    speed_at = places_of(n, normal).index(velocity)
 
     def product(size):
-        """What a Warp function does that multiplies so many rows, from the row `first` of a matrix at `m`, by `here`."""
+        """What a Warp function does that multiplies so many rows, from the block `first` of a matrix on, by `here`."""
         return f"""
             wp::vec_t<{size}, wp::float64> found;
-            const wp::float64* column = m.data + {(2 * n + 2) * total} * matrix + first;
-            for (int r = 0; r < {size}; ++r) found[r] = column[r] * here[0];
-            for (int k = 1; k < {2 * n + 2}; ++k) {{
-                column += {total};
-                for (int r = 0; r < {size}; ++r) found[r] += column[r] * here[k];
+            const wp::float64* column = m.data + {BLOCK * (2 * n + 2)} * ({total} * matrix + first);
+            const int columns = matrix % 4 == 3 ? {2 * n + 2} : {2 * n};
+            for (int b = 0; b < {size}; b += {BLOCK}) {{
+                wp::float64 sums[{BLOCK}];
+                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * here[0];
+                for (int k = 1; k < columns; ++k)
+                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * here[k];
+                for (int r = 0; r < {BLOCK}; ++r) found[b + r] = sums[r];
+                column += {BLOCK * (2 * n + 2)};
             }}
             return found;"""
 
@@ -189,13 +210,20 @@ def functions(form: Form) -> Functions:
         contact, y = physics.transition(own, contact, how[0], y, how[1:3] != 0, how[3])
         return jnp.concatenate([y, jnp.stack([contact.status.astype(y.dtype), contact.direction])])
 
+    def limits_of(sizes):
+        return sizes[:6].reshape(3, 2, 1)
+
+    def begun_of(mode, start, sizes):
+        zeros, _ = leading(start.reshape(4, 2, 1), limits_of(sizes), exact_of(mode))
+        return jnp.any(zeros > 0)[None]
+
     def safe_of(mode, start, hull, sizes):
-        limits = sizes[:6].reshape(3, 2, 1)
-        return first_is_safe(start.reshape(4, 2, 1), hull.reshape(ORDER, 2, 1), limits, exact_of(mode))
+        hull = hull[: 2 * ORDER].reshape(ORDER, 2, 1)
+        return first_is_safe(start.reshape(4, 2, 1), hull, limits_of(sizes), exact_of(mode))
 
     def bracket_of(mode, start, end, sizes):
-        limits, inside = sizes[:6].reshape(3, 2, 1), jnp.ones(1, bool)
-        found = bracketed(start.reshape(5, 2, 1), end.reshape(2, 1), limits, exact_of(mode), inside)
+        inside = jnp.ones(1, bool)
+        found = bracketed(start.reshape(5, 2, 1), end.reshape(2, 1), limits_of(sizes), exact_of(mode), inside)
         return jnp.concatenate([jnp.ravel(part).astype(start.dtype) for part in jax.tree.leaves(found)])
 
     def fastest_of(speeds, steps):
@@ -207,32 +235,32 @@ def functions(form: Form) -> Functions:
     @wp.func_native(body(next_of, mechanics=numbers, mode=mode_type, y=state, how=how_type))
     def next_mode(mechanics: numbers, mode: mode_type, y: state, how: how_type) -> row: ...
 
-    @wp.func_native(body(safe_of, mode=mode_type, start=sizes_type, hull=hull_type, sizes=sizes_type))
-    def is_safe(mode: mode_type, start: sizes_type, hull: hull_type, sizes: sizes_type) -> one_type: ...
+    @wp.func_native(body(begun_of, mode=mode_type, start=block_type, sizes=block_type))
+    def has_begun(mode: mode_type, start: block_type, sizes: block_type) -> one_type: ...
 
-    @wp.func_native(body(bracket_of, mode=mode_type, start=few, end=pair, sizes=sizes_type))
-    def brackets(mode: mode_type, start: few, end: pair, sizes: sizes_type) -> bracket_type: ...
+    @wp.func_native(body(safe_of, mode=mode_type, start=block_type, hull=hull_type, sizes=block_type))
+    def is_safe(mode: mode_type, start: block_type, hull: hull_type, sizes: block_type) -> one_type: ...
+
+    @wp.func_native(body(bracket_of, mode=mode_type, start=few, end=pair, sizes=block_type))
+    def brackets(mode: mode_type, start: few, end: pair, sizes: block_type) -> bracket_type: ...
 
     @wp.func_native(body(fastest_of, speeds=speeds_type, steps=one_type))
     def fastest_sample(speeds: speeds_type, steps: one_type) -> one_type: ...
 
-    @wp.func_native(product(8))
-    def eight(m: matrices_type, matrix: int, first: int, here: row) -> sizes_type: ...
+    @wp.func_native(product(BLOCK))
+    def block(m: matrices_type, matrix: int, first: int, here: row) -> block_type: ...
 
-    @wp.func_native(product(2 * n))
-    def sample(m: matrices_type, matrix: int, first: int, here: row) -> state: ...
+    @wp.func_native(product(padded(2 * n)))
+    def sample(m: matrices_type, matrix: int, first: int, here: row) -> sample_type: ...
 
-    @wp.func_native(product(2 * ORDER))
+    @wp.func_native(product(padded(2 * ORDER)))
     def hull(m: matrices_type, matrix: int, first: int, here: row) -> hull_type: ...
 
-    @wp.func_native(product(2 * (ORDER + 2)))
+    @wp.func_native(product(padded(2 * (ORDER + 2))))
     def guard_series(m: matrices_type, matrix: int, first: int, here: row) -> guards_type: ...
 
-    @wp.func_native(product(n * (ORDER + 2)))
+    @wp.func_native(product(padded(n * (ORDER + 2))))
     def series(m: matrices_type, matrix: int, first: int, here: row) -> series_type: ...
-
-    @wp.func_native(product(1))
-    def one_row(m: matrices_type, matrix: int, first: int, here: row) -> one_type: ...
 
     # Numbers in double precision: Warp takes Python's for single.
     zero, half, one, two, most = real(0.0), real(0.5), real(1.0), real(2.0), real(float(INTERVALS))
@@ -269,18 +297,31 @@ def functions(form: Form) -> Functions:
     @wp.func
     def stacked(y: state, load: real) -> row:
         found = row()
-        for k in range(2 * n):
-            found[k] = y[k]
-        found[2 * n] = load
-        found[2 * n + 1] = one
+        for k in range(2 * n + 2):
+            place = of_row[k]
+            if place < 2 * n:
+                found[k] = y[place]
+            elif place == 2 * n:
+                found[k] = load
+            else:
+                found[k] = one
         return found
 
     @wp.func
-    def sizes_at(m: matrices_type, w: int, here: row) -> sizes_type:
+    def sample_at(m: matrices_type, w: int, here: row, i: int) -> state:
+        """The state at the beginning of an interval."""
+        there = sample(m, w, samples + of_sample * i, here)
+        found = state()
+        for k in range(2 * n):
+            found[k] = there[k]
+        return found
+
+    @wp.func
+    def sizes_at(m: matrices_type, w: int, here: row) -> block_type:
         size = row()
         for k in range(2 * n + 2):
             size[k] = wp.abs(here[k])
-        return eight(m, w, bounds, size)
+        return block(m, w, bounds, size)
 
     @wp.func
     def value_at(c: polynomial, x: real) -> pair:
@@ -405,15 +446,20 @@ def functions(form: Form) -> Functions:
         """The first interval that may have an event, in which the section is crossed, or in which the time ends."""
         sizes = sizes_at(m, w, here)
         whole = int(wp.floor(steps))
-        before = here[velocity]
+        before = here[speed_at]
         i = int(0)
         searching = int(1)
         while searching == 1 and i < whole:
-            c = eight(m, w, intervals + 8 * i, here)
+            c = block(m, w, intervals + i, here)
+            begins = zero
+            start = block_type()
+            if i == 0:
+                start = block(m, w, guards, here)
+                begins = has_begun(mode, start, sizes)[0]
             if before < zero and c[6] >= zero:
                 searching = 0
-            elif i == 0:
-                if is_safe(mode, eight(m, w, guards, here), hull(m, w, hulls, here), sizes)[0] == zero:
+            elif begins > zero:
+                if is_safe(mode, start, hull(m, w, hulls, here), sizes)[0] == zero:
                     searching = 0
             elif not (
                 wp.min(wp.min(c[0], c[2]), c[4]) > sizes[6] and wp.min(wp.min(c[1], c[3]), c[5]) > sizes[7]
@@ -434,7 +480,7 @@ def functions(form: Form) -> Functions:
         i = first_interval(m, w, mode, here, steps)
         began = y
         if i > 0:
-            began = sample(m, w, samples + 2 * n * i, here)
+            began = sample_at(m, w, here, i)
         share = zero
         fires_0 = int(0)
         fires_1 = int(0)
@@ -519,8 +565,7 @@ def functions(form: Form) -> Functions:
         m: matrices_type, w: int, here: row, load: real, i: int, steps: real, interval: real
     ) -> real:
         """The largest tangential speed next to a sample of the window."""
-        about = sample(m, w, samples + 2 * n * i, here)
-        c = speed_series(series(m, w, displacements, stacked(about, load)))
+        c = speed_series(series(m, w, displacements, stacked(sample_at(m, w, here, i), load)))
         low = wp.max(-real(i), -one)
         high = wp.min(steps - real(i), one)
         x = zero
@@ -549,7 +594,7 @@ def functions(form: Form) -> Functions:
         speeds = speeds_type()
         turned = speeds_type()
         for k in range(INTERVALS + 1):
-            speeds[k] = one_row(m, w, samples + 2 * n * k + velocity, here)[0]
+            speeds[k] = sample(m, w, samples + of_sample * k, here)[velocity]
             turned[k] = -speeds[k]
             if real(k) <= steps:
                 highest = wp.max(highest, wp.abs(speeds[k]))

@@ -128,7 +128,7 @@ def first_is_safe(
     """Whether the first interval is certain to have no event: a guard may start at zero there, because the status has just
     begun. From the first coefficients of the guards, the control points of their series, and the bounds on rounding.
     """
-    zeros, lead = _start(start, limits, exact)
+    zeros, lead = leading(start, limits, exact)
     safe = (lead > 0) & (least(hull[2:]) > 0) & ((zeros >= 2) | (hull[0] > 0)) & ((zeros >= 3) | (hull[1] > 0))
     return safe[0] & safe[1]
 
@@ -143,7 +143,7 @@ def bracketed(
     """The brackets of both guards from the first five coefficients of their series or more, their values at the `end`, and the
     bounds on rounding; none for trajectories that are not `inside` an interval.
     """
-    zeros, lead = _start(c, limits, exact)
+    zeros, lead = leading(c, limits, exact)
     spent = inside & (lead < 0)
     crosses = inside & (lead >= 0) & (end <= 0)
     slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
@@ -206,10 +206,10 @@ def least(rows: Array) -> Array:
     return rows[0]
 
 
-def _start(
+def leading(
     c: Float[Array, "k g l"], limits: Float[Array, "3 g l"], exact: Bool[Array, "g l"]
 ) -> tuple[Int[Array, "g l"], Float[Array, "g l"]]:
-    """How many of the first coefficients are zero up to rounding, and the first one that is not."""
+    """How many of the first coefficients of guards are zero up to rounding, and the first one that is not."""
     size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3])
     zeros, lead = jnp.zeros_like(size, jnp.int32), c[0]
     for k, zero in enumerate(zero_at_start(c, size, limits, exact)):
