@@ -24,7 +24,7 @@ from ..contact.rounding import RESTING
 from ..foundation.scalar_source import scalar_source
 from .propagation import INTERVALS, ORDER, Propagators
 from .window import bracketed, fastest, first_is_safe, leading
-from .window_roots import MOST_ROOT_STEPS, PEAK_STEPS, RISE_STEPS
+from .window_roots import MOST_ROOT_STEPS, PEAK_STEPS, RISE_STEPS, ROOT_STEPS
 
 # Structures with more degrees of freedom make kernels that take long to compile.
 MOST_COORDINATES = 8
@@ -262,13 +262,45 @@ def functions(form: Form) -> Functions:
     @wp.func_native(product(padded(n * (ORDER + 2))))
     def series(m: matrices_type, matrix: int, first: int, here: row) -> series_type: ...
 
+    def horner(terms):
+        """What a Warp function does that gives value and slope of a polynomial, of its first terms."""
+        return f"""
+            wp::float64 value = c[{terms - 1}], slope = 0.0;
+            for (int k = {terms - 2}; k >= 0; --k) {{
+                slope = slope * x + value;
+                value = value * x + c[k];
+            }}
+            return wp::vec_t<2, wp::float64>(value, slope);"""
+
+    @wp.func_native(horner(ORDER + 1))
+    def value_at(c: polynomial, x: real) -> pair: ...
+
+    @wp.func_native(horner(ROOT_STEPS[0] + 1))
+    def value_of_few(c: polynomial, x: real) -> pair: ...
+
+    within = f"""
+        wp::vec_t<{2 * n}, wp::float64> found;
+        for (int j = 0; j < {n}; ++j) {{
+            wp::float64 value = c[{ORDER + 2} * j + {ORDER + 1}], slope = 0.0;
+            for (int k = {ORDER}; k >= 0; --k) {{
+                slope = slope * x + value;
+                value = value * x + c[{ORDER + 2} * j + k];
+            }}
+            found[j] = value;
+            found[{n} + j] = slope / interval;
+        }}
+        return found;"""
+
+    @wp.func_native(within)
+    def state_within(c: series_type, x: real, interval: real) -> state: ...
+
     # Numbers in double precision: Warp takes Python's for single.
     zero, half, one, two, most = real(0.0), real(0.5), real(1.0), real(2.0), real(float(INTERVALS))
     settled, settled_rise = real(1e-7), real(1e-8)
     rounding, infinite = real(8.0 * np.finfo(float).eps), real(math.inf)
     resting = real(RESTING["float64"])
     stick, slide, detach = (real(float(status)) for status in (Status.STICK, Status.SLIDE, Status.DETACH))
-    order = ORDER
+    order, short_steps = ORDER, len(ROOT_STEPS) - 1
 
     @wp.struct
     class Step:
@@ -324,16 +356,6 @@ def functions(form: Form) -> Functions:
         return block(m, w, bounds, size)
 
     @wp.func
-    def value_at(c: polynomial, x: real) -> pair:
-        """Value and slope, by Horner's rule, of a polynomial of `order`."""
-        value = c[order]
-        slope = zero
-        for k in range(order):
-            slope = slope * x + value
-            value = value * x + c[order - 1 - k]
-        return pair(value, slope)
-
-    @wp.func
     def lowest_of(c: polynomial, guess: real) -> real:
         """Where a guard that dips is lowest, in [0, 1]."""
         x = guess
@@ -362,7 +384,12 @@ def functions(form: Form) -> Functions:
         done = int(0)
         count = int(0)
         while done == 0 and count < MOST_ROOT_STEPS:
-            there = value_at(c, x)
+            few_terms = count < short_steps
+            there = pair()
+            if few_terms:
+                there = value_of_few(c, x)
+            else:
+                there = value_at(c, x)
             value = there[0]
             slope = there[1]
             # The slope of the polynomial with its roots at zero divided out, up to the common factor of value and slope.
@@ -371,31 +398,20 @@ def functions(form: Form) -> Functions:
             nearer = x - value
             if slope != zero:
                 nearer = x - value / slope
-                if wp.abs(nearer - x) <= settled:
-                    done = 1
-            if value > zero:
-                low = x
+            if few_terms:
+                x = wp.clamp(nearer, zero, end)
             else:
-                high = x
-            if done == 0 and not (nearer > low and nearer < high):
-                nearer = half * (low + high)
-            x = wp.clamp(nearer, zero, one)
+                if slope != zero and wp.abs(nearer - x) <= settled:
+                    done = 1
+                if value > zero:
+                    low = x
+                else:
+                    high = x
+                if done == 0 and not (nearer > low and nearer < high):
+                    nearer = half * (low + high)
+                x = wp.clamp(nearer, zero, one)
             count += 1
         return pair(x, slope)
-
-    @wp.func
-    def state_within(c: series_type, x: real, interval: real) -> state:
-        """The state a share of an interval later."""
-        found = state()
-        for j in range(n):
-            value = c[(order + 2) * j + order + 1]
-            slope = zero
-            for k in range(order + 1):
-                slope = slope * x + value
-                value = value * x + c[(order + 2) * j + order - k]
-            found[j] = value
-            found[n + j] = slope / interval
-        return found
 
     @wp.func
     def speed_series(c: series_type) -> polynomial:
