@@ -7,6 +7,7 @@ laws. No trajectory waits for the slowest of a block, and nothing is padded.
 import functools
 import threading
 from concurrent.futures import Executor
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,8 +23,10 @@ from .conclusion import STEPS_PER_LOOK
 from .flattened import Flattened, flatten
 from .windowed_returns import KEPT
 
-# Trajectories that a thread of a CPU takes at a time.
-LEAST_AT_A_TIME, MOST_AT_A_TIME = 8, 256
+# Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
+AT_A_TIME, LEAST_STEPS = 4, 4096
+# Steps from one crossing of the section to the next, roughly.
+STEPS_TO_CROSSING = 9
 
 
 class Looks(NamedTuple):
@@ -70,7 +73,8 @@ class Kernels:
         path, longest = np.full((count, KEPT, size), np.nan), self.longest[group] * crossings
         given = [(group.astype(np.int32), wp.int32), (crossings, wp.int32), (longest, wp.float64)]
         moved = [(y, state), (mode, self.types.mode), (events, wp.int32), (crossed, wp.int32), (time, wp.float64)]
-        self._launch(self.programs.returned, [*given, *moved, (path, state), (peak, wp.float64)], [int(peaks)])
+        each = int(STEPS_TO_CROSSING * np.mean(crossings)) if count else 0
+        self._launch(self.programs.returned, [*given, *moved, (path, state), (peak, wp.float64)], each, [int(peaks)])
         arrived = (crossed >= crossings) & np.all(np.isfinite(y), axis=1)
         y[~arrived], peak[~arrived] = np.nan, np.nan
         # The states were kept in a ring; the newest comes last.
@@ -103,9 +107,8 @@ class Kernels:
             *((events, wp.int32), (last, wp.float64), (seen, state), (near, wp.int32), (reached, wp.int32)),
             *((record.states, state), (record.times, wp.float64), (record.events, wp.int32)),
         ]
-        self._launch(
-            self.programs.followed, rows, [int(looks)], [(known, state), (np.array(torus.amplitude), wp.float64)]
-        )
+        tori = [(known, state), (np.array(torus.amplitude), wp.float64)]
+        self._launch(self.programs.followed, rows, looks * STEPS_PER_LOOK, [int(looks)], tori)
         after = eqx.tree_at(
             lambda now: (
                 *(now.t, now.y, now.contact.status, now.contact.direction, now.crossing, now.events),
@@ -116,28 +119,37 @@ class Kernels:
         )
         return flatten((columns, after)), reached != 0, record
 
-    def _launch(self, kernel, rows: list[tuple[np.ndarray, Any]], values: list, more: list = ()) -> None:  # pyright: ignore[reportArgumentType]
-        """Run a kernel for each row of these arrays, which are changed in place; `more` are arrays of the groups."""
+    def _launch(self, kernel, rows: list[tuple[np.ndarray, Any]], steps: int, values: list, more=()) -> None:
+        """Run a kernel for each row of these arrays, which are changed in place; `more` are arrays of the groups. A row takes
+        some `steps` steps.
+        """
         count, wp = len(rows[0][0]), self.wp
-        on_cpu = self.devices == ["cpu"]
-        each = -(-count // (4 * workers() if on_cpu else len(self.devices)))
-        each = min(max(each, LEAST_AT_A_TIME), MOST_AT_A_TIME) if on_cpu else each
-        also = {
-            device: [wp.array(part, dtype=kind, device=device, copy=not on_cpu) for part, kind in more]
-            for device in self.devices
-        }
+        if self.devices == ["cpu"]:
+            arrays = [wp.array(part, dtype=kind, device="cpu", copy=False) for part, kind in (*more, *rows)]
+            given = [*self.of_groups["cpu"], *arrays, *values]
+            parts = max(1, min(count, AT_A_TIME * workers(), count * steps // LEAST_STEPS))
+            ends = np.linspace(0, count, parts + 1).astype(int).tolist()
 
-        def run(start: int) -> None:
-            device = self.devices[start // each % len(self.devices)]
-            own = slice(start, start + each)
-            arrays = [wp.array(part[own], dtype=kind, device=device, copy=not on_cpu) for part, kind in rows]
-            size = len(rows[0][0][own])
-            wp.launch(kernel, dim=size, inputs=[*self.of_groups[device], *also[device], *arrays, *values], device=device)
-            if not on_cpu:
-                for (part, _), array in zip(rows, arrays, strict=True):
-                    part[own] = array.numpy()
+            def run(part: tuple[int, int]) -> None:
+                wp.launch(kernel, dim=part[1] - part[0], inputs=[*given, part[0]], device="cpu")
+        else:
+            ends = np.linspace(0, count, len(self.devices) + 1).astype(int).tolist()
 
-        for _ in self.pool.map(run, range(0, count, each)):
+            def run(part: tuple[int, int]) -> None:
+                device = self.devices[ends.index(part[0])]
+                own = slice(*part)
+                arrays = [wp.array(whole[own], dtype=kind, device=device) for whole, kind in rows]
+                also = [wp.array(whole, dtype=kind, device=device) for whole, kind in more]
+                given = [*self.of_groups[device], *also, *arrays, *values, 0]
+                wp.launch(kernel, dim=part[1] - part[0], inputs=given, device=device)
+                for (whole, _), array in zip(rows, arrays, strict=True):
+                    whole[own] = array.numpy()
+
+        parts = [part for part in pairwise(ends) if part[0] < part[1]]
+        if len(parts) == 1:
+            run(parts[0])
+            return
+        for _ in self.pool.map(run, parts):
             pass
 
 
@@ -190,8 +202,9 @@ def _programs(form: Form) -> _Programs:
         path: wp.array2d(dtype=state),
         highest: wp.array(dtype=real),
         peaks: int,
+        first: int,
     ):
-        i = wp.tid()
+        i = first + wp.tid()
         g = group[i]
         own = mechanics[g]
         y = states[i]
@@ -258,8 +271,9 @@ def _programs(form: Form) -> _Programs:
         time_at: wp.array2d(dtype=real),
         events_at: wp.array2d(dtype=integer),
         looks: int,
+        first: int,
     ):
-        i = wp.tid()
+        i = first + wp.tid()
         g = group[i]
         own = mechanics[g]
         t = times[i]

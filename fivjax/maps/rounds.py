@@ -41,6 +41,8 @@ ENSEMBLES = 128
 LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 # Where a cycle is known that attracts slowly: for so many of its time constants, but not for more periods than so many.
 TIME_CONSTANTS, MOST_PERIODS = 12.0, 20000.0
+# Trajectories that kernels have followed and that are asked for a verdict at a time.
+CONCLUDED = 256
 # Looks at a trajectory's verdict while its time grows e-fold.
 LOOKS = 8
 
@@ -303,7 +305,7 @@ def _follow_by_kernel(
 
     rows = flatten((*_rows(after.tree, asks), began[asks], reached[asks]))
     # They are few of each group, and what they share is little.
-    concluded = in_blocks(function, kernels.for_conclusions, group[asks], rows, 1, batch.pool)
+    concluded = in_blocks(function, kernels.for_conclusions, group[asks], rows, 1, batch.pool, size=CONCLUDED)
     trajectories.numbers[asks] = concluded.numbers
     return record
 
