@@ -10,6 +10,7 @@ import pytest
 import fivjax as fj
 from fivjax.contact import Contact
 from fivjax.foundation.compiling import compiled
+from fivjax.maps.kernels import Kernels
 from fivjax.maps.section import ReturnMaps, Section
 from fivjax.maps.sharing import Batch, shared_by
 from fivjax.maps.tori import section_at
@@ -18,19 +19,20 @@ from fivjax.steppers.windowed import Windowed
 CROSSINGS = 6
 
 
-@pytest.fixture(scope="module")
-def maps():
+@pytest.fixture(scope="module", params=["by XLA", "by kernels"])
+def maps(request):
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
-        batch = Batch(scene, Windowed(), ("mu",), (), (), False, 8, False, pool)
-        yield ReturnMaps(batch, shared_by(batch, np.array([[0.12], [0.2], [0.227]])))
+        batch = Batch(scene, Windowed(request.param == "by kernels"), ("mu",), (), (), False, 8, False, pool)
+        shared = shared_by(batch, np.array([[0.12], [0.2], [0.227]]))
+        yield ReturnMaps(batch, shared, Kernels(shared, pool) if batch.by_kernel else None)
 
 
 @pytest.fixture(scope="module")
 def exactly(maps):
     """The same return maps by the series stepper, which the oracle agrees with."""
     same = copy.copy(maps)
-    same.windows = None
+    same.windows = same.kernels = None
     return same
 
 
@@ -80,6 +82,7 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
 
 
+@pytest.mark.parametrize("maps", ["by XLA"], indirect=True)
 def test_the_peak_of_an_advance_may_be_anywhere_in_it(maps):
     """Advances end between the samples of a window, where the velocity may be larger than at any of them; and the largest of the
     samples may stand beside a lower peak than another one does.

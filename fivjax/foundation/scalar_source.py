@@ -113,7 +113,8 @@ class _Writer:
         return [read(atom) for atom in jaxpr.outvars]
 
     def applied(self, equation, operands: list[np.ndarray]) -> list[np.ndarray]:
-        name, within = equation.primitive.name, _within(equation.params)
+        primitive, within = equation.primitive, _within(equation.params)
+        name = primitive.name
         if within is not None:
             return self.run(within.jaxpr, within.consts, operands)
         kinds = [variable.aval.dtype for variable in equation.outvars]
@@ -122,8 +123,8 @@ class _Writer:
                 jnp.asarray(np.array(part.tolist(), atom.aval.dtype).reshape(part.shape))
                 for part, atom in zip(operands, equation.invars, strict=True)
             ]
-            found = equation.primitive.bind(*values, **equation.params)
-            return [_of_numbers(part) for part in (found if equation.primitive.multiple_results else [found])]
+            found = primitive.bind(*values, **equation.params)
+            return [_of_numbers(part) for part in (found if primitive.multiple_results else [found])]
         if name == "select_n" and len(operands) == 3 and _is_known(operands[0]):
             return [np.where(operands[0].astype(bool), operands[2], operands[1])]
         if name in MOVING:
@@ -133,7 +134,7 @@ class _Writer:
         if name in FOLDED:
             return [self.folded(FOLDED[name], operands[0], equation.params["axes"], kinds[0])]
         if name == "dot_general":
-            return [self.product(*operands, equation.params["dimension_numbers"], kinds[0])]
+            return [self.product(operands[0], operands[1], equation.params["dimension_numbers"], kinds[0])]
         return [self.by_number(name, equation.params, operands, kinds[0])]
 
     def by_number(self, name: str, params, operands: list[np.ndarray], kind) -> np.ndarray:
@@ -206,13 +207,18 @@ def _within(params) -> ClosedJaxpr | None:
     """The traced function that an equation calls once, if it calls one."""
     if any(name in params for name in ("branches", "cond_jaxpr", "body_jaxpr", "length")):
         raise NotImplementedError("Loops and branches have no C++ here; write the function with `jnp.where`.")
-    return next((part for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if isinstance(part := params.get(name), ClosedJaxpr)), None)
+    return next(
+        (part for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if isinstance(part := params.get(name), ClosedJaxpr)),
+        None,
+    )
 
 
 def _moved(equation, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Where the entries of the operands go; operands that are numbers are places to take them from, unless nothing else is."""
     name = equation.primitive.name
-    carried = len(operands) if name in ("concatenate", "stack") else {"scatter": 3, "dynamic_update_slice": 2}.get(name, 1)
+    carried = (
+        len(operands) if name in ("concatenate", "stack") else {"scatter": 3, "dynamic_update_slice": 2}.get(name, 1)
+    )
     places, entries = [], []
     for position, (operand, atom) in enumerate(zip(operands, equation.invars, strict=True)):
         is_place = (name == "scatter" and position == 1) or position >= carried

@@ -4,8 +4,6 @@ A kernel does for one trajectory what `rounds` and `windowed_returns` do for blo
 laws. No trajectory waits for the slowest of a block, and nothing is padded.
 """
 
-import functools
-import threading
 from concurrent.futures import Executor
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -15,12 +13,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..cycles.section_map import MOST_TO_CROSSING
-from ..steppers.scalar_windows import Form, functions, matrices, warp
-from ..verdicts.ensemble import LOOKS_NEAR, REACHED, SEEN
+from ..foundation.warp_library import devices, load, warp
+from ..steppers.kernel_advance import stepping
+from ..steppers.kernel_laws import Form
+from ..steppers.kernel_matrices import matrices
 from .blocks import workers
 from .conclusion import STEPS_PER_LOOK
 from .flattened import Flattened, flatten
+from .kernel_programs import programs
 from .windowed_returns import KEPT
 
 # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
@@ -45,7 +45,7 @@ class Kernels:
         mechanics, prepared = tree.mechanics, tree.prepared
         form = Form.of(mechanics, leading=1)
         self.pool, self.shared, self.wp = pool, shared, wp
-        self.types, self.programs = functions(form), _programs(form)
+        self.types, self.programs = stepping(form).types, programs(form)
         # The proofs that are not left to kernels do not need the matrices.
         self.for_conclusions = flatten(jax.tree.map(np.asarray, (tree.values, mechanics, tree.modes, tree.drift)))
         self.longest = np.asarray(tree.longest_return)
@@ -57,11 +57,11 @@ class Kernels:
             (np.array(prepared.interval), wp.float64),
             (np.array(tree.weights), self.types.state),
         ]
-        self.devices = [device.alias for device in wp.get_cuda_devices()] or ["cpu"]
+        self.devices = devices()
         self.of_groups = {
             device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups] for device in self.devices
         }
-        _load(wp, self.programs.module, self.devices)
+        load(self.programs.module, self.devices)
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool):
         """What `moved_in_windows` gives, for motions from these states of the section."""
@@ -96,7 +96,9 @@ class Kernels:
         events, near = (np.array(part, np.int32) for part in (now.events, now.approach.near))
         reached, torus = np.zeros(len(group), np.int32), self.shared.tree.attractor
         record = Looks(
-            np.zeros((len(group), count, y.shape[1])), np.zeros((len(group), count)), np.zeros((len(group), count), np.int32)
+            np.zeros((len(group), count, y.shape[1])),
+            np.zeros((len(group), count)),
+            np.zeros((len(group), count), np.int32),
         )
         known = np.ascontiguousarray(torus.crossings if np.any(torus.amplitude > 0) else torus.crossings[:1, :1])
         rows = [
@@ -151,180 +153,3 @@ class Kernels:
             return
         for _ in self.pool.map(run, parts):
             pass
-
-
-class _Programs(NamedTuple):
-    module: Any
-    returned: Any
-    followed: Any
-
-
-_ONE_AT_A_TIME = threading.Lock()
-
-
-def _load(wp, module, devices: list[str]) -> None:
-    """Compile the kernels, or find them in Warp's cache, without a word."""
-    with _ONE_AT_A_TIME:
-        before = wp.config.log_level
-        wp.config.log_level = max(before, wp.LOG_WARNING)
-        try:
-            for device in devices:
-                wp.load_module(module, device, block_dim=1 if device == "cpu" else None)
-        finally:
-            wp.config.log_level = before
-
-
-@functools.cache
-def _programs(form: Form) -> _Programs:
-    wp, of = warp(), functions(form)
-    real, integer = wp.float64, wp.int32
-    state, mode_type, numbers, advance, peak = of.state, of.mode, of.mechanics, of.advance, of.peak
-    size = state._length_
-    one, zero = real(1.0), real(0.0)
-    infinite, reached_at = real(np.inf), real(REACHED)
-    module = wp.get_module(f"fivjax.maps.kernels.{of.name}")
-    # Products and sums in one: a tenth faster.
-    flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast".strip()
-    module.options.update(max_unroll=1, cpu_compiler_flags=flags)
-
-    @wp.kernel(enable_backward=False, module=module)
-    def returned(
-        m: wp.array(dtype=real),
-        mechanics: wp.array(dtype=numbers),
-        interval: wp.array(dtype=real),
-        weights: wp.array(dtype=state),
-        group: wp.array(dtype=integer),
-        crossings: wp.array(dtype=integer),
-        longest: wp.array(dtype=real),
-        states: wp.array(dtype=state),
-        modes: wp.array(dtype=mode_type),
-        events: wp.array(dtype=integer),
-        crossed: wp.array(dtype=integer),
-        time: wp.array(dtype=real),
-        path: wp.array2d(dtype=state),
-        highest: wp.array(dtype=real),
-        peaks: int,
-        first: int,
-    ):
-        i = first + wp.tid()
-        g = group[i]
-        own = mechanics[g]
-        y = states[i]
-        mode = modes[i]
-        left = longest[i]
-        ended = int(0)
-        passed = int(0)
-        count = int(0)
-        top = real(0.0)
-        while left > zero and passed < crossings[i] and count < MOST_TO_CROSSING:
-            after = advance(m, own, interval[g], g, y, mode, zero, left)
-            if peaks > 0:
-                top = wp.max(top, peak(m, interval[g], g, y, mode, zero, after.h, after.end))
-            y = after.y
-            mode = after.mode
-            ended += after.ended
-            if after.h >= left:
-                left = zero
-            else:
-                left -= after.h
-            if after.crossed > 0:
-                path[i, passed % KEPT] = y
-                passed += 1
-            count += 1
-            if not wp.isfinite(after.h):
-                left = zero
-        states[i] = y
-        modes[i] = mode
-        events[i] = ended
-        crossed[i] = passed
-        highest[i] = top
-        time[i] = longest[i] - left
-
-    @wp.func
-    def distance(known: wp.array2d(dtype=state), g: int, crossing: state) -> real:
-        """Of a weighted crossing state to the nearest one of a torus, relative to its size."""
-        nearest = real(infinite)
-        for k in range(known.shape[1]):
-            apart = crossing - known[g, k]
-            nearest = wp.min(nearest, wp.dot(apart, apart))
-        return wp.sqrt(nearest / wp.dot(crossing, crossing))
-
-    @wp.kernel(enable_backward=False, module=module)
-    def followed(
-        m: wp.array(dtype=real),
-        mechanics: wp.array(dtype=numbers),
-        interval: wp.array(dtype=real),
-        weights: wp.array(dtype=state),
-        known: wp.array2d(dtype=state),
-        amplitude: wp.array(dtype=real),
-        group: wp.array(dtype=integer),
-        jumps: wp.array2d(dtype=real),
-        loads: wp.array2d(dtype=real),
-        times: wp.array(dtype=real),
-        states: wp.array(dtype=state),
-        modes: wp.array(dtype=mode_type),
-        crossings: wp.array(dtype=state),
-        events: wp.array(dtype=integer),
-        last_event: wp.array(dtype=real),
-        seen: wp.array2d(dtype=state),
-        near: wp.array(dtype=integer),
-        reached: wp.array(dtype=integer),
-        seen_at: wp.array2d(dtype=state),
-        time_at: wp.array2d(dtype=real),
-        events_at: wp.array2d(dtype=integer),
-        looks: int,
-        first: int,
-    ):
-        i = first + wp.tid()
-        g = group[i]
-        own = mechanics[g]
-        t = times[i]
-        y = states[i]
-        mode = modes[i]
-        crossing = crossings[i]
-        for at in range(looks):
-            for _ in range(STEPS_PER_LOOK):
-                past = int(0)
-                while past < jumps.shape[1] and jumps[i, past] <= t:
-                    past += 1
-                until = real(infinite)
-                if past < jumps.shape[1]:
-                    until = real(jumps[i, past])
-                after = advance(m, own, interval[g], g, y, mode, loads[i, past], until - t)
-                if after.h >= until - t:
-                    t = until
-                else:
-                    t += after.h
-                if after.mode[0] != mode[0]:
-                    events[i] = events[i] + 1
-                    last_event[i] = t
-                y = after.y
-                mode = after.mode
-                # Crossings during the kick do not count for the motion after it.
-                if after.crossed > 0 and past == jumps.shape[1]:
-                    crossing = y
-            look = wp.cw_mul(weights[g], crossing)
-            fresh = int(0)
-            for k in range(size):
-                if look[k] != seen[i, 0][k]:
-                    fresh = 1
-            if fresh > 0:
-                for k in range(SEEN - 1):
-                    seen[i, SEEN - 1 - k] = seen[i, SEEN - 2 - k]
-                seen[i, 0] = look
-                close = int(0)
-                if amplitude[g] > zero and distance(known, g, look) <= reached_at:
-                    close = 1
-                near[i] = close * (near[i] + 1)
-                if near[i] >= LOOKS_NEAR:
-                    reached[i] = 1
-            if at < seen_at.shape[1]:
-                seen_at[i, at] = look
-                time_at[i, at] = t
-                events_at[i, at] = events[i]
-        times[i] = t
-        states[i] = y
-        modes[i] = mode
-        crossings[i] = crossing
-
-    return _Programs(module, returned, followed)

@@ -16,13 +16,14 @@ from jaxtyping import Array, Float
 from ..contact import Mechanics
 from ..cycles.section_map import longest_return, mechanics_about_sliding
 from ..foundation.kept_programs import kept
+from ..foundation.warp_library import is_installed
 from ..linear.linearisation import linear_sliding
 from ..model.friction import Coulomb
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
+from ..steppers.kernel_advance import MOST_COORDINATES
 from ..steppers.propagation import MATRIX_ROWS
-from ..steppers.scalar_windows import MOST_COORDINATES, is_installed
 from ..steppers.windowed import Windowed
 from ..verdicts import ensemble as attractors
 from ..verdicts.ensemble import Attractor

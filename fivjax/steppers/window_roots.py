@@ -13,8 +13,8 @@ MOST_ROOT_STEPS = 60
 # Steps of Newton's method in a bracket, for the root of a velocity that changes sign in an interval; bisection is seldom
 # needed.
 RISE_STEPS = 12
-# Steps of Newton's method for a peak, from the sample next to it.
-PEAK_STEPS = 5
+# Steps of Newton's method for where a guard is lowest, and for a peak, from the sample next to it.
+LOWEST_STEPS, PEAK_STEPS = 6, 5
 # Terms of the series in each of the first steps of Newton's method, which are enough for nearly all roots: few at first.
 ROOT_STEPS = (5, 5, ORDER)
 
@@ -31,7 +31,7 @@ def dipped(series: Series, brackets: Bracket) -> Bracket:
 
         # Newton's method: within an interval the slope is nearly linear. It starts from the value that the outer loop carries;
         # XLA would move anything that does not depend on it out of the loop and compute it every time.
-        lowest = jax.lax.fori_loop(0, 6, nearer, bracket.guess)
+        lowest = jax.lax.fori_loop(0, LOWEST_STEPS, nearer, bracket.guess)
         below = bracket.dips & (value_and_slope(c, lowest)[0] <= 0)
         return Bracket(
             guess=jnp.where(below, 0.5 * lowest, bracket.guess),

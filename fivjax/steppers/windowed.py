@@ -38,7 +38,7 @@ class Windowed(eqx.Module):
     `prepare` and `advance` are those of a stepper.
     """
 
-    # Whether maps leave the stepping to a kernel (`scalar_windows`).
+    # Whether maps leave the stepping to a kernel (`kernel_advance`).
     by_kernel: bool = eqx.field(static=True, default=False)
 
     dt: ClassVar = np.inf

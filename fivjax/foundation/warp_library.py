@@ -1,0 +1,62 @@
+"""NVIDIA Warp, where it is installed: kernels of one thread for each trajectory, on a CPU or on GPUs.
+
+It is an extra (`pip install "fivjax[gpu]"`), so it is imported only where it is used.
+"""
+
+import contextlib
+import functools
+import importlib.util
+import threading
+from typing import Any
+
+import jax
+
+_ONE_AT_A_TIME = threading.Lock()
+
+
+def is_installed() -> bool:
+    """Whether Warp can be imported."""
+    return importlib.util.find_spec("warp") is not None
+
+
+@functools.cache
+def warp() -> Any:
+    """The module `warp`, initialised.
+
+    **Raises:** `ImportError` where it is not installed.
+    """
+    try:
+        import warp as wp
+    except ImportError:
+        raise ImportError(
+            "This run's trajectories are followed by kernels of Warp, which is not installed here. Install it with "
+            '`pip install "fivjax[gpu]"` on all machines of the run, or on none.'
+        ) from None
+    with _quietly(wp):
+        wp.init()
+    return wp
+
+
+def devices() -> list[str]:
+    """Where kernels run: on all GPUs, or on the CPU, where there is none or where JAX is told to use the CPU only."""
+    gpus = [] if jax.config.jax_platforms == "cpu" else warp().get_cuda_devices()
+    return [device.alias for device in gpus] or ["cpu"]
+
+
+def load(module, names: list[str]) -> None:
+    """Compile a Warp module for these devices, or find it in Warp's own cache."""
+    wp = warp()
+    with _ONE_AT_A_TIME, _quietly(wp):
+        for name in names:
+            # A kernel on a CPU is compiled anew for each size of a block of threads; there it is one.
+            wp.load_module(module, name, block_dim=1 if name == "cpu" else None)
+
+
+@contextlib.contextmanager
+def _quietly(wp):
+    before = wp.config.log_level
+    wp.config.log_level = max(before, wp.LOG_ERROR)
+    try:
+        yield
+    finally:
+        wp.config.log_level = before
