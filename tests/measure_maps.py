@@ -1,6 +1,6 @@
 """Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed] [start] [memory] [roofline]
+    python tests/measure_maps.py [errors] [table2] [map] [speed] [kernels] [start] [memory] [roofline]
 
 Each word picks one study; without any, all run (some minutes on two cores). The reference is `tests/oracle.py`.
 """
@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import oracle
@@ -93,6 +94,31 @@ def speed() -> None:
                 f"farthest from a boundary in p: {_farthest(m, undecided):.1g}",
                 flush=True,
             )
+
+
+def kernels() -> None:
+    """Warm maps of two sizes with and without kernels, in turns: wall time, and whether their verdicts agree."""
+    for points in (64, 256):
+        paper_map(points), without_kernels(points)  # compiled
+        for _ in range(3):
+            walls, found = [], []
+            for make in (paper_map, without_kernels):
+                begin = time.perf_counter()
+                found.append(make(points))
+                walls.append(time.perf_counter() - begin)
+            one, other = (m["verdict"].values for m in found)
+            sizes = [np.where(np.asarray(m["verdict"]) == 1, m["amplitude"], 1.0) for m in found]
+            print(
+                f"{points} × {points}: {walls[0]:.1f} s by kernels, {walls[1]:.1f} s without, ratio {walls[0] / walls[1]:.2f}; "
+                f"verdicts that differ: {np.sum(one != other)}, amplitudes by "
+                f"{np.max(np.where(one == other, np.abs(sizes[0] / sizes[1] - 1), 0.0)):.1e} at most",
+                flush=True,
+            )
+
+
+def without_kernels(points: int):
+    with mock.patch("fivjax.maps.sharing.is_installed", return_value=False):
+        return paper_map(points)
 
 
 def _farthest(m, undecided: np.ndarray) -> float:
@@ -205,6 +231,7 @@ if __name__ == "__main__":
         "table2": table2,
         "map": map_,
         "speed": speed,
+        "kernels": kernels,
         "start": start,
         "memory": memory,
         "roofline": roofline,

@@ -14,6 +14,7 @@ import xarray as xr
 import fivjax as fj
 from fivjax import cli
 from fivjax.maps import checkpoint, plan, rounds
+from fivjax.maps.kernels import Kernels
 from fivjax.maps.results import Ended, not_run, record
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
@@ -43,7 +44,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
     paper_scene, whole, tmp_path, monkeypatch, at_once, calls
 ):
     """A job's results do not depend on what runs beside it, and it is kept as a whole or not at all."""
-    real, made = rounds._follow_block, []
+    real, made = Kernels.follow, []
 
     def interrupted(*args):
         made.append(1)
@@ -52,7 +53,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
         return real(*args)
 
     path = tmp_path / "map.part"
-    monkeypatch.setattr(rounds, "_follow_block", interrupted)
+    monkeypatch.setattr(Kernels, "follow", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         first = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     open_ = first["verdict"] == fj.Verdict.NOT_RUN

@@ -15,7 +15,8 @@ import reference
 import xarray as xr
 
 import fivjax as fj
-from fivjax.maps import engine, plan, rounds
+from fivjax.maps import engine, plan
+from fivjax.maps.kernels import Kernels
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
 TABLE_2 = np.array([1.06, 1.11, 1.17, 1.20, 1.20, 1.20, 1.20])
@@ -218,7 +219,7 @@ def test_undecided_trajectories_are_labelled_and_counted(paper_scene):
 
 def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     """Ctrl-C in the middle of a run: the decided trajectories are returned, the others labelled, and the user is told."""
-    real, calls = rounds._follow_block, []
+    real, calls = Kernels.follow, []
 
     def interrupted(*args):
         calls.append(1)
@@ -226,7 +227,7 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(rounds, "_follow_block", interrupted)
+    monkeypatch.setattr(Kernels, "follow", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, mu=[0.227], p=[1.01, 1.015, 1.02, 1.19], progress=False).isel(mu=0)
     assert m["verdict"].values.tolist() == [0, 0, 0, fj.Verdict.NOT_RUN]

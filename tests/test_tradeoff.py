@@ -8,7 +8,7 @@ import pytest
 from catalogue import LOW_ORDER
 
 import fivjax as fj
-from fivjax.maps import tradeoff_study
+from fivjax.maps import refinement_study, tradeoff_study
 from fivjax.maps.tradeoff_study import recommend, table
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
@@ -93,3 +93,14 @@ def test_the_boundary_of_each_method(paper_scene):
     assert found["wrong_verdicts"].sel(stepper="exact") == 0
     assert found["p_crit_error"].sel(stepper="exact") < 1e-5
     assert found["p_crit_error"].sel(stepper="fine") < found["p_crit_error"].sel(stepper="coarse")
+
+
+def test_refinement_is_compared_with_the_whole_map(monkeypatch):
+    """Where nothing is left out it is right, and what it computes is told; a table of its own in the text."""
+    monkeypatch.setattr(refinement_study, "COARSEST", 6)
+    trade = refinement_study.refinement_trade(SCENE, 1)
+    assert trade["refined_computed"][0] == 1.0 and 0.3 < trade["refined_computed"][1] < 1.0
+    assert trade["refined_wrong"][0] == 0.0 and trade["refined_wrong"][1] < 0.1
+    assert np.all(trade["refined_seconds"] > 0)
+    with pytest.raises(ValueError, match="Argument `refine` must be"):
+        fj.tradeoff(SCENE, refine=-1)

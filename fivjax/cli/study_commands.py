@@ -23,6 +23,8 @@ class Tradeoff:
     """number of trajectories in the batch whose cost is measured"""
     boundary: bool = True
     """compare p_crit and verdicts, too, which takes minutes"""
+    refine: int = 0
+    """the most halvings for which refined maps are compared with the whole one"""
     out: Path = Path("tradeoff")
     """files to write, without suffix"""
     overwrite: Overwrite = False
@@ -32,7 +34,13 @@ class Tradeoff:
         from ..maps.tradeoff_study import table
 
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
-        dataset = fj.tradeoff(self.scene.scene(), t1=self.t1, trajectories=self.trajectories, boundary=self.boundary)
+        dataset = fj.tradeoff(
+            self.scene.scene(),
+            t1=self.t1,
+            trajectories=self.trajectories,
+            boundary=self.boundary,
+            refine=self.refine,
+        )
         fj.save(dataset, data)
         fj.save_figure(fj.plot.tradeoff(dataset), picture)
         say(data, picture)

@@ -4,8 +4,11 @@ It is an extra (`pip install "fivjax[gpu]"`), so it is imported only where it is
 """
 
 import contextlib
+import ctypes.util
 import functools
 import importlib.util
+import os
+import sys
 import threading
 from typing import Any
 
@@ -32,7 +35,7 @@ def warp() -> Any:
             "This run's trajectories are followed by kernels of Warp, which is not installed here. Install it with "
             '`pip install "fivjax[gpu]"` on all machines of the run, or on none.'
         ) from None
-    with _quietly(wp):
+    with _quietly(wp), _without_stderr():
         wp.init()
     return wp
 
@@ -50,6 +53,23 @@ def load(module, names: list[str]) -> None:
         for name in names:
             # A kernel on a CPU is compiled anew for each size of a block of threads; there it is one.
             wp.load_module(module, name, block_dim=1 if name == "cpu" else None)
+
+
+@contextlib.contextmanager
+def _without_stderr():
+    """Where there is no CUDA driver, Warp's library says so on the process' standard error, whatever its settings."""
+    if ctypes.util.find_library("cuda") is not None:
+        yield
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from .attractors_listed import attractor_table
 from .axes import add_linear_limit
 from .crossing import first_crossings
 from .results import CHAOTIC, Verdicts
+from .sharing import kernels_by
 from .trajectories import Grid
 
 
@@ -66,6 +67,7 @@ def map_dataset(
         dataset["p_crit_low"] = (others, crossing.low.reshape(over))
         dataset["p_crit_high"] = (others, crossing.high.reshape(over))
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
+    dataset.attrs.update(kernels_by(method, scene, bool(verdicts.energy)))
     dataset["verdict"].attrs.update(
         flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),

@@ -11,7 +11,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .plan import in_a_job
-from .sharing import bytes_per_trajectory, in_bulk
+from .sharing import bytes_per_trajectory, in_bulk, kernels_by
 from .store import Store, is_store
 from .trajectories import Grid
 
@@ -30,6 +30,7 @@ def keeper_at(
     run = {
         "fivjax": metadata.version("fivjax"),
         "jax": jax.__version__,
+        **kernels_by(method, scene, energy),
         "device": jax.devices()[0].device_kind,
         "scene": describe(scene),
         "method": repr(method),

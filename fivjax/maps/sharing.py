@@ -6,6 +6,7 @@ matrices of their stepper, the same proofs and the same attractors.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib import metadata
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -77,6 +78,12 @@ def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed
     small = scene.structure.size <= MOST_COORDINATES
     # Only of a law that is known can it be said that a kernel can be made of it.
     return Windowed(by_kernel=small and isinstance(scene.friction, Coulomb) and is_installed())
+
+
+def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
+    """The version of Warp, where its kernels follow the trajectories of such a run."""
+    by = method if energy else in_bulk(method, scene)
+    return {"warp": metadata.version("warp-lang")} if isinstance(by, Windowed) and by.by_kernel else {}
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:

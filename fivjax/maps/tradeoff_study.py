@@ -27,6 +27,7 @@ from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .bistability import bistability_map
+from .refinement_study import refinement_trade
 from .threshold import critical_perturbation
 
 # Accuracies of the state for which a method is recommended.
@@ -52,6 +53,7 @@ def tradeoff(
     p: np.ndarray | None = None,
     precisions: tuple[str, ...] = ("float64", "float32"),
     boundary: bool = True,
+    refine: int = 0,
     progress: bool | None = None,
 ) -> xr.Dataset:
     """The cost of each method on a scene, and its errors there.
@@ -66,13 +68,16 @@ def tradeoff(
     - `precisions`: "float64", "float32". Maps always compute in double precision, so `p_crit` and verdicts are only given for
       that.
     - `boundary`: whether to compare p_crit and verdicts, too, which takes most of the time.
+    - `refine`: the most halvings for which refined maps are compared with the whole one, over belt speed (0.8 to 1.2
+      times the scene's) and p (1 to 4), with `8 * 2**refine + 1` points each: what `bistability_map(..., refine=)` saves.
 
     **Returns:** a dataset over `stepper` and `precision`: `cost` (s per trajectory-cycle: one trajectory over one period of the
     least stable sliding mode, on this machine, without compilation), `state_error` (of the worst coordinate, relative to
     the largest displacement or velocity), `p_crit_error`, `wrong_verdicts` and `undecided` (shares of the kicks). The reference
     is `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is the cost of parts of the work, relative to
-    that of the event-exact end state alone. The attribute `recommendation` names, for each accuracy of the state, the cheapest
-    method that reaches it.
+    that of the event-exact end state alone. With `refine`, over `halvings`: `refined_seconds`, `refined_computed` (the share of
+    the points that were computed) and `refined_wrong` (that of points with a wrong verdict). The attribute
+    `recommendation` names, for each accuracy of the state, the cheapest method that reaches it.
 
     **Raises:** `TypeError` or `ValueError` for objects that are no methods, times and counts that are not positive, and a load
     without a pulse if `boundary` is true.
@@ -85,7 +90,7 @@ def tradeoff(
         ... )
     """
     methods = default_methods() if methods is None else methods
-    _check(scene, methods, t1, trajectories, precisions, boundary)
+    _check(scene, methods, t1, trajectories, precisions, boundary, refine)
     frequency = _frequency(scene)
     rows = {(name, kind): method for (name, method), kind in itertools.product(methods.items(), precisions)}
     measures = ("cost", "state_error", "p_crit_error", "wrong_verdicts", "undecided")
@@ -104,12 +109,15 @@ def tradeoff(
             for measure, value in edge(method).items():
                 table[measure][place] = value
     parts = _parts(scene, t1)
+    refined = refinement_trade(scene, refine) if refine else {}
+    halvings = {"halvings": np.arange(refine + 1)} if refine else {}
     dataset = xr.Dataset(
         {
             **{name: (("stepper", "precision"), values) for name, values in table.items()},
             "part_cost": ("part", np.array(list(parts.values()))),
+            **{name: ("halvings", values) for name, values in refined.items()},
         },
-        coords={"stepper": list(methods), "precision": list(precisions), "part": list(parts)},
+        coords={"stepper": list(methods), "precision": list(precisions), "part": list(parts), **halvings},
     )
     dataset.attrs["recommendation"] = json.dumps({f"{wanted:g}": recommend(dataset, wanted) for wanted in WANTED})
     return labelled(
@@ -148,12 +156,18 @@ def table(dataset: xr.Dataset) -> str:
         f"{part:40s} {float(cost):6.2f}"
         for part, cost in zip(dataset["part"].values, dataset["part_cost"].values, strict=True)
     ]
+    for count in dataset["halvings"].values if "halvings" in dataset.coords else ():
+        of = dataset.sel(halvings=count)
+        lines.append(
+            f"map refined {count} times{float(of['refined_seconds']):23.1f} s, {float(of['refined_computed']):6.1%} "
+            f"computed, {float(of['refined_wrong']):.2%} wrong"
+        )
     for wanted, method in json.loads(dataset.attrs["recommendation"]).items():
         lines.append(f"for a state good to {wanted}: {method or 'none of these'}")
     return "\n".join(lines)
 
 
-def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
+def _check(scene, methods, t1, trajectories, precisions, boundary, refine) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_vector_contacts(scene.structure, "`tradeoff`")
     if not isinstance(methods, dict) or not methods:
@@ -166,10 +180,13 @@ def _check(scene, methods, t1, trajectories, precisions, boundary) -> None:
     for kind in precisions:
         arguments.one_of("precisions", kind, ("float64", "float32"))
     arguments.truth("boundary", boundary)
-    if boundary:
+    arguments.whole_number("refine", refine, minimum=0)
+    if boundary or refine:
         arguments.instance(
-            "scene.load", scene.load, Pulse, "a Pulse, whose critical p is compared (or pass boundary=False)"
+            "scene.load", scene.load, Pulse, "a Pulse, whose p is varied (or pass boundary=False and refine=0)"
         )
+    if refine and np.ndim(scene.belt_speed):
+        raise ValueError("Argument `refine` must be 0 for a scene whose contacts have belt speeds of their own.")
 
 
 def _frequency(scene: Scene) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics
-from ..foundation.scalar_source import scalar_source
+from ..foundation.scalar_code import scalar_source
 from ..foundation.warp_library import warp
 from .kernel_types import Types, types
 from .propagation import ORDER
