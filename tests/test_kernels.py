@@ -12,6 +12,7 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
+from fivjax.foundation import warp_library
 from fivjax.foundation.compiling import compiled
 from fivjax.foundation.scalar_code import scalar_source
 from fivjax.foundation.warp_library import devices, load, warp
@@ -174,7 +175,7 @@ def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch):
 
 def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "warp", None)
-    warp.cache_clear()
+    warp_library._initialised.cache_clear()
     with pytest.raises(ImportError, match=r'pip install "fivjax\[gpu\]"'):
         warp()
     monkeypatch.undo()

@@ -14,7 +14,8 @@ from typing import Any
 
 import jax
 
-_ONE_AT_A_TIME = threading.Lock()
+# Warp's modules are built by one thread at a time.
+ONE_AT_A_TIME = threading.RLock()
 
 
 def is_installed() -> bool:
@@ -22,12 +23,17 @@ def is_installed() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
-@functools.cache
 def warp() -> Any:
     """The module `warp`, initialised.
 
     **Raises:** `ImportError` where it is not installed.
     """
+    with ONE_AT_A_TIME:
+        return _initialised()
+
+
+@functools.cache
+def _initialised():
     try:
         import warp as wp
     except ImportError:
@@ -49,7 +55,7 @@ def devices() -> list[str]:
 def load(module, names: list[str]) -> None:
     """Compile a Warp module for these devices, or find it in Warp's own cache."""
     wp = warp()
-    with _ONE_AT_A_TIME, _quietly(wp):
+    with ONE_AT_A_TIME, _quietly(wp):
         for name in names:
             # A kernel on a CPU is compiled anew for each size of a block of threads; there it is one.
             wp.load_module(module, name, block_dim=1 if name == "cpu" else None)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..foundation.warp_library import devices, load, warp
+from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
 from ..steppers.kernel_matrices import matrices
@@ -45,7 +45,8 @@ class Kernels:
         mechanics, prepared = tree.mechanics, tree.prepared
         form = Form.of(mechanics, leading=1)
         self.pool, self.shared, self.wp = pool, shared, wp
-        self.types, self.programs = stepping(form).types, programs(form)
+        with ONE_AT_A_TIME:
+            self.types, self.programs = stepping(form).types, programs(form)
         # The proofs that are not left to kernels do not need the matrices.
         self.for_conclusions = flatten(jax.tree.map(np.asarray, (tree.values, mechanics, tree.modes, tree.drift)))
         self.longest = np.asarray(tree.longest_return)
