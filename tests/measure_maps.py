@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest import mock
 
@@ -213,11 +214,36 @@ def roofline() -> None:
     table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / groups
     print(f"{groups} structures with {beside} trajectories each: {1e6 * each / count:.2f} µs a trajectory-step")
     print(f"a trajectory-step: {flops / count:.0f} operations, {moved / count / 1e3:.1f} kB between kernels")
+    print(f"by kernels, the same work in another order: {1e6 * kernel_step():.2f} µs a trajectory-step")
     print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
     print(f"the machine: {peak / 1e9:.0f} Gflop/s in a large product (all cores), {traffic / 1e9:.1f} GB/s in memory")
     print(
         f"reached: {flops / each / 1e9:.1f} Gflop/s, {flops / each / peak:.0%} of that; {moved / each / 1e9:.0f} GB/s in cache"
     )
+
+
+def kernel_step() -> float:
+    """The time (s) of one step of trajectories that stay in motion, by a kernel on one core."""
+    import jax
+
+    from fivjax.maps.following import begun
+    from fivjax.maps.kernels import Kernels
+    from fivjax.maps.sharing import Batch, shared_by
+    from fivjax.steppers.windowed import Windowed
+
+    mu, group, looks = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 200
+    with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
+        batch = Batch(scene(), Windowed(by_kernel=True), ("mu",), ("p",), (), False, 16, False, pool)
+        shared = shared_by(batch, mu[:, None])
+        trajectories = begun(batch, shared, group, np.full((len(group), 1), 1.3))
+        kernels = Kernels(shared, pool)
+        moving, *_ = kernels.follow(group, trajectories, looks)
+        found = []
+        for _ in range(5):
+            start = time.perf_counter()
+            kernels.follow(group, moving, looks)
+            found.append(time.perf_counter() - start)
+    return min(found) / (8 * looks * len(group))
 
 
 def paper_map(points: int):

@@ -70,6 +70,9 @@ def test_the_peak_on_the_way_is_known_to_rounding(maps, exactly, starts):
     np.testing.assert_allclose(maps.peaks(*starts, CROSSINGS), exactly.peaks(*starts, CROSSINGS), rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "maps", ["by kernels", pytest.param("by XLA", marks=pytest.mark.slow)], indirect=True, scope="module"
+)
 def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     """In the coordinates that the section and the contact leave free: the others nobody can change."""
     group, at = (starts[0][:12], starts[1].rows(slice(12)))
@@ -82,6 +85,7 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maps", ["by XLA"], indirect=True)
 def test_the_peak_of_an_advance_may_be_anywhere_in_it(maps):
     """Advances end between the samples of a window, where the velocity may be larger than at any of them; and the largest of the

@@ -44,6 +44,7 @@ from .mechanics import Mechanics as Mechanics
 from .mechanics import Rest as Rest
 from .mode import Contact as Contact
 from .mode import Status as Status
+from .mode import same_mode as same_mode
 from .mode_forces import ModeForces as ModeForces
 from .mode_forces import sticking_forces as sticking_forces
 from .rounding import exactly_zero as exactly_zero

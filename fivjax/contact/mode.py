@@ -28,3 +28,8 @@ class Contact(eqx.Module):
 
     status: Int[Array, "*batch"]
     direction: Float[Array, "*batch"]
+
+
+def same_mode(status, direction, other_status, other_direction):
+    """Which contacts are in the same mode: the direction of friction counts while they slide. For arrays of any kind."""
+    return (status == other_status) & ((status != Status.SLIDE) | (direction == other_direction))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..contact import Status
+from ..contact import same_mode
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .section_map import Point, Return, return_with_jacobian
@@ -101,9 +101,8 @@ def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -
 
 
 def _same_mode(a: Point, b: Point) -> bool:
-    one, other = (np.asarray(point.contact.status) for point in (a, b))
-    alike = np.asarray(a.contact.direction) == np.asarray(b.contact.direction)
-    return bool(np.all((one == other) & ((one != Status.SLIDE) | alike)))
+    one, other = a.contact, b.contact
+    return bool(np.all(same_mode(one.status, one.direction, other.status, other.direction)))
 
 
 def _newton_step(jacobian: np.ndarray, gap: np.ndarray, contacts: int) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
-from ..contact import Contact, Status
+from ..contact import Contact, same_mode
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
@@ -230,7 +230,7 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
         back, tangents, (mode, arrived) = jax.vmap(
             lambda unit: jax.jvp(image, (tried,), (unit,), has_aux=True), out_axes=(None, -1, None)
         )(units)
-        same = (mode.status == contact.status) & ((mode.status != Status.SLIDE) | (mode.direction == contact.direction))
+        same = same_mode(mode.status, mode.direction, contact.status, contact.direction)
         usable = arrived & jnp.all(jnp.isfinite(tangents.y)) & jnp.all(same)
         missed = jnp.linalg.norm(weights * (back.y - tried)) / jnp.linalg.norm(weights * tried)
         new = _Root(tried, back.period, back.peak, jnp.where(usable, missed, jnp.inf), tangents.y)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status
+from ..contact import same_mode
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, PROBED, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
 from ..verdicts.capture_of_several import free_directions, trial_of_several
@@ -161,7 +161,7 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
         with np.errstate(invalid="ignore", divide="ignore"):
             missed = np.linalg.norm(weights * gap, axis=1) / np.linalg.norm(weights * at.y, axis=1)
             better = missed < closure[running]
-        alike = (image.status == at.status) & ((at.status != Status.SLIDE) | (image.direction == at.direction))
+        alike = same_mode(image.status, image.direction, at.status, at.direction)
         alike = np.all(alike.reshape(len(alike), -1), axis=1)
         usable = np.isfinite(missed) & np.all(np.isfinite(derived), axis=(1, 2))
         better &= alike & usable

@@ -41,7 +41,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status
+from ..contact import Status, same_mode
 
 # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
 MARGIN = 1e-6
@@ -192,7 +192,7 @@ def neighbourhood(attempt: Trial | None, returned: ReturnMap) -> Neighbourhood |
 
 
 def _same_mode(status, direction, other, other_direction):
-    same = (status == other) & ((other != Status.SLIDE) | (direction == other_direction))
+    same = same_mode(status, direction, other, other_direction)
     return np.all(same, axis=-1) if np.ndim(other) else same
 
 
