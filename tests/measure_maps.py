@@ -231,19 +231,19 @@ def kernel_step() -> float:
     from fivjax.maps.sharing import Batch, shared_by
     from fivjax.steppers.windowed import Windowed
 
-    mu, group, looks = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 200
+    mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
     with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
         batch = Batch(scene(), Windowed(by_kernel=True), ("mu",), ("p",), (), False, 16, False, pool)
         shared = shared_by(batch, mu[:, None])
         trajectories = begun(batch, shared, group, np.full((len(group), 1), 1.3))
         kernels = Kernels(shared, pool)
-        moving, *_ = kernels.follow(group, trajectories, looks)
+        moving = kernels.follow(group, trajectories, steps)
         found = []
         for _ in range(5):
             start = time.perf_counter()
-            kernels.follow(group, moving, looks)
+            kernels.follow(group, moving, steps)
             found.append(time.perf_counter() - start)
-    return min(found) / (8 * looks * len(group))
+    return min(found) / (steps * len(group))
 
 
 def paper_map(points: int):

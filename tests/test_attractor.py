@@ -1,58 +1,65 @@
 """Attractors of a map: what ensembles nominate, what is computed and checked of it, and which trajectories it captures."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
 
 import fivjax as fj
-from fivjax.maps.captures import Cycle
-from fivjax.maps.tori import _holds_one_of, _on_one_torus
-from fivjax.verdicts import tube
-from fivjax.verdicts.ensemble import (
-    KEPT,
-    LEAST_MEMBERS,
-    LOOKS_NEAR,
-    REACHED,
-    SEEN,
-    Approach,
-    Attractor,
-    Ensemble,
-    approached,
-    distance_to,
-    met,
-    no_approach,
+from fivjax.maps.captures import CROSSINGS, Cycle
+from fivjax.maps.section import Section
+from fivjax.maps.tori import (
+    LONGER,
+    TRACED,
+    Torus,
+    _holds_one_of,
+    _in_clusters,
+    _may_be_torus,
+    _on_one_torus,
+    reached,
 )
+from fivjax.verdicts import tube
 
-LOOKS, MEMBERS, DECAY = 60, 16, 1.0
+STATES = 256
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def ensemble(radii, turn=GOLDEN / 14, size=4.0, moving=None):
-    """Members one look a second apart that wind around circles of these radii (looks × members), 4 off the origin."""
-    phase = 2 * np.pi * (turn * np.arange(LOOKS)[:, None] * 17 + np.arange(MEMBERS) * GOLDEN)
-    states = np.stack([size + radii * np.cos(phase), radii * np.sin(phase)], axis=-1)
-    times = 0.05 * np.arange(LOOKS)[:, None] * np.ones(MEMBERS)
-    events = 3 * np.arange(LOOKS)[:, None] * np.ones(MEMBERS, int)
-    return Ensemble(states, times, events, np.ones(MEMBERS, bool) if moving is None else moving)
+def wound(turn=GOLDEN / 14, radius=0.5, returns=TRACED):
+    """Crossing states on circles, 4 off the origin, that wind by so many turns from one to the next."""
+    phase = 2 * np.pi * turn * np.arange(returns)
+    return np.stack([4 + radius * np.cos(phase), radius * np.sin(phase)], axis=-1)
 
 
-def settling(rate, final=0.5):
-    """Radii that start apart, some inside, some outside, and come together."""
-    start = np.linspace(-0.4, 1.0, MEMBERS)
-    return final + start * np.exp(-rate * np.arange(LOOKS))[:, None]
+def test_a_motion_that_winds_around_a_curve_may_be_on_a_torus():
+    assert _may_be_torus(wound())
+    # However small: next to the bifurcation that it was born in, a torus is.
+    assert _may_be_torus(wound(radius=1e-4))
 
 
-def test_members_from_inside_and_outside_meet_on_a_torus():
-    states = met(ensemble(settling(0.4)), DECAY)
-    assert states.shape == (KEPT, 2)
-    np.testing.assert_allclose(np.hypot(states[:, 0] - 4, states[:, 1]), 0.5, atol=1e-4)
+@pytest.mark.parametrize("rate", [1e-4, 1e-5, 1e-6])
+def test_a_motion_that_fades_slowly_is_on_no_torus(rate):
+    """The whole motion by e in ten thousand to a million returns; and a beat that dies away about a periodic motion."""
+    fading = np.exp(-rate * np.arange(TRACED))[:, None]
+    assert not _may_be_torus(wound() * fading)
+    dying = wound(radius=0.5 * np.exp(-100 * rate * np.arange(TRACED)))
+    assert not _may_be_torus(dying)
 
 
-def test_members_that_meet_on_one_point_nominate_no_torus():
-    """A periodic motion, or the ghost of one: nearly the same state again and again. Those are computed, or nothing."""
-    assert met(ensemble(settling(0.4, final=0.01)), DECAY) is None
+def test_a_periodic_motion_of_few_crossings_is_on_no_torus():
+    for crossings in (1, 2, CROSSINGS):
+        assert not _may_be_torus(wound(turn=1 / crossings))
+    assert not _may_be_torus(wound(turn=0.0))
+    approached = wound(turn=1 / 3, radius=0.5 + 0.1 * 0.99 ** np.arange(TRACED))
+    assert not _may_be_torus(approached)
+    assert not _may_be_torus(np.where(np.arange(TRACED)[:, None] > 2000, np.nan, wound()))
+
+
+def test_a_locked_motion_shows_by_its_clusters():
+    """Twenty-three places of a curve; on the way there from a motion that fills the curve; and one that keeps filling it."""
+    assert _in_clusters(wound(turn=3 / 23))
+    slips = np.cumsum(0.01 * 0.99 ** np.arange(TRACED))
+    assert _in_clusters(wound(turn=3 / 23 + slips / np.arange(1, TRACED + 1)))
+    assert not _in_clusters(wound())
+    assert not _in_clusters(wound(returns=LONGER))
 
 
 def windings(centres, radius=1.0, returns=96, turn=GOLDEN):
@@ -70,71 +77,41 @@ def test_motions_that_creep_along_a_line_of_states_are_on_no_common_torus():
     assert not _on_one_torus(np.where(np.arange(96)[:, None] > 90, np.nan, windings(np.zeros((8, 1)))))
 
 
-def test_members_on_circles_of_their_own_have_not_met():
-    """Each returns to where it was itself; nobody else was there."""
-    assert met(ensemble(np.linspace(0.2, 2.0, MEMBERS) * np.ones((LOOKS, 1))), DECAY) is None
+class Winding:
+    """A return map by which states wind about a circle that each keeps; section states are weighted by 2 and 1."""
+
+    weights = np.array([2.0, 1.0])
+
+    def __init__(self):
+        self.asked: list[int] = []
+
+    def path(self, group, at, count):
+        self.asked += [len(group)]
+        phase = np.arctan2(at.y[:, 1], 2 * at.y[:, 0] - 4)[:, None] + 2 * np.pi * GOLDEN / 14 * np.arange(1, count + 1)
+        radius = np.hypot(2 * at.y[:, 0] - 4, at.y[:, 1])[:, None]
+        return at, np.stack([4 + radius * np.cos(phase), radius * np.sin(phase)], axis=-1) / self.weights
 
 
-def test_a_vibration_that_dies_together_is_no_limit_cycle():
-    """One path for all, on which nothing sustains them: at the structure's own rate of decay, or at a third of it."""
-    for rate in (1.0, 1 / 3):
-        fading = np.exp(-rate * 0.05 * np.arange(LOOKS))[:, None] * np.ones(MEMBERS)
-        whole = ensemble(0.5 * fading)
-        faded = whole._replace(deviations=whole.deviations * fading[..., None])
-        assert met(faded, DECAY) is None
+def test_a_torus_captures_what_stays_in_half_its_tube():
+    """Motions beside it that will leave are none of its own, however near they are; those far off are not even asked."""
+    maps = Winding()
+    torus = Torus(wound(returns=512), tube.RADIUS, 1.0, 0.1)
+    half = 0.5 * tube.RADIUS * tube.mean_size(torus.states)
+    radii = 0.5 + half * np.array([0.0, 0.9, -0.9, 1.1, -1.1, 3.0])
+    states = np.stack([4 + radii, 0 * radii], axis=-1) / maps.weights
+    at = Section(states, np.zeros(6, np.int32), np.ones(6))
+    found = reached(maps, np.zeros(6, int), at, states, [(np.arange(6), torus)])  # type: ignore[arg-type]
+    assert found == dict.fromkeys((0, 1, 2), torus)
+    assert maps.asked == [5]
+    # One whose last crossing is not known, and another torus, which has been asked about first.
+    states = np.where(np.arange(6)[:, None] == 0, np.nan, states)
+    other = torus._replace(amplitude=2.0)
+    found = reached(maps, np.zeros(6, int), at, states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
+    assert found == {1: other, 2: torus}
+    assert reached(maps, np.zeros(6, int), at, states, []) == {}  # type: ignore[arg-type]
 
 
-def test_a_vibration_without_contact_events_is_no_limit_cycle():
-    """Just above the stability limit all members grow on one mode, slowly, and meet on it; the first event is far off."""
-    whole = ensemble(settling(0.4))
-    assert met(whole._replace(events=np.full_like(whole.events, 7)), DECAY) is None
-
-
-def test_too_few_members_or_too_short_a_time_prove_nothing():
-    few = np.arange(MEMBERS) < LEAST_MEMBERS - 1
-    assert met(ensemble(settling(0.4), moving=few), DECAY) is None
-    assert met(ensemble(settling(0.4), moving=np.zeros(MEMBERS, bool)), DECAY) is None
-    # A structure that hardly decays by itself has to be watched for longer.
-    assert met(ensemble(settling(0.4)), 0.1 * DECAY) is None
-
-
-def looks_until_reached(distances):
-    """The look at which a trajectory has reached a torus of one crossing state, seen at these relative distances from it."""
-    with jax.enable_x64(True):
-        attractor = Attractor(jnp.ones((KEPT, 3)) / np.sqrt(3), jnp.asarray(1.0))
-        approach, away = no_approach(jnp.zeros(3)), jnp.asarray([1.0, -1.0, 0.0]) / np.sqrt(2)
-        step = jax.jit(lambda approach, state: approached(approach, state, distance_to(attractor, state)))
-        for look, distance in enumerate(distances):
-            approach, reached = step(approach, attractor.crossings[0] + distance * away)
-            if reached:
-                return look
-    return None
-
-
-def test_a_trajectory_that_stays_in_the_tube_is_captured():
-    near = REACHED * (0.9 - 0.5 * np.arange(LOOKS_NEAR + 2) / LOOKS_NEAR)
-    assert looks_until_reached([0.3, 0.1, *near]) == LOOKS_NEAR + 1
-
-
-def test_a_trajectory_that_passes_through_the_tube_is_not():
-    assert looks_until_reached([0.3, *[0.019] * (LOOKS_NEAR - 1), 0.03] * 3) is None
-    assert looks_until_reached([0.021] * 40) is None and REACHED < 0.021
-
-
-def test_the_same_crossing_state_is_looked_at_once():
-    """A slow method looks many times between two crossings."""
-    assert looks_until_reached([0.01] * 40) is None
-
-
-def test_nothing_known_is_never_reached():
-    with jax.enable_x64(True):
-        unknown = Attractor(jnp.zeros((KEPT, 2)), jnp.asarray(0.0))
-        near = Approach(jnp.zeros((SEEN, 2)), jnp.asarray(99))
-        state = jnp.full(2, 1e-9)
-        assert not approached(near, state, distance_to(unknown, state))[1]
-
-
-def circle(radius=0.5, count=KEPT):
+def circle(radius=0.5, count=STATES):
     """Weighted states (displacement, gap, velocity, rate of the gap) in contact on a closed curve, in no order."""
     angle = 2 * np.pi * GOLDEN * np.arange(count)
     zero = np.zeros(count)
@@ -150,7 +127,7 @@ def test_the_tube_is_entered_from_all_sides_on_its_edge():
     contact = tube.starts(states, velocity=3, gap=1, gap_rate=1)
     assert np.all(contact[:, [1, 3]] == 0)
     apart = np.linalg.norm(contact[:, None] - states, axis=-1)
-    chosen = states[np.linspace(0, KEPT - 1, tube.STARTS).round().astype(int)]
+    chosen = states[np.linspace(0, STATES - 1, tube.STARTS).round().astype(int)]
     np.testing.assert_allclose(np.linalg.norm(contact - chosen, axis=1), tube.RADIUS * size)
     assert apart.min(axis=1).max() > 0.5 * tube.RADIUS * size
     radial = np.linalg.norm(contact, axis=1) - np.linalg.norm(chosen, axis=1)
@@ -194,9 +171,10 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
 
 
 def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
-    """The paper's torus, kept from the search that comes first: it is found from where the trajectory is in the end."""
+    """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
-    monkeypatch.setattr("fivjax.maps.attractors.tori_among", lambda *_: ({}, []))
+    for place in ("attractors._add_tori", "rounds.add_tori"):
+        monkeypatch.setattr(f"fivjax.maps.{place}", lambda *_: None)
     monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
     monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)

@@ -14,13 +14,13 @@ def to_bytes(found: dict[bytes, Attractors]) -> bytes:
     """The attractors of groups, by the groups' parameters, as bytes."""
     arrays, index = {}, []
     for number, (key, one) in enumerate(found.items()):
-        index.append([key.hex(), len(one.cycles), one.torus is not None])
+        index.append([key.hex(), len(one.cycles), len(one.tori)])
         for k, cycle in enumerate(one.cycles):
             fields = {**cycle._asdict(), **{f"n_{name}": part for name, part in cycle.neighbourhood._asdict().items()}}
             del fields["neighbourhood"]
             arrays |= {f"{number}.{k}.{name}": np.asarray(value) for name, value in fields.items()}
-        if one.torus is not None:
-            arrays |= {f"{number}.torus.{name}": np.asarray(value) for name, value in one.torus._asdict().items()}
+        for k, torus in enumerate(one.tori):
+            arrays |= {f"{number}.torus{k}.{name}": np.asarray(value) for name, value in torus._asdict().items()}
     content = io.BytesIO()
     np.savez_compressed(content, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)
     return content.getvalue()
@@ -31,7 +31,7 @@ def from_bytes(content: bytes) -> dict[bytes, Attractors]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     found = {}
-    for number, (key, cycles, has_torus) in enumerate(json.loads(arrays["index"].tobytes())):
+    for number, (key, cycles, tori) in enumerate(json.loads(arrays["index"].tobytes())):
 
         def of(kind, prefix, own=number, **others):
             names = [name for name in kind._fields if name not in others]
@@ -39,7 +39,7 @@ def from_bytes(content: bytes) -> dict[bytes, Attractors]:
 
         found[bytes.fromhex(key)] = Attractors(
             [of(Cycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)],
-            of(Torus, "torus.") if has_torus else None,
+            [of(Torus, f"torus{k}.") for k in range(tori)],
         )
     return found
 

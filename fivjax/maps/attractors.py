@@ -1,153 +1,160 @@
 """The attractors of a group: computed from where an ensemble of released trajectories nominates them.
 
 What is found depends on the group alone: on no trajectory of the map, nor on their number. Cycles are computed
-(`captures`); where none is found although the members stay in motion, the set that they have met on is tried as a torus: starts
-about it, further in and further out, must all come back to it.
+(`captures`); what members trace that no cycle captures is tried as a torus (`tori`).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from ..verdicts import ensemble as nominating
 from ..verdicts.verdict import Verdict
 from .captures import Cycle, captured, distinct, is_new, stable_cycles
-from .flattened import Flattened, flatten
+from .flattened import Flattened
+from .following import begun, follow
+from .kernels import Kernels
 from .section import ReturnMaps, Section
 from .sharing import Batch
-from .tori import BACK_WITHIN, BACK_WITHIN_ALONE, Torus, about, section_at, tori_among
+from .tori import TUBES, Torus, reached, tori_from
 
-# Looks at an ensemble after which cycles are computed from where its members are.
-NEWTON_AT = {24: 0.1, 64: 0.03, 128: 0.01, 256: 0.003}
+# Loads that the ensemble is released from, in final loads: its members have different energies. Where they come to may be an
+# attractor, and never is an unstable cycle, which is met by nobody.
+RELEASES = np.linspace(1.5, 6.0, 8)
+# Steps of an ensemble after which cycles are computed from where its members are, and how nearly they have to have come back.
+NEWTON_AT = {192: 0.1, 512: 0.03, 1024: 0.01}
+# Members of each group that are tried for a torus, one after the other.
+TRIED = 2
 
 
 class Attractors(NamedTuple):
     """What was found of a group."""
 
     cycles: list[Cycle]
-    torus: Torus | None
+    tori: list[Torus]
 
-
-class Follower(NamedTuple):
-    """How trajectories are begun and followed (`rounds`)."""
-
-    begun: Callable
-    observed: Callable
+    def copy(self) -> "Attractors":
+        return Attractors(list(self.cycles), list(self.tori))
 
 
 def search(
     batch: Batch,
+    kernels: Kernels | None,
     shared: Flattened,
     maps: ReturnMaps,
-    rounds: Follower,
     groups: Int[np.ndarray, " g"],
     columns: Float[np.ndarray, "g h"],
     report,
-    near: Float[np.ndarray, "g 2n"] | None = None,
-    cycles: list[list[Cycle]] | None = None,
 ) -> list[Attractors]:
-    """The attractors of these groups. `columns` are the load's histories of any trajectory of each.
-
-    With `near`, states of the section, members begin about these instead of being released. `cycles` of each are known.
-    """
-    members = len(nominating.RELEASES)
+    """The attractors of these groups. `columns` are the load's histories of any trajectory of each."""
+    members = len(RELEASES)
     own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
     # The ensemble's own states, not those of a trajectory.
     each[:, len(batch.history) :] = np.nan
-    running, moving = np.arange(len(own)), np.ones(len(own), bool)
-    trajectories = rounds.begun(batch, shared, own, each, np.tile(nominating.RELEASES, len(groups)))
-    if near is not None:
-        starts = [about(maps, state)[:members] for state in near]
-        trajectories = _at(trajectories, np.concatenate(starts) / maps.weights, maps.normal)
-    if near is None:
-        tests, within = nominating.TESTS, BACK_WITHIN
-    else:
-        tests, within = nominating.TESTS_ALONE, BACK_WITHIN_ALONE
-    most, size = max(tests), 2 * maps.structure.size
-    deviations = np.full((most, len(own), size), np.nan)
-    times, events = (np.full((most, len(own)), np.nan) for _ in range(2))
-    decay = shared.tree.modes.slowest_decay
-    found = [Attractors([] if cycles is None else list(cycles[k]), None) for k in range(len(groups))]
-    looks = 0
-
-    def met(k: int):
-        mine = slice(k * members, (k + 1) * members)
-        whole = nominating.Ensemble(deviations, times, events, moving)
-        seen = nominating.Ensemble(*(part[:looks, mine] for part in whole[:-1]), moving=moving[mine])
-        return nominating.met(seen, decay[groups[k]], thin=near is not None)
-
-    for stop in sorted({*NEWTON_AT, *tests}):
-        if not len(running) or stop > most:
+    of_group = {int(g): Attractors([], []) for g in groups}
+    running, done = own, 0
+    trajectories = begun(batch, shared, own, each, np.tile(RELEASES, len(groups)))
+    for stop, nearly in NEWTON_AT.items():
+        if not len(running):
             break
         report(0)
-        seen = rounds.observed(shared, own[running], trajectories, stop - looks)
-        _, now = trajectories.tree
-        for whole, part in zip((deviations, times, events), seen, strict=True):
-            whole[looks:stop, running] = part.swapaxes(0, 1)
-        looks = stop
-        moving[running] = now.verdict == Verdict.UNDECIDED
-        if looks in NEWTON_AT:
-            _add_cycles(maps, own, running, moving, now, found, members, NEWTON_AT[looks])
-        if looks in tests:
-            open_ = np.unique(running[moving[running]] // members)
-            sets = [(k, set_) for k, set_ in zip(open_, batch.pool.map(met, open_), strict=True) if set_ is not None]
-            if sets:
-                tori, of_locked = tori_among(maps, groups, sets, [one.cycles for one in found], within, report)
-                for k, torus in tori.items():
-                    found[k] = found[k]._replace(torus=torus)
-                _keep(maps, of_locked, found)
-                done = [*tori, *(k for k, _ in of_locked)]
-                moving[np.isin(np.arange(len(own)) // members, np.array(done, int))] = False
-        left = moving[running]
-        running, trajectories = running[left], trajectories.compacted(np.flatnonzero(left))
-    return found
+        follow(batch, kernels, shared, running, trajectories, stop - done)
+        done = stop
+        left = _left_by_cycles(maps, running, trajectories.tree[1], of_group, nearly)
+        running, trajectories = running[left], trajectories.compacted(left)
+    if len(running):
+        _add_tori(maps, running, trajectories.tree[1], of_group, report)
+    return list(of_group.values())
 
 
-def _keep(maps: ReturnMaps, new: list[tuple[int, Cycle]], found: list[Attractors]) -> None:
-    """Adds those cycles (each with the place of its group) that are not known yet."""
-    for k, cycle in new:
-        if is_new(maps, cycle, found[k].cycles):
-            found[k].cycles.append(cycle)
+def _left_by_cycles(
+    maps: ReturnMaps, group, now, of_group: dict[int, Attractors], nearly: float
+) -> Int[np.ndarray, " r"]:
+    """The members that are still in motion where no cycle captures them; adds cycles where members are by now."""
+    moving, latest, at = now.verdict == Verdict.UNDECIDED, np.array(now.crossing), section_of(now)
+    usable = moving & has_crossed(now)
+    captured_by = come_to(maps, group, at, latest, usable, of_group)
+    usable[list(captured_by)] = moving[list(captured_by)] = False
+    picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), group, usable)
+    if len(picked):
+        known = {g: one.cycles for g, one in of_group.items()}
+        new = stable_cycles(maps, group[picked], at.rows(picked), known, nearly=nearly)
+        for g, _, cycle in new:
+            add_cycle(maps, of_group[g], cycle)
+        if new:
+            moving[list(come_to(maps, group, at, latest, usable, of_group))] = False
+    return np.flatnonzero(moving)
 
 
-def _add_cycles(
-    maps: ReturnMaps, own, running, moving, now, found: list[Attractors], members: int, nearly: float
+def _add_tori(maps: ReturnMaps, group, now, of_group: dict[int, Attractors], report) -> None:
+    """Adds the tori that members are on, and the cycles of those that are locked."""
+    latest, at, usable = np.array(now.crossing), section_of(now), has_crossed(now)
+    for _ in range(TRIED):
+        picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), group, usable, most=1)
+        if not len(picked):
+            break
+        report(0)
+        add_tori(maps, group[picked], at.rows(picked), of_group, report)
+        usable[picked] = False
+        usable[list(come_to(maps, group, at, latest, usable, of_group))] = False
+
+
+def add_tori(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    of_group: dict[int, Attractors],
+    report,
+    tubes=TUBES[:1],
 ) -> None:
-    """Cycles where members are by now; those that are captured by them need not be followed any further."""
-    latest = np.array(now.crossing)
-    usable = moving[running] & np.all(np.isfinite(latest), axis=1) & (now.events > 0)
-    at = section_of(now)
+    """Adds the tori that motions from these states are on to those known of their groups, and the cycles of locked ones."""
+    known = [of_group[int(g)] for g in group]
+    tori, locked = tori_from(maps, group, at, [one.cycles for one in known], [one.tori for one in known], report, tubes)
+    for row, torus in tori.items():
+        known[row].tori.append(torus)
+    for row, cycle in locked:
+        add_cycle(maps, known[row], cycle)
 
-    def take_captured():
-        known = [(np.flatnonzero(usable & (running // members == k)), c) for k, a in enumerate(found) for c in a.cycles]
-        inside = captured(maps, own[running], at, latest, known) >= 0
-        moving[running[inside]] = False
-        return usable & ~inside
 
-    left = take_captured() if any(a.cycles for a in found) else usable
-    picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), running // members, left)
-    if not len(picked):
-        return
-    known = {int(own[members * k]): one.cycles for k, one in enumerate(found)}
-    new = stable_cycles(maps, own[running[picked]], at.rows(picked), known, nearly=nearly)
-    _keep(maps, [(running[picked[rows[0]]] // members, cycle) for _, rows, cycle in new], found)
+def add_cycle(maps: ReturnMaps, known: Attractors, cycle: Cycle) -> bool:
+    """Adds a cycle if it is none of those known; and whether it was."""
+    new = is_new(maps, cycle, known.cycles)
     if new:
-        take_captured()
+        known.cycles.append(cycle)
+    return new
+
+
+def come_to(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    latest: Float[np.ndarray, "m 2n"],
+    asked: Bool[np.ndarray, " m"],
+    of_group: dict[int, Attractors],
+) -> dict[int, Cycle | Torus]:
+    """The known attractors of their groups by which trajectories have been captured, by row. Only those that are `asked` count;
+    `latest` are their last crossings, see `captures.captured`.
+    """
+    rows = np.flatnonzero(asked)
+    if not len(rows):
+        return {}
+    rows = rows[np.argsort(group[rows], kind="stable")]
+    which, first = np.unique(group[rows], return_index=True)
+    own = [
+        (part, of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True) if int(g) in of_group
+    ]
+    cycles = [(part, cycle) for part, known in own for cycle in known.cycles]
+    place = captured(maps, group, at, latest, cycles)
+    found: dict[int, Cycle | Torus] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
+    tori = [(part[place[part] < 0], torus) for part, known in own for torus in known.tori]
+    return found | reached(maps, group, at, latest, tori)
+
+
+def has_crossed(now) -> Bool[np.ndarray, " m"]:
+    """Which trajectories have crossed the section under their final load, and had events."""
+    return np.all(np.isfinite(now.crossing), axis=1) & (now.events > 0)
 
 
 def section_of(now) -> Section:
     """Where trajectories are."""
     return Section(np.array(now.y), np.array(now.contact.status), np.array(now.contact.direction))
-
-
-def _at(begun: Flattened, y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray) -> Flattened:
-    """Trajectories that have begun, put to these states of the section."""
-    columns, now = begun.tree
-    # They have been released: friction points the way it does on the section.
-    status = section_at(y, normal, np.asarray(now.contact.direction)).status.astype(now.contact.status.dtype)
-    contact = eqx.tree_at(lambda c: c.status, now.contact, status)
-    return flatten(jax.tree.map(np.asarray, (columns, eqx.tree_at(lambda n: (n.y, n.contact), now, (y, contact)))))

@@ -269,14 +269,16 @@ def captured(
     return which
 
 
-def distinct(states: Float[np.ndarray, "m 2n"], group, chosen: Bool[np.ndarray, " m"]) -> Int[np.ndarray, " r"]:
+def distinct(
+    states: Float[np.ndarray, "m 2n"], group, chosen: Bool[np.ndarray, " m"], most: int = NOMINATED
+) -> Int[np.ndarray, " r"]:
     """A few of the chosen rows of each group, far from each other."""
     picked: list[int] = []
     for g in np.unique(group[chosen]):
         rows = np.flatnonzero(chosen & (group == g))
         mine = [rows[0]]
         away = np.linalg.norm(states[rows] - states[rows[0]], axis=1)
-        while len(mine) < min(NOMINATED, len(rows)):
+        while len(mine) < min(most, len(rows)):
             mine.append(rows[np.argmax(away)])
             away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
         picked += mine

@@ -1,11 +1,10 @@
-"""The verdict on one trajectory, as far as it can be proved at a given time; and its distance to a known torus."""
+"""The verdict on one trajectory, as far as it can be proved at a given time and without the attractors."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..verdicts import ensemble as attractors
 from ..verdicts.sliding_proof import slides_forever
 from ..verdicts.slow_growth import slid_on
 from ..verdicts.sticking_proof import sticks_forever
@@ -13,24 +12,8 @@ from ..verdicts.verdict import Verdict
 from .flattened import Flattened
 from .progress import Progress, Setting
 
-# Steps between two comparisons of a trajectory with a known torus: one or two cycles for the fastest method.
-STEPS_PER_LOOK = 8
 # A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
 GROWTH = 1e9
-
-
-def distance_to_torus(setting: Setting, now: Progress) -> Float[Array, ""]:
-    """The distance of the trajectory's last crossing from the known torus, relative to its size."""
-    return attractors.distance_to(setting.attractor, setting.scene.structure.weights * now.crossing)
-
-
-def look(
-    setting: Setting, now: Progress, distance: Float[Array, ""], reached: Bool[Array, ""]
-) -> tuple[Progress, Bool[Array, ""]]:
-    """The trajectory with its `distance` to the known torus noted, and whether it has reached the torus by now."""
-    crossing = setting.scene.structure.weights * now.crossing
-    approach, reached_now = attractors.approached(now.approach, crossing, distance)
-    return eqx.tree_at(lambda now: now.approach, now, approach), reached | reached_now
 
 
 def may_be_concluded(shared: Flattened, group: Int[np.ndarray, " m"], before: Progress, now: Progress) -> np.ndarray:
@@ -43,13 +26,12 @@ def may_be_concluded(shared: Flattened, group: Int[np.ndarray, " m"], before: Pr
     return (now.events == before.events) | (now.t <= before.t) | ~(largest <= GROWTH * yardstick[group])
 
 
-def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: Bool[Array, ""]) -> Progress:
+def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progress:
     """The trajectory with its verdict, if one can be proved by now.
 
-    `began` is the time (s) at which the present round of steps began; `reached` says whether it has reached the known torus.
-    Capture by cycles is tested elsewhere (`rounds`).
+    `began` is the time (s) at which the present round of steps began. Capture by attractors is tested elsewhere (`rounds`).
     """
-    scene, mechanics, modes = setting.scene, setting.mechanics, setting.modes
+    scene, mechanics, modes = setting.scene, setting.shared.mechanics, setting.shared.modes
     structure = scene.structure
     weights = structure.weights
     equilibrium, velocity = modes.linear.equilibrium, structure.size + mechanics.tangential
@@ -58,8 +40,8 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
     grown = jnp.max(jnp.abs(weights * now.y)) > GROWTH * yardstick
     # There is no proof that several contacts stick for ever.
     jammed = jnp.asarray(False)
-    if setting.drift is not None:
-        jammed = sticks_forever(setting.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
+    if setting.shared.drift is not None:
+        jammed = sticks_forever(setting.shared.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
     quiet_load = jnp.all(scene.load.jumps <= now.t)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
@@ -70,15 +52,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress, reached: 
             jnp.where(
                 slides_forever(mechanics, modes, now.contact, now.y, quiet_load),
                 Verdict.SLIDING,
-                jnp.where(
-                    quiet_load & reached,
-                    Verdict.LIMIT_CYCLE,
-                    jnp.where(
-                        quiet_load & (jammed | grown),
-                        Verdict.UNBOUNDED,
-                        Verdict.UNDECIDED,
-                    ),
-                ),
+                jnp.where(quiet_load & (jammed | grown), Verdict.UNBOUNDED, Verdict.UNDECIDED),
             ),
         ),
     )
@@ -90,11 +64,11 @@ def _may_slide_on(setting: Setting, now: Progress) -> bool:
     """Whether a motion that grows slowly may skip the time to its next event: with one contact, constant friction, an exact
     method, and without an energy ledger.
     """
-    mechanics = setting.mechanics
+    mechanics = setting.shared.mechanics
     return not mechanics.several and mechanics.friction.constant and np.isinf(setting.method.dt) and now.energy is None
 
 
 def _slid_on(setting: Setting, now: Progress, quiet_load: Bool[Array, ""]) -> Progress:
     open_ = quiet_load & (now.verdict == Verdict.UNDECIDED)
-    y, time = slid_on(setting.mechanics, setting.modes, now.contact, now.y, open_)
+    y, time = slid_on(setting.shared.mechanics, setting.shared.modes, now.contact, now.y, open_)
     return eqx.tree_at(lambda now: (now.t, now.skipped, now.y), now, (now.t + time, now.skipped + time, y))

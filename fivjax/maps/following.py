@@ -6,15 +6,13 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.kept_programs import kept
-from ..verdicts.ensemble import SEEN
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
-from .conclusion import STEPS_PER_LOOK, conclude, distance_to_torus, look, may_be_concluded
+from .conclusion import conclude, may_be_concluded
 from .flattened import Flattened, flatten
-from .kernels import Kernels, Looks
+from .kernels import Kernels
 from .progress import Setting, begin, placed, released, step
 from .sharing import Batch, Shared, with_values
 
@@ -37,56 +35,39 @@ def begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarra
 
 
 def follow(
-    batch: Batch, kernels: Kernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int
+    batch: Batch, kernels: Kernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, steps: int
 ) -> None:
-    """Trajectories `looks` looks further, in place."""
+    """Trajectories so many steps further, in place."""
     if kernels is not None:
-        _follow_by_kernel(batch, kernels, shared, group, trajectories, looks)
+        _follow_by_kernel(batch, kernels, shared, group, trajectories, steps)
         return
     follow_block = _follow_block_of_many if batch.many else _follow_block
 
     def function(*block):
-        return follow_block(batch.scene, batch.method, batch.names, batch.history, np.int32(looks), *block)
+        return follow_block(batch.scene, batch.method, batch.names, batch.history, np.int32(steps), *block)
 
     in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True, size=_block(batch))
 
 
 def _follow_by_kernel(
-    batch: Batch, kernels: Kernels, shared: Flattened, group, trajectories, looks: int, recorded: bool = False
-) -> Looks:
-    after, reached, record = kernels.follow(group, trajectories, looks, recorded)
+    batch: Batch, kernels: Kernels, shared: Flattened, group: np.ndarray, trajectories: Flattened, steps: int
+) -> None:
+    after = kernels.follow(group, trajectories, steps)
     before = trajectories.tree[1]
     began = np.array(before.t)
     # While its mode changes again and again, nothing can be proved of a trajectory.
-    asks = np.flatnonzero(reached | may_be_concluded(shared, group, before, after.tree[1]))
+    asks = np.flatnonzero(may_be_concluded(shared, group, before, after.tree[1]))
     trajectories.numbers[:] = after.numbers
     if not len(asks):
-        return record
+        return
 
     def function(*block):
         return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
 
-    rows = flatten((*jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree), began[asks], reached[asks]))
+    rows = flatten((*jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree), began[asks]))
     # They are few of each group, and what they share is little.
     concluded = in_blocks(function, kernels.for_conclusions, group[asks], rows, 1, batch.pool, size=CONCLUDED)
     trajectories.numbers[asks] = concluded.numbers
-    return record
-
-
-def observed(
-    batch: Batch, kernels: Kernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, looks: int
-) -> Looks:
-    """Trajectories `looks` looks further, in place; and what was seen of them."""
-    if kernels is not None:
-        return _follow_by_kernel(batch, kernels, shared, group, trajectories, looks, recorded=True)
-    parts = []
-    for start in range(0, looks, SEEN):
-        follow(batch, None, shared, group, trajectories, min(SEEN, looks - start))
-        now = trajectories.tree[1]
-        each = np.ones((1, SEEN))
-        # As of the last of these looks: enough to tell whether there were any since the looks before.
-        parts.append(Looks(now.approach.seen[:, ::-1].copy(), now.t[:, None] * each, now.events[:, None] * each))
-    return Looks(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
 def _block(batch: Batch) -> int | None:
@@ -117,24 +98,14 @@ def _begin_block(
     return flatten((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
 
 
-def _followed(scene, method, names, history, looks, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _followed(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
-    everything = shared.tree
-    of_all = functools.partial(_of_all, scene, method, names, history, everything, columns)
+    of_all = functools.partial(_of_all, scene, method, names, history, shared.tree, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
-    a_step, a_distance, a_look, concluded = map(of_all, (step, distance_to_torus, look, conclude))
-    known, nothing = jnp.any(everything.attractor.known), jnp.full(begun.t.shape, jnp.inf, begun.t.dtype)
-
-    def until_look(_, carry):
-        now, reached = carry
-        now = jax.lax.fori_loop(0, STEPS_PER_LOOK, lambda _, now: a_step(now), now)
-        # Until a torus is known, which is seldom, there is no distance to compute.
-        return a_look(now, jax.lax.cond(known, a_distance, lambda _: nothing, now), reached)
-
-    none = jnp.zeros(begun.t.shape, bool)
-    after, reached = jax.lax.fori_loop(0, looks, until_look, (begun, none))
-    return flatten((columns, concluded(begun.t, after, reached)), row_axes=2)
+    a_step, concluded = map(of_all, (step, conclude))
+    after = jax.lax.fori_loop(0, steps, lambda _, now: a_step(now), begun)
+    return flatten((columns, concluded(begun.t, after)), row_axes=2)
 
 
 _follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_compiled=False)
@@ -142,29 +113,19 @@ _follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_
 
 @kept
 def _conclude_block(scene, method, names, history, shared: Flattened, trajectories: Flattened) -> Flattened:
-    columns, after, began, reached = trajectories.tree
-    values, mechanics, modes, drift = shared.tree
-    everything = Shared(values, mechanics, None, modes, drift, None, None, None)  # pyright: ignore[reportArgumentType]
-    concluded = _of_all(scene, method, names, history, everything, columns, conclude)
-    return flatten((columns, concluded(began, after, reached)), row_axes=2)
+    columns, after, began = trajectories.tree
+    concluded = _of_all(scene, method, names, history, shared.tree, columns, conclude)
+    return flatten((columns, concluded(began, after)), row_axes=2)
 
 
-def _of_all(scene, method, names, history, everything, columns, function):
+def _of_all(scene, method, names, history, everything: Shared, columns, function):
     """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
 
     def of_group(shared, columns, *own):
         scene_of_group = with_values(scene, names, shared.values)
 
         def of_one(row, *own):
-            setting = Setting(
-                with_values(scene_of_group, history, row),
-                method,
-                shared.mechanics,
-                shared.prepared,
-                shared.modes,
-                shared.drift,
-                shared.attractor,
-            )
+            setting = Setting(with_values(scene_of_group, history, row), method, shared)
             return function(setting, *own)
 
         return jax.vmap(of_one)(columns, *own)

@@ -4,8 +4,6 @@ Everything here is written for one trajectory; `rounds` follows many. States are
 the final load, so that rounding errors are relative to the deviation and not to the total displacement.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,11 +17,9 @@ from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, op
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.windowed import Windowed
-from ..verdicts import ensemble as attractors
-from ..verdicts.ensemble import Approach, Attractor
 from ..verdicts.sliding_proof import SlidingModes
-from ..verdicts.sticking_proof import StickingDrift
 from ..verdicts.verdict import Verdict
+from .sharing import Shared
 
 # The longest advance with an energy ledger, s.
 LONGEST_ENTRY = 1.0
@@ -39,7 +35,6 @@ class Progress(eqx.Module):
     crossing: State  # the last crossing of the section under the final load; NaN before the first
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
-    approach: Approach
     verdict: Int[Array, ""]
     energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
     steps: "LoadSteps | None" = None  # for a kernel
@@ -50,11 +45,7 @@ class Setting(eqx.Module):
 
     scene: Scene
     method: AbstractStepper | Windowed
-    mechanics: Mechanics  # see `mechanics_about_sliding`
-    prepared: Any  # see `AbstractStepper.prepare`
-    modes: SlidingModes
-    drift: StickingDrift | None  # None with several contacts
-    attractor: Attractor
+    shared: Shared
 
 
 class EnergyRecord(eqx.Module):
@@ -97,14 +88,13 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool,
         crossing=jnp.full_like(y, jnp.nan),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
-        approach=attractors.no_approach(y),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
         steps=LoadSteps(scene.load) if for_kernel else None,
     )
 
 
-def placed(now: Progress, scene: Scene, shared, places: tuple[int, ...], values) -> Progress:
+def placed(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...], values) -> Progress:
     """The trajectory with total values (not deviations) at these indices of its initial state; NaN leaves an entry as it is."""
     if not places:
         return now
@@ -148,11 +138,11 @@ def step(setting: Setting, now: Progress) -> Progress:
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
     # Exact steppers end on the section. `Windowed` interpolates crossings from its samples, which is good enough here.
     at_section = not isinstance(method, Windowed)
-    after = method.advance(setting.prepared, now.contact, load, now.y, t - now.t, at_section)
+    after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section)
     y, contact, h, rise = after.y, after.contact, after.h, after.rise
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status
-    changed = jnp.any(changed) if setting.mechanics.several else changed
+    changed = jnp.any(changed) if setting.shared.mechanics.several else changed
     # Crossings during the kick do not count for the motion after it.
     crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
     return Progress(
@@ -163,7 +153,6 @@ def step(setting: Setting, now: Progress) -> Progress:
         crossing=jnp.where(crossed, rise.at, now.crossing),
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
-        approach=now.approach,
         verdict=now.verdict,
         energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
         steps=now.steps,
@@ -173,7 +162,7 @@ def step(setting: Setting, now: Progress) -> Progress:
 def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
     scene = setting.scene
     segment = Segment(before.t, load, before.contact, before.y, after)
-    ledger = enter(EnergyData(scene), setting.method, setting.mechanics, energy.ledger, segment)
+    ledger = enter(EnergyData(scene), setting.method, setting.shared.mechanics, energy.ledger, segment)
     kick_ends = jnp.max(scene.load.jumps, initial=0.0)
     just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
     vibration = mechanical_energy(scene.structure, after.y)

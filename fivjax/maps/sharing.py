@@ -26,8 +26,6 @@ from ..steppers.event_exact import EventExact
 from ..steppers.kernel_advance import MOST_COORDINATES
 from ..steppers.propagation import MATRIX_ROWS
 from ..steppers.windowed import Windowed
-from ..verdicts import ensemble as attractors
-from ..verdicts.ensemble import Attractor
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 from .flattened import Flattened, flatten
@@ -36,6 +34,8 @@ from .flattened import Flattened, flatten
 HISTORY = ("p", "duration", "start")
 # Number of groups worked out at a time, so that one size is compiled.
 GROUPS_AT_A_TIME = 64
+# States kept of a torus, mostly.
+OF_TORUS = 512
 
 
 class Shared(eqx.Module):
@@ -46,7 +46,6 @@ class Shared(eqx.Module):
     prepared: Any  # see `AbstractStepper.prepare`
     modes: SlidingModes
     drift: StickingDrift | None  # None with several contacts
-    attractor: Attractor
     weights: Float[Array, " state"]  # see `Structure.weights`
     longest_return: Float[Array, ""]  # of the section's return map, s
 
@@ -90,10 +89,10 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     """Memory for one trajectory, in bytes, if `sharing` of them make a group; with its part of intermediate results."""
     n = scene.structure.size
     m = 2 * (n - 1)
-    own = 8 * ((3 + attractors.SEEN) * 2 * n + 60)
+    own = 8 * (3 * 2 * n + 60)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
-    attractor = 8 * attractors.KEPT * 2 * n
+    attractor = 8 * OF_TORUS * 2 * n
     return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
@@ -121,9 +120,8 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
         # Written into the result one by one, because they are large and should not be in memory twice.
         mechanics, prepared, _, drifts, weights, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
-        unknown = attractors.unknown(rows.stop - start, 2 * batch.scene.structure.size)
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, unknown, weights, longest))
+        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, weights, longest))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)

@@ -1,39 +1,48 @@
-"""Tori of many groups: whether sets on which ensembles have met attract, whether neighbours part on them, how high they go."""
+"""Tori of many groups: the sets that long motions trace on the section, whether these attract, whether neighbours part on them,
+how high they go.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..contact import Status
-from ..cycles.torus import extent, smooth_mean
+from ..cycles.torus import drifts, extent, smooth_mean
 from ..verdicts import tube
 from ..verdicts.tube import nearest
 from ..verdicts.tube_of_several import starts_of_several
-from .captures import MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
+from .captures import CROSSINGS, KNOWN_TO, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
+from .parting import PARTING_OVER, parting_rates
 from .section import ReturnMaps, Section
 from .windowed_returns import KEPT
 
-# Crossings in which the starts about a torus have to be back: of a group's ensemble, and about a motion that has asked alone.
-# What takes longer is left to the trajectories that meet it.
-BACK_WITHIN, BACK_WITHIN_ALONE = 96, 384
-# Starts about a torus that are followed further. Over so many returns, twice, it is asked whether neighbours part: the first
-# turn directions to where they grow. On a torus they part no faster than linearly; in chaos by so much per return, and more.
-FURTHER, PARTING_OVER, PARTING = 8, 48, 0.05
+# Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
+TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
+# States on the section in a row that make the set: so many, and twice as many of a motion that beats slowly; and how many at a
+# time: after each, motions that have come to a torus that is known are left out, and those whose extent changes by this factor,
+# as on the way to a cycle.
+TRACED, LONGER, AT_A_TIME, CHANGES = 2048, 4096, 512, 1.5
+# The mean of the states may change with time by so much of their extent, and their extent by this share. A fade that takes
+# thousands of periods is such a set, too, and starts further in are home while they pass it.
+DRIFT, SHRINKS = 5e-3, 0.05
+# A motion that comes back this close, relative to the extent of its states, within `CROSSINGS`, is on a cycle. One that is
+# locked weakly to a cycle of more crossings is better taken as on a torus: motions from about it trace the rest of that, once
+# they have come to it, after so many returns. Its states are in clusters: distances between neighbours are mostly smaller than
+# this share of those on a curve.
+REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
+# Crossings in which starts in the tube have to be back, so much closer than elsewhere: next to a slow fade there is a direction
+# in which they come back hardly at all. The first few starts tell most sets that do not attract.
+BACK_WITHIN, CLOSER, FIRST = 1536, 0.5, 4
+# Starts about a torus that are followed further. In chaos neighbours part by so much per return, and more.
+FURTHER, PARTING = 8, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
 LOCKED = -0.01
 # On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
 # within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
 SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
-# A motion that nothing has captured in its time is followed on for so many times as many returns at most: until neighbours
-# have parted by so many e-folds since they were closest, or have closed in by so many since they were furthest apart. On a
-# torus they part and close in by turns, by two or three e-folds. Where they have parted by more before they close in, the
-# motion was chaotic for a time: another solver's rounding may lead to another attractor.
-PARTING_TIMES, PARTED, CLOSED_IN, AS_ON_A_TORUS = 128, 30.0, 15.0, 7.0
-# How far neighbours are apart at first, relative to their size.
-APART = 1e-7
 # The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share since before it was
-# asked whether neighbours part, or in as many returns as starts about the torus have to come back in, if these are more. Else
+# asked whether neighbours part, or in as many returns as starts about the torus took to come back, if these are more. Else
 # the motions settle, each time for twice as long, so often at most: a set whose amplitude still drifts is not accepted. (What
 # shrinks slowly beats more than it shrinks in a short time, and may seem to stand still.)
 PEAK_OVER, SETTLED, SETTLE_TIMES = 32, 7.5e-4, 6
@@ -43,41 +52,167 @@ class Torus(NamedTuple):
     """A set of crossing states about which everything was seen to come back."""
 
     states: Float[np.ndarray, "k 2n"]  # weighted deviations
+    radius: float  # of the tube from which all comes back, relative to the states' mean size; half of it captures
     amplitude: float  # m/s
     period: float  # mean time between crossings, s
 
 
-def tori_among(
+def tori_from(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    cycles: list[list[Cycle]],
+    tori: list[list[Torus]],
+    report,
+    tubes=TUBES,
+) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
+    """The tori that motions from these states are on, by row; and the cycles of locked ones, with their rows. `cycles` and
+    `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
+    """
+    traced = _traced(maps, group, at, tori, max(TRACED, tubes[-1][1]))
+    _trace_locked(maps, group, traced)
+    found: dict[int, Torus] = {}
+    locked: list[tuple[int, Cycle]] = []
+    # A tube that is wider says more, where everything in it comes back.
+    for radius, count in tubes:
+        sets = [(row, path[:: max(len(path) // count, 1)]) for row, path in traced.items()]
+        sets = [(row, states) for row, states in sets if not _holds_one_of(maps, states, cycles[row], radius)]
+        if not sets:
+            break
+        new, of_locked = _attracting(maps, group, sets, cycles, radius, report)
+        found |= new
+        locked += of_locked
+        for row in {*new, *(row for row, _ in of_locked)}:
+            del traced[row]
+    return found, locked
+
+
+def reached(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    latest: Float[np.ndarray, "m 2n"],
+    known: list[tuple[Int[np.ndarray, " r"], Torus]],
+) -> dict[int, Torus]:
+    """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
+    `captures.captured`, `latest` tells which to ask, and their next crossings decide.
+    """
+    near = []
+    for rows, torus in known:
+        width = (0.5 * torus.radius + KNOWN_TO) * tube.mean_size(torus.states)
+        with np.errstate(invalid="ignore"):
+            near.append(rows[nearest(maps.weights * latest[rows], torus.states) <= width])
+    asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
+    if not len(asked):
+        return {}
+    _, paths = maps.path(group[asked], at.rows(asked), tube.HOME)
+    found: dict[int, Torus] = {}
+    for (_, torus), rows in zip(known, near, strict=True):
+        open_ = np.array([row for row in rows if row not in found], int)
+        if len(open_):
+            ends = maps.weights * np.moveaxis(paths[np.searchsorted(asked, open_)], 1, 0)
+            found |= dict.fromkeys(open_[_holds(torus, ends)].tolist(), torus)
+    return found
+
+
+def _holds(torus: Torus, ends: Float[np.ndarray, "h m 2n"]):
+    """Which motions a torus has captured, by their weighted crossing states."""
+    return tube.home(torus.states, ends, torus.radius)
+
+
+def _traced(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, tori: list[list[Torus]], count: int
+) -> dict[int, Float[np.ndarray, "_ 2n"]]:
+    """At least so many weighted states of those motions, by row, that may be on a torus that is none of the known ones."""
+    running, paths = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1]))
+    traced: dict[int, Float[np.ndarray, "_ 2n"]] = {}
+    for length in range(AT_A_TIME, LONGER + 1, AT_A_TIME):
+        if not len(running):
+            break
+        at, more = maps.path(group[running], at, AT_A_TIME)
+        more *= maps.weights
+        paths, left = np.concatenate([paths, more], axis=1), np.zeros(len(running), bool)
+        for k, (row, path, now) in enumerate(zip(running, paths, more, strict=True)):
+            if length >= count and _may_be_torus(path):
+                traced[int(row)] = path
+            else:
+                left[k] = _may_come_to_torus(now, tori[row])
+        running, at, paths = running[left], at.rows(left), paths[left]
+    return traced
+
+
+def _may_come_to_torus(path: Float[np.ndarray, "k 2n"], known: list[Torus]) -> bool:
+    """Whether a motion may be on the way to a torus that is none of the `known` ones, as far as its latest states tell."""
+    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path) or _repeats(path, CROSSINGS):
+        return False
+    new = not any(_holds(torus, path[-tube.HOME :, None]).item() for torus in known)
+    return new and abs(_growth(path)) <= np.log(CHANGES)
+
+
+def _growth(path: Float[np.ndarray, "k 2n"]) -> float:
+    """The logarithm of the growth of the extent of states from the first third of them to the last."""
+    third = len(path) // 3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.log(extent(path[-third:]) / extent(path[:third])))
+
+
+def _may_be_torus(path: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether a motion neither drifts nor shrinks nor repeats, as far as its weighted states on the section tell."""
+    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path) or _repeats(path, CROSSINGS):
+        return False
+    return not drifts(path, DRIFT) and abs(_growth(path)) <= SHRINKS
+
+
+def _repeats(path: Float[np.ndarray, "k 2n"], crossings: int) -> bool:
+    """Whether the last state is one of those up to so many crossings before."""
+    apart = np.linalg.norm(path[-1 - crossings : -1] - path[-1], axis=1)
+    return bool(np.min(apart) <= REPEATS * extent(path))
+
+
+def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will."""
+    states = path[:: len(path) // TUBES[0][1]]
+    return bool(np.median(nearest(states, states, others=True)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
+
+
+def _trace_locked(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Float[np.ndarray, "k 2n"]]) -> None:
+    """Puts the states of motions about it in the place of those of a motion that repeats."""
+    rows = [row for row, path in traced.items() if _in_clusters(path)]
+    if not rows:
+        return
+    count = tube.STARTS
+    own = np.repeat(group[rows], count)
+    starts = np.concatenate([about(maps, traced[row][:: len(traced[row]) // count] / maps.weights) for row in rows])
+    at = section_at(starts / maps.weights, maps.normal, maps.sliding[own])
+    _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // count)
+    for row, states in zip(rows, (maps.weights * paths).reshape(len(rows), TRACED, -1), strict=True):
+        if np.all(np.isfinite(states)):
+            traced[row] = states
+
+
+def _attracting(
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
     sets: list[tuple[int, Float[np.ndarray, "k 2n"]]],
     known: list[list[Cycle]],
-    within: int,
+    radius: float,
     report,
-    radius: float = tube.RADIUS,
-    end_radius: float = tube.RADIUS,
 ) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
-    """Which of these sets, each with the place of its group, are tori: those, by the place; and the cycles of those that are
-    locked. `known` are the cycles of each group; starts about a torus, in a tube of this relative
-    `radius`, have to be back `within` so many crossings, in the inner half of one of `end_radius`.
-    """
-    sets = [(k, states) for k, states in sets if not _holds_one_of(maps, states, known[k], radius)]
-    if not sets:
-        return {}, []
-    own = np.array([groups[k] for k, _ in sets])
-    back, last = _back(maps, own, [states for _, states in sets], within, report, radius, end_radius)
+    """Which of these sets, each with its row, are tori; and the cycles of those that are locked."""
+    own = np.array([groups[row] for row, _ in sets])
+    back, last, taken = _back(maps, own, [states for _, states in sets], radius, report)
     if not len(back):
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
     group, at = own[chosen // tube.STARTS], last.rows(chosen)
     peak, at = _highest(maps, group, at)
-    growth, period, later, path = _parting(maps, group, at)
+    growth, period, later, path = parting_rates(maps, group, at)
     growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
     lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
     closing_in = np.flatnonzero(growth < LOCKED)
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
-    of_group = {int(groups[k]): known[k] for k, _ in sets}
+    of_group = {int(groups[row]): known[row] for row, _ in sets}
     # One motion of each after the other, because most lead to the same cycle.
     for nominee in range(0, FURTHER, FURTHER // NOMINATED):
         asks = FURTHER * closing_in[~np.isin(closing_in, locked)] + nominee
@@ -91,14 +226,19 @@ def tori_among(
         kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
     if not len(kept):
         return {}, cycles
-    rows = (FURTHER * kept[:, None] + np.arange(FURTHER)).ravel()
-    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept], within)
+    rows = _of_each(kept)
+    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept], taken[back[kept]])
     tori = {}
     for k, mean, highest in zip(kept, period[kept], peak, strict=True):
-        place, states = sets[back[k]]
+        row, states = sets[back[k]]
         if np.isfinite(mean) and np.isfinite(highest):
-            tori[place] = Torus(states, float(highest), float(mean))
+            tori[row] = Torus(states.copy(), radius, float(highest), float(mean))
     return tori, cycles
+
+
+def _of_each(tori: Int[np.ndarray, " t"]) -> Int[np.ndarray, " s"]:
+    """The places of the motions on each of these tori."""
+    return (FURTHER * tori[:, None] + np.arange(FURTHER)).ravel()
 
 
 def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: list[Cycle], radius: float) -> bool:
@@ -107,37 +247,36 @@ def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: l
 
 
 def _back(
-    maps: ReturnMaps,
-    group: Int[np.ndarray, " s"],
-    sets: list[Float[np.ndarray, "k 2n"]],
-    within: int,
-    report,
-    radius,
-    end_radius,
-) -> tuple[Int[np.ndarray, " t"], Section]:
-    """About which of the sets all starts come back within so many crossings; and where the starts are then, set by set."""
+    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "k 2n"]], radius: float, report
+) -> tuple[Int[np.ndarray, " t"], Section, Int[np.ndarray, " s"]]:
+    """About which of the sets all starts come back; where the starts are then, set by set; and in how many crossings."""
     weights, count = maps.weights, tube.STARTS
     starts = [about(maps, states[:: len(states) // count] / weights, radius) for states in sets]
     own = np.repeat(group, count)
     last = section_at(np.concatenate(starts) / weights, maps.normal, maps.sliding[own])
-    running, back, ok = np.arange(len(own)), np.zeros(len(own), bool), np.ones(len(sets), bool)
+    back, ok, taken = np.zeros(len(own), bool), np.ones(len(sets), bool), np.zeros(len(sets), int)
     smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
-    for _ in range(0, within, KEPT):
-        report(0)
-        image = maps.returns(own[running], last.rows(running), KEPT)
-        last.put(running, image.at)
-        ends = weights * np.moveaxis(image.path, 1, 0)
-        # One that fades, or fails, does not come back.
-        with np.errstate(invalid="ignore"):
-            lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[running // count])
-        ok[running[lost] // count] = False
-        for k in np.unique(running // count):
-            mine = running // count == k
-            back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine], end_radius)
-        running = running[ok[running // count] & ~back[running]]
-        if not len(running):
-            break
-    return np.flatnonzero(np.all(back.reshape(-1, count), axis=1) & ok), last
+    place, of_set = np.arange(len(own)) % count, np.arange(len(own)) // count
+    for among in (place < FIRST, place >= FIRST):
+        running = np.flatnonzero(among & ok[of_set])
+        for crossed in range(KEPT, BACK_WITHIN + 1, KEPT):
+            if not len(running):
+                break
+            report(0)
+            image = maps.returns(own[running], last.rows(running), KEPT)
+            last.put(running, image.at)
+            ends = weights * np.moveaxis(image.path, 1, 0)
+            # One that fades, or fails, does not come back.
+            with np.errstate(invalid="ignore"):
+                lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[of_set[running]])
+            ok[of_set[running[lost]]] = False
+            for k in np.unique(of_set[running]):
+                mine = of_set[running] == k
+                back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine], CLOSER * radius)
+            taken[of_set[running]] = np.maximum(taken[of_set[running]], crossed)
+            running = running[ok[of_set[running]] & ~back[running]]
+        ok[of_set[among & ~back]] = False
+    return np.flatnonzero(ok), last, taken
 
 
 def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
@@ -158,46 +297,6 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
     )
 
 
-def _parting(maps: ReturnMaps, group, at: Section):
-    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; the mean
-    time of a return (s); where the motions are in the end; and their weighted states on the section.
-    """
-    beside, growth, time, paths = _beside(at), np.full(len(group), np.nan), np.zeros(len(group)), []
-    for _ in range(2):
-        growth, taken, at, beside, path = _parted(maps, group, at, beside)
-        time = time + taken
-        paths.append(path)
-    return growth, time / (2 * PARTING_OVER), at, np.concatenate(paths, axis=1)
-
-
-def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
-    """Neighbours, away from the equilibrium: that keeps what the section and the contact hold at zero."""
-    return at.y * (1 + APART)
-
-
-def _parted(maps: ReturnMaps, group, at: Section, beside):
-    """After `PARTING_OVER` returns: the logarithm of the growth of the distance to neighbours per return, the time taken (s),
-    where the motions are, neighbours in the direction in which those from before are by then, and the motions' weighted states
-    on the section.
-    """
-    weights = maps.weights
-    size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
-    apart = np.linalg.norm(weights * (beside - at.y), axis=1)
-    pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    path, time = [], np.zeros(len(group))
-    for _ in range(0, PARTING_OVER, KEPT):
-        image = maps.returns(np.tile(group, 2), pair, KEPT)
-        pair, time = image.at, time + image.time[: len(group)]
-        path.append(weights * image.path[: len(group)])
-    at, other = pair.rows(slice(None, len(group))), pair.rows(slice(len(group), None))
-    away = weights * (other.y - at.y)
-    distance = np.linalg.norm(away, axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        growth = np.log(distance[:, 0] / apart) / PARTING_OVER
-        beside = at.y + APART * size * away / distance / weights
-    return growth, time, at, beside, np.concatenate(path, axis=1)
-
-
 def _highest(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " t"], Section]:
     """The largest tangential speed (m/s) in the next `PEAK_OVER` returns of motions on tori, `FURTHER` on each; and where the
     motions are then.
@@ -207,59 +306,30 @@ def _highest(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " 
 
 
 def _settled_peak(
-    maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"], within: int
+    maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"], over: Int[np.ndarray, " t"]
 ) -> Float[np.ndarray, " t"]:
-    """The same once it has settled, from what it was `before`; not a number where it does not settle."""
+    """The same once it has settled, from what it was `before`; not a number where it does not settle, each time `over` twice as
+    many returns.
+    """
     peak, last = np.full(len(before), np.nan), before.copy()
-    running, over = np.arange(len(peak)), 2 * PARTING_OVER
-    if within > over:
-        at, over = maps.returns(group, at, within - over).at, within
+    running, further = np.arange(len(peak)), np.maximum(over - 2 * PARTING_OVER, 0)
+    over = 2 * PARTING_OVER + further
     for _ in range(SETTLE_TIMES):
-        rows = (FURTHER * running[:, None] + np.arange(FURTHER)).ravel()
+        going = running[further[running] > 0]
+        rows = _of_each(going)
+        if len(rows):
+            at.put(rows, maps.returns(group[rows], at.rows(rows), np.repeat(further[going], FURTHER)).at)
+        rows = _of_each(running)
         now, end = _highest(maps, group[rows], at.rows(rows))
+        at.put(rows, end)
         done = np.abs(now / last[running] - 1) <= SETTLED
         peak[running[done]], last[running] = now[done], now
-        open_ = ~done & np.isfinite(now)
-        running, left = running[open_], np.repeat(open_, FURTHER)
+        running = running[~done & np.isfinite(now)]
         if not len(running):
             break
         over *= 2
-        at.put(rows[left], maps.returns(group[rows[left]], end.rows(left), over).at)
+        further = over
     return peak
-
-
-class Followed(NamedTuple):
-    """What motions do in the long run."""
-
-    chaotic: Bool[np.ndarray, " m"]  # neighbours part exponentially, or did for long
-    closing_in: Bool[np.ndarray, " m"]  # neighbours close in exponentially, as they do on a cycle
-    at: Section  # where the motions are then
-
-
-def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Followed:
-    """Whether neighbours part or close in exponentially where motions that start here lead to: asked over thousands of returns,
-    because events may be rare. On a torus they do neither.
-    """
-    at = maps.returns(group, at, 1).at
-    _, _, at, beside, _ = _parted(maps, group, at, _beside(at))
-    running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
-    parted, least, most, furthest = np.zeros((4, len(group)))
-    for _ in range(PARTING_TIMES):
-        growth, _, at, beside, _ = _parted(maps, group[running], at, beside)
-        parted[running] += PARTING_OVER * growth
-        least, most = np.fmin(least, parted), np.fmax(most, parted)
-        last.put(running, at)
-        # Not a number is neither.
-        with np.errstate(invalid="ignore"):
-            furthest = np.fmax(furthest, parted - least)
-            left = ((parted - least < PARTED) & (most - parted < CLOSED_IN))[running]
-        running, at, beside = running[left], at.rows(left), beside[left]
-        if not len(running):
-            break
-    with np.errstate(invalid="ignore"):
-        closing_in = most - parted >= CLOSED_IN
-        chaotic = furthest >= np.where(closing_in, AS_ON_A_TORUS, PARTED)
-    return Followed(chaotic, closing_in & ~chaotic, last)
 
 
 def about(maps: ReturnMaps, states, radius: float = tube.RADIUS) -> Float[np.ndarray, "m 2n"]:
