@@ -1,6 +1,6 @@
 """Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed] [kernels] [start] [memory] [roofline]
+    python tests/measure_maps.py [errors] [table2] [map] [speed] [kernels] [axes] [start] [memory] [roofline]
 
 Each word picks one study; without any, all run (some minutes on two cores). The reference is `tests/oracle.py`.
 """
@@ -113,6 +113,33 @@ def kernels() -> None:
                 f"{points} × {points}: {walls[0]:.1f} s by kernels, {walls[1]:.1f} s without, ratio {walls[0] / walls[1]:.2f}; "
                 f"verdicts that differ: {np.sum(one != other)}, amplitudes by "
                 f"{np.max(np.where(one == other, np.abs(sizes[0] / sizes[1] - 1), 0.0)):.1e} at most",
+                flush=True,
+            )
+
+
+def axes() -> None:
+    """Warm maps over two parameters without kicks, where trajectories share nothing, against that over friction and kick: at the
+    README's belt speed, where many limit cycles are tori, and at 1 m/s, where they are periodic.
+    """
+    pairs = {
+        "μ × belt speed": {"mu": (0.05, 0.228), "belt_speed": (0.5, 5.0)},
+        "k1 × k2": {"k1": (0.8e5, 1.2e5), "k2": (0.8e5, 1.2e5)},
+        "m1 × c1": {"m1": (0.4, 0.7), "c1": (0.5, 2.0)},
+    }
+    for speed in (3.0, 1.0):
+        base = scene(belt_speed=speed)
+
+        def seconds(ranges: dict, base=base) -> tuple[float, str]:
+            values = {name: np.linspace(*ends, 64) for name, ends in ranges.items()}
+            begin = time.perf_counter()
+            m = fj.bistability_map(base, progress=False, **values)
+            return time.perf_counter() - begin, m.attrs["counts"]
+
+        seconds(MAP)  # compiled
+        for what, ranges in pairs.items():
+            one, (other, counts) = seconds(MAP)[0], seconds(ranges)
+            print(
+                f"{what}, 64 × 64, {speed:g} m/s: {other:.1f} s, friction × kick {one:.1f} s, ratio {other / one:.1f}; {counts}",
                 flush=True,
             )
 
@@ -258,6 +285,7 @@ if __name__ == "__main__":
         "map": map_,
         "speed": speed,
         "kernels": kernels,
+        "axes": axes,
         "start": start,
         "memory": memory,
         "roofline": roofline,
