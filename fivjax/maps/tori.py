@@ -70,20 +70,23 @@ def tori_from(
     `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
     """
     traced = _traced(maps, group, at, tori, max(TRACED, tubes[-1][1]))
-    _trace_locked(maps, group, traced)
+    around = _traced_around(maps, group, traced)
     found: dict[int, Torus] = {}
     locked: list[tuple[int, Cycle]] = []
     # A tube that is wider says more, where everything in it comes back.
     for radius, count in tubes:
-        sets = [(row, path[:: max(len(path) // count, 1)]) for row, path in traced.items()]
-        sets = [(row, states) for row, states in sets if not _holds_one_of(maps, states, cycles[row], radius)]
-        if not sets:
-            break
-        new, of_locked = _attracting(maps, group, sets, cycles, radius, report)
-        found |= new
-        locked += of_locked
-        for row in {*new, *(row for row, _ in of_locked)}:
-            del traced[row]
+        for paths in (traced | around, {row: traced[row] for row in around}):
+            open_ = {row: path for row, path in paths.items() if row in traced}
+            sets = [(row, path[:: max(len(path) // count, 1)]) for row, path in open_.items()]
+            sets = [(row, states) for row, states in sets if not _holds_one_of(maps, states, cycles[row], radius)]
+            if not sets:
+                continue
+            new, of_locked = _attracting(maps, group, sets, cycles, radius, report)
+            found |= new
+            locked += of_locked
+            for row in {*new, *(row for row, _ in of_locked)}:
+                del traced[row]
+                around.pop(row, None)
     return found, locked
 
 
@@ -175,19 +178,20 @@ def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
     return bool(np.median(nearest(states, states, others=True)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
 
 
-def _trace_locked(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Float[np.ndarray, "k 2n"]]) -> None:
-    """Puts the states of motions about it in the place of those of a motion that repeats."""
+def _traced_around(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Float[np.ndarray, "_ 2n"]]
+) -> dict[int, Float[np.ndarray, "_ 2n"]]:
+    """The states of motions about those that are in clusters."""
     rows = [row for row, path in traced.items() if _in_clusters(path)]
     if not rows:
-        return
+        return {}
     count = tube.STARTS
     own = np.repeat(group[rows], count)
     starts = np.concatenate([about(maps, traced[row][:: len(traced[row]) // count] / maps.weights) for row in rows])
     at = section_at(starts / maps.weights, maps.normal, maps.sliding[own])
     _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // count)
-    for row, states in zip(rows, (maps.weights * paths).reshape(len(rows), TRACED, -1), strict=True):
-        if np.all(np.isfinite(states)):
-            traced[row] = states
+    states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
+    return {row: whole for row, whole in zip(rows, states, strict=True) if np.all(np.isfinite(whole))}
 
 
 def _attracting(
