@@ -1,4 +1,4 @@
-"""Attractors of a map: what ensembles nominate, what is computed and checked of it, and which trajectories it captures."""
+"""Attractors of a map: what motions trace, what is computed and checked of it, and which trajectories it captures."""
 
 import numpy as np
 import pytest

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from test_propagators import SEEDS, at_rest, marched, random_scene
+from test_propagators import SEEDS, at_rest, light_mass, lowest_later, marched, random_motion, touches_at
 from test_simulate import CASES, scene_of
 
 import fivjax as fj
@@ -125,12 +125,7 @@ def test_states_and_events_agree_with_the_oracle(name):
 @pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
 def test_any_structure_moves_as_by_the_series_stepper(seed):
     """Two to five coordinates, static friction above dynamic, rebounds, belts both ways: event by event."""
-    rng = np.random.default_rng(seed)
-    n = 2 + seed % 4
-    scene = random_scene(rng, n)
-    y0 = np.zeros(2 * n)
-    y0[scene.structure.normal] = 0.05
-    y0[n:] = 3 * rng.normal(size=n)
+    scene, y0 = random_motion(seed)
     fast, fast_events, _ = by_kernel(scene, 2.0, y0)
     exact, exact_events = marched(fj.EventExact(), scene, 2.0, y0)
     assert [status for _, status in fast_events] == [status for _, status in exact_events]
@@ -142,20 +137,15 @@ def test_any_structure_moves_as_by_the_series_stepper(seed):
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-9])
 def test_a_touch_between_two_samples_is_found_and_a_miss_is_none(depth):
     """A detached mass whose lowest point lies between two samples, a little below the belt or a little above it."""
-    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
-    scene = fj.Scene(structure, fj.Coulomb(0.1, 0.1), 1.0, fj.Pulse(1.0, 1.0, duration=1e3), restitution=0.0)
+    scene = light_mass()
     with jax.enable_x64(True):
         interval = float(prepared(scene, jnp.zeros(4))[1].interval)
     lowest_at = 4.37 * interval
     for touches, amplitude in ((True, 1 + depth), (False, 1 - depth)):
-        # A load that lifts by 1 N holds the rest position 1 m above the belt: the height is 1 - amplitude cos(t - lowest_at).
-        gap, rate = 1 - amplitude * np.cos(lowest_at), -amplitude * np.sin(lowest_at)
-        y0, flying = [0.0, gap, 0.0, rate], (float(Status.DETACH), 1.0)
-        _, _, first = by_kernel(scene, lowest_at + 2 * interval, y0, flying)
+        flying = (float(Status.DETACH), 1.0)
+        _, _, first = by_kernel(scene, lowest_at + 2 * interval, lowest_later(amplitude, lowest_at), flying)
         if touches:
-            # Two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the root of their depth.
-            instant = lowest_at - np.arccos(1 / amplitude)
-            assert first == pytest.approx(instant, abs=1e-15 / depth**0.5 + 1e-14)
+            assert first == touches_at(amplitude, lowest_at)
         else:
             assert first > lowest_at
 

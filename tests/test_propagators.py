@@ -87,8 +87,12 @@ def test_rises_within_an_advance_are_where_the_series_stepper_ends_its_own():
     assert again.min() < 1e-8
 
 
-def random_scene(rng: np.random.Generator, n: int) -> fj.Scene:
-    """Any symmetric structure of n coordinates, pressed on firmly enough to touch, on a belt that runs either way."""
+def random_motion(seed: int) -> tuple[fj.Scene, np.ndarray]:
+    """Any symmetric structure of two to five coordinates, pressed on firmly enough to touch, on a belt that runs either way; and a
+    state in the air.
+    """
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 4
 
     def definite(scale):
         root = rng.normal(size=(n, n))
@@ -98,13 +102,36 @@ def random_scene(rng: np.random.Generator, n: int) -> fj.Scene:
     normal, tangential = rng.permutation(n)[:2]
     direction = np.where(np.arange(n) == normal, -1.0, 0.3 * rng.normal(size=n))
     mu = rng.uniform(0.05, 0.6)
-    return fj.Scene(
+    scene = fj.Scene(
         fj.Structure(mass, definite(0.3), definite(1e3), direction, tangential=int(tangential), normal=int(normal)),
         fj.Coulomb(mu, mu * rng.uniform(1.0, 1.5)),
         belt_speed=rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 1.0),
         load=fj.Pulse(50.0, rng.uniform(0.0, 4.0), duration=0.3),
         restitution=rng.choice([0.0, 0.4]),
     )
+    y0 = np.zeros(2 * n)
+    y0[normal] = 0.05
+    y0[n:] = 3 * rng.normal(size=n)
+    return scene, y0
+
+
+def light_mass() -> fj.Scene:
+    """A mass that a load holds 1 m above the belt: in the air it swings about there with one radian per second."""
+    # Contact, friction and load of the kind that a random structure of two coordinates has been compiled with.
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    return fj.Scene(structure, fj.Coulomb(0.1, 0.1), 1.0, fj.Pulse(1.0, 1.0, duration=1e3), restitution=0.0)
+
+
+def lowest_later(amplitude: float, t: float) -> np.ndarray:
+    """The state from which that mass is lowest at `t`, by its amplitude (m) below the rest position."""
+    return np.array([0.0, 1 - amplitude * np.cos(t), 0.0, -amplitude * np.sin(t)])
+
+
+def touches_at(amplitude: float, t: float):
+    """When it touches the belt on the way there: two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the
+    root of their depth.
+    """
+    return pytest.approx(t - np.arccos(1 / amplitude), abs=1e-15 / (amplitude - 1) ** 0.5 + 1e-14)
 
 
 # Each number of coordinates, and each choice of two for the contact, is compiled anew: these are of one kind.
@@ -114,12 +141,7 @@ SEEDS = (0, 12, 28)
 @pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
 def test_any_structure_moves_as_by_the_series_stepper(seed):
     """Two to five coordinates, static friction above dynamic, rebounds, belts both ways: the same events, the same end."""
-    rng = np.random.default_rng(seed)
-    n = 2 + seed % 4
-    scene = random_scene(rng, n)
-    y0 = np.zeros(2 * n)
-    y0[scene.structure.normal] = 0.05
-    y0[n:] = 3 * rng.normal(size=n)
+    scene, y0 = random_motion(seed)
     fast, fast_events = marched(Windowed(), scene, 2.0, y0)
     exact, exact_events = marched(fj.EventExact(), scene, 2.0, y0)
     assert [status for _, status in fast_events] == [status for _, status in exact_events]
@@ -131,26 +153,17 @@ def test_any_structure_moves_as_by_the_series_stepper(seed):
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-9])
 def test_a_touch_between_two_samples_is_found_and_a_miss_is_none(depth):
     """A detached mass whose lowest point lies between two samples, a little below the belt or a little above it."""
-    # Contact, friction and load of the kind that the structure of two coordinates above has been compiled with.
-    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
-    scene = fj.Scene(structure, fj.Coulomb(0.1, 0.1), 1.0, fj.Pulse(1.0, 1.0, duration=1e3), restitution=0.0)
-    method, start = Windowed(), jnp.zeros(())
+    scene, method, start = light_mass(), Windowed(), jnp.zeros(())
     with jax.enable_x64(True):
         table, _ = begun(method, scene, jnp.zeros(4))
         contact = Contact(jnp.asarray(Status.DETACH, jnp.int32), jnp.asarray(1.0))
         interval = float(table.interval)
         lowest_at = 4.37 * interval
         for touches, amplitude in ((True, 1 + depth), (False, 1 - depth)):
-            # A load that lifts by 1 N holds the rest position 1 m above the belt: the height is
-            # 1 - amplitude cos(t - lowest_at).
-            gap, rate = 1 - amplitude * np.cos(lowest_at), -amplitude * np.sin(lowest_at)
-            y = jnp.array([0.0, gap, 0.0, rate])
+            y = jnp.asarray(lowest_later(amplitude, lowest_at))
             after, _ = advanced(method, table, scene, contact, y, start, jnp.asarray(8 * interval))
             if touches:
-                # Two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the root of their depth.
-                assert float(after.h) == pytest.approx(
-                    lowest_at - np.arccos(1 / amplitude), abs=1e-15 / depth**0.5 + 1e-14
-                )
+                assert float(after.h) == touches_at(amplitude, lowest_at)
                 assert float(after.y[1]) == 0.0
             else:
                 assert float(after.h) > lowest_at and float(after.y[1]) > 0

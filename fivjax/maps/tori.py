@@ -136,10 +136,12 @@ def _traced(
         more *= maps.weights
         paths, left = np.concatenate([paths, more], axis=1), np.zeros(len(running), bool)
         for k, (row, path, now) in enumerate(zip(running, paths, more, strict=True)):
+            if not _may_come_to_torus(now, tori[row]):
+                continue
             if length >= count and _may_be_torus(path):
                 traced[int(row)] = path
             else:
-                left[k] = _may_come_to_torus(now, tori[row])
+                left[k] = True
         running, at, paths = running[left], at.rows(left), paths[left]
     return traced
 
