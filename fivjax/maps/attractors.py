@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
-from .captures import Cycle, captured, distinct, is_new, stable_cycles
+from .captures import CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
 from .flattened import Flattened
 from .following import begun, follow
 from .kernels import Kernels
@@ -32,6 +32,13 @@ class Attractors(NamedTuple):
 
     cycles: list[Cycle]
     tori: list[Torus]
+
+    @property
+    def locked(self) -> bool:
+        """Whether there is a cycle of many crossings, on a locked torus: motions take long to close in on it, and nothing else
+        need be sought for them.
+        """
+        return any(len(cycle.points) > CROSSINGS for cycle in self.cycles)
 
     def copy(self) -> "Attractors":
         return Attractors(list(self.cycles), list(self.tori))
@@ -96,6 +103,7 @@ def _add_tori(maps: ReturnMaps, group, now, of_group: dict[int, Attractors], rep
         report(0)
         add_tori(maps, group[picked], at.rows(picked), of_group, report)
         usable[picked] = False
+        usable &= ~np.isin(group, [g for g, one in of_group.items() if one.locked])
         usable[list(come_to(maps, group, at, latest, usable, of_group))] = False
 
 

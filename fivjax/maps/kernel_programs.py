@@ -9,7 +9,6 @@ from ..cycles.section_map import MOST_TO_CROSSING
 from ..foundation.warp_library import warp
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
-from .windowed_returns import KEPT
 
 
 class Programs(NamedTuple):
@@ -72,7 +71,7 @@ def programs(form: Form) -> Programs:
             else:
                 left -= after.h
             if after.crossed > 0:
-                path[i, passed % KEPT] = y
+                path[i, passed % path.shape[1]] = y
                 passed += 1
             count += 1
             if not wp.isfinite(after.h):

@@ -55,14 +55,14 @@ class Kernels:
         }
         load(self.programs.module, self.devices)
 
-    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool):
-        """What `moved_in_windows` gives, for motions from these states of the section."""
+    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int = KEPT):
+        """What `moved_in_windows` gives, for motions from these states of the section; with the last `kept` crossings."""
         count, size = y.shape
         wp, state = self.wp, self.types.state
         crossings = np.array(np.broadcast_to(crossings, count), np.int32)
         mode, y = np.stack([status, direction], axis=1).astype(float), np.array(y, float)
         (events, crossed), (time, peak) = np.zeros((2, count), np.int32), np.zeros((2, count))
-        path, longest = np.full((count, KEPT, size), np.nan), self.longest[group] * crossings
+        path, longest = np.full((count, kept, size), np.nan), self.longest[group] * crossings
         given = [(group.astype(np.int32), wp.int32), (crossings, wp.int32), (longest, wp.float64)]
         moved = [(y, state), (mode, self.types.mode), (events, wp.int32), (crossed, wp.int32), (time, wp.float64)]
         each = int(STEPS_TO_CROSSING * np.mean(crossings)) if count else 0
@@ -70,7 +70,7 @@ class Kernels:
         arrived = (crossed >= crossings) & np.all(np.isfinite(y), axis=1)
         y[~arrived], peak[~arrived] = np.nan, np.nan
         # The states were kept in a ring; the newest comes last.
-        path = np.take_along_axis(path, ((crossed[:, None] + np.arange(KEPT)) % KEPT)[..., None], axis=1)
+        path = np.take_along_axis(path, ((crossed[:, None] + np.arange(kept)) % kept)[..., None], axis=1)
         return y, mode[:, 0].astype(np.int32), mode[:, 1], events, time, path, peak
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> Flattened:

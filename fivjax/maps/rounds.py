@@ -167,9 +167,7 @@ class Basins:
             led_to_one[rows] = True
             if add_cycle(self.maps, self.known[g], cycle):
                 self._wait_for(g, [cycle])
-        # Motions on a locked torus take long to close in on its cycle: nothing else need be sought for them.
-        locked = [any(len(cycle.points) > CROSSINGS for cycle in self.known[g].cycles) for g in group[picked]]
-        alone = np.flatnonzero(~led_to_one & ~np.array(locked))
+        alone = np.flatnonzero(~led_to_one & ~np.array([self.known[g].locked for g in group[picked]]))
         alone = alone[np.unique(group[picked[alone]], return_index=True)[1]]
         for start in range(0, len(alone), ENSEMBLES):
             part = alone[start : start + ENSEMBLES]

@@ -93,6 +93,9 @@ class ReturnMaps:
 
     def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
         """The next `count` states on the section from each row: the last one with its contact mode; and all of them."""
+        if self.kernels is not None:
+            *end, _, _, path, _ = self.kernels.returns(group, *at, count, False, kept=count)
+            return Section(*end), path
         states = []
         while count > 0:
             part = min(count, KEPT)

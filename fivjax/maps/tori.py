@@ -75,7 +75,9 @@ def tori_from(
     locked: list[tuple[int, Cycle]] = []
     # A tube that is wider says more, where everything in it comes back.
     for radius, count in tubes:
-        for paths in (traced | around, {row: traced[row] for row in around}):
+        # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
+        own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
+        for paths in (traced | around, *own):
             open_ = {row: path for row, path in paths.items() if row in traced}
             sets = [(row, path[:: max(len(path) // count, 1)]) for row, path in open_.items()]
             sets = [(row, states) for row, states in sets if not _holds_one_of(maps, states, cycles[row], radius)]
@@ -219,12 +221,14 @@ def _attracting(
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
     of_group = {int(groups[row]): known[row] for row, _ in sets}
-    # One motion of each after the other, because most lead to the same cycle.
-    for nominee in range(0, FURTHER, FURTHER // NOMINATED):
-        asks = FURTHER * closing_in[~np.isin(closing_in, locked)] + nominee
+    # One motion of each after the other, because most lead to the same cycle. What is no torus for sure has no better
+    # attractor than a cycle with a narrow neighbourhood.
+    for nominee, settled in (*((k, False) for k in range(0, FURTHER, FURTHER // NOMINATED)), (0, True)):
+        left = closing_in[~np.isin(closing_in, locked)]
+        asks = FURTHER * (left[~lasting[left]] if settled else left) + nominee
         if not len(asks):
-            break
-        for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS):
+            continue
+        for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS, settled):
             of_torus = asks[rows] // FURTHER
             cycles.append((sets[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
