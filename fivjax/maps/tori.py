@@ -41,11 +41,11 @@ LOCKED = -0.01
 # On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
 # within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
 SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
-# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share since before it was
-# asked whether neighbours part, or in as many returns as starts about the torus took to come back, if these are more. Else
-# the motions settle, each time for twice as long, so often at most: a set whose amplitude still drifts is not accepted. (What
-# shrinks slowly beats more than it shrinks in a short time, and may seem to stand still.)
-PEAK_OVER, SETTLED, SETTLE_TIMES = 32, 7.5e-4, 6
+# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share in so many returns, or
+# in as many as starts about the torus took to come back, if these are more. Else the motions settle, each time for twice as
+# long, so often at most: a set whose amplitude still drifts is not accepted. (What shrinks slowly beats more than it shrinks in
+# a short time, and may seem to stand still; and the highest beats may be rare.)
+PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 128, 384, 7.5e-4, 6
 
 
 class Torus(NamedTuple):
@@ -322,8 +322,8 @@ def _settled_peak(
     many returns.
     """
     peak, last = np.full(len(before), np.nan), before.copy()
-    running, further = np.arange(len(peak)), np.maximum(over - 2 * PARTING_OVER, 0)
-    over = 2 * PARTING_OVER + further
+    over = np.maximum(over, SETTLE_OVER)
+    running, further = np.arange(len(peak)), over - 2 * PARTING_OVER
     for _ in range(SETTLE_TIMES):
         going = running[further[running] > 0]
         rows = _of_each(going)
