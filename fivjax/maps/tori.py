@@ -41,8 +41,8 @@ LOCKED = -0.01
 # On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
 # within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
 SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
-# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share in so many returns, or
-# in as many as starts about the torus took to come back, if these are more. Else the motions settle, each time for twice as
+# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share in so many returns,
+# or in as many as starts about the torus took to come back, if these are more. Else the motions settle, each time for twice as
 # long, so often at most: a set whose amplitude still drifts is not accepted. (What shrinks slowly beats more than it shrinks in
 # a short time, and may seem to stand still; and the highest beats may be rare.)
 PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 128, 384, 7.5e-4, 6
