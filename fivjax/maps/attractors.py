@@ -82,7 +82,7 @@ def _left_by_cycles(
     usable = moving & has_crossed(now)
     captured_by = come_to(maps, group, at, latest, usable, of_group)
     usable[list(captured_by)] = moving[list(captured_by)] = False
-    picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), group, usable)
+    picked = distinct(maps.weights * latest, group, usable)
     if len(picked):
         known = {g: one.cycles for g, one in of_group.items()}
         new = stable_cycles(maps, group[picked], at.rows(picked), known, nearly=nearly)
@@ -97,7 +97,7 @@ def _add_tori(maps: ReturnMaps, group, now, of_group: dict[int, Attractors], rep
     """Adds the tori that members are on, and the cycles of those that are locked."""
     latest, at, usable = np.array(now.crossing), section_of(now), has_crossed(now)
     for _ in range(TRIED):
-        picked = distinct(maps.weights * np.where(usable[:, None], latest, 0.0), group, usable, most=1)
+        picked = distinct(maps.weights * latest, group, usable, most=1)
         if not len(picked):
             break
         report(0)
@@ -148,9 +148,7 @@ def come_to(
         return {}
     rows = rows[np.argsort(group[rows], kind="stable")]
     which, first = np.unique(group[rows], return_index=True)
-    own = [
-        (part, of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True) if int(g) in of_group
-    ]
+    own = [(part, of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True)]
     cycles = [(part, cycle) for part, known in own for cycle in known.cycles]
     place = captured(maps, group, at, latest, cycles)
     found: dict[int, Cycle | Torus] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}

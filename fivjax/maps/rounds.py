@@ -158,8 +158,8 @@ class Basins:
         asks = has_crossed(now)
         if not np.any(asks) or self.maps is None:
             return
-        group, latest = self.group[pending], np.array(now.crossing)
-        picked = distinct(self.maps.weights * np.where(asks[:, None], latest, 0.0), group, asks)
+        group = self.group[pending]
+        picked = distinct(self.maps.weights * np.array(now.crossing), group, asks)
         led_to_one = np.zeros(len(picked), bool)
         at = section_of(now).rows(picked)
         known = {g: one.cycles for g, one in self.known.items()}

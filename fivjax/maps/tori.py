@@ -150,7 +150,7 @@ def _traced(
 
 def _may_come_to_torus(path: Float[np.ndarray, "k 2n"], known: list[Torus]) -> bool:
     """Whether a motion may be on the way to a torus that is none of the `known` ones, as far as its latest states tell."""
-    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path) or _repeats(path, CROSSINGS):
+    if not _goes_on(path):
         return False
     new = not any(_holds(torus, path[-tube.HOME :, None]).item() for torus in known)
     return new and abs(_growth(path)) <= np.log(CHANGES)
@@ -165,15 +165,15 @@ def _growth(path: Float[np.ndarray, "k 2n"]) -> float:
 
 def _may_be_torus(path: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether a motion neither drifts nor shrinks nor repeats, as far as its weighted states on the section tell."""
-    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path) or _repeats(path, CROSSINGS):
+    return _goes_on(path) and not drifts(path, DRIFT) and abs(_growth(path)) <= SHRINKS
+
+
+def _goes_on(path: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether a motion goes on, and the last of its states is none of those up to `CROSSINGS` before."""
+    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path):
         return False
-    return not drifts(path, DRIFT) and abs(_growth(path)) <= SHRINKS
-
-
-def _repeats(path: Float[np.ndarray, "k 2n"], crossings: int) -> bool:
-    """Whether the last state is one of those up to so many crossings before."""
-    apart = np.linalg.norm(path[-1 - crossings : -1] - path[-1], axis=1)
-    return bool(np.min(apart) <= REPEATS * extent(path))
+    apart = np.linalg.norm(path[-1 - CROSSINGS : -1] - path[-1], axis=1)
+    return bool(np.min(apart) > REPEATS * extent(path))
 
 
 def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
@@ -189,11 +189,8 @@ def _traced_around(
     rows = [row for row, path in traced.items() if _in_clusters(path)]
     if not rows:
         return {}
-    count = tube.STARTS
-    own = np.repeat(group[rows], count)
-    starts = np.concatenate([about(maps, traced[row][:: len(traced[row]) // count] / maps.weights) for row in rows])
-    at = section_at(starts / maps.weights, maps.normal, maps.sliding[own])
-    _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // count)
+    own, at = _starts(maps, group[rows], [traced[row] for row in rows], tube.RADIUS)
+    _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // tube.STARTS)
     states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
     return {row: whole for row, whole in zip(rows, states, strict=True) if np.all(np.isfinite(whole))}
 
@@ -261,9 +258,7 @@ def _back(
 ) -> tuple[Int[np.ndarray, " t"], Section, Int[np.ndarray, " s"]]:
     """About which of the sets all starts come back; where the starts are then, set by set; and in how many crossings."""
     weights, count = maps.weights, tube.STARTS
-    starts = [about(maps, states[:: len(states) // count] / weights, radius) for states in sets]
-    own = np.repeat(group, count)
-    last = section_at(np.concatenate(starts) / weights, maps.normal, maps.sliding[own])
+    own, last = _starts(maps, group, sets, radius)
     back, ok, taken = np.zeros(len(own), bool), np.ones(len(sets), bool), np.zeros(len(sets), int)
     smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
     place, of_set = np.arange(len(own)) % count, np.arange(len(own)) // count
@@ -340,6 +335,15 @@ def _settled_peak(
         over *= 2
         further = over
     return peak
+
+
+def _starts(
+    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "_ 2n"]], radius: float
+) -> tuple[Int[np.ndarray, " m"], Section]:
+    """The starts about each of these sets, with their groups."""
+    own = np.repeat(group, tube.STARTS)
+    starts = [about(maps, states[:: len(states) // tube.STARTS] / maps.weights, radius) for states in sets]
+    return own, section_at(np.concatenate(starts) / maps.weights, maps.normal, maps.sliding[own])
 
 
 def about(maps: ReturnMaps, states, radius: float = tube.RADIUS) -> Float[np.ndarray, "m 2n"]:
