@@ -26,7 +26,7 @@ from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
 from .sharing import Batch
-from .windowed_returns import KEPT, SIDE_BY_SIDE, moved_in_windows, no_path, with_newest
+from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, many_of_each, moved_in_windows, no_path, with_newest
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -170,7 +170,8 @@ class ReturnMaps:
         if self.kernels is not None:
             return self.kernels.returns(group, *at, crossings, peaks)
         rows = _rows(at, crossings, np.full(len(at.y), peaks))
-        return in_blocks(moved_in_windows, self.windows, group, rows, SIDE_BY_SIDE, self.pool, size=self.block).tree
+        width, size = (SIDE_BY_SIDE, self.block) if many_of_each(group) else (1, FEW)
+        return in_blocks(moved_in_windows, self.windows, group, rows, width, self.pool, size=size).tree
 
     def _exactly(self, program, size: int, group, at: Section, crossings):
         return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree

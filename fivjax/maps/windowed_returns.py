@@ -4,7 +4,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact
 from ..cycles.section_map import MOST_TO_CROSSING
@@ -12,10 +13,17 @@ from ..foundation.kept_programs import kept
 from ..steppers.windowed import Windowed
 from .flattened import Flattened, flatten
 
-# Number of motions of one group in a row.
-SIDE_BY_SIDE = 8
+# Number of motions of one group in a row. Where groups have few motions each, most of such rows were padding: then there is one
+# in a row, and so many rows in a block.
+SIDE_BY_SIDE, FEW = 8, 8
 # Number of states on the section that are kept of a motion, the last ones.
 KEPT = 16
+
+
+def many_of_each(group: Int[np.ndarray, " m"]) -> bool:
+    """Whether these motions' groups have so many of them that rows of several are not mostly padding."""
+    _, count = np.unique(group, return_counts=True)
+    return bool(SIDE_BY_SIDE * np.sum(-(-count // SIDE_BY_SIDE)) <= 2 * len(group))
 
 
 def no_path(y: Float[Array, "*rows state"]) -> Float[Array, "*rows kept state"]:
