@@ -209,6 +209,8 @@ def everything(x, y):
         jnp.clip(y, -1.0, 1.0) ** 3 / (1.0 + jnp.log1p(0.0) + x[0] ** 2),
         (jnp.floor(y).astype(jnp.int32) * 2 != 4).astype(float),
         jnp.where(jnp.array([True, False, True]), y, -y)[np.array([2, 0])],
+        jnp.stack([y, -y], axis=1).T.reshape(3, 2)[:, ::2].ravel(),
+        *jnp.split(jnp.outer(y[:2], jnp.ones(2)).ravel(), [1]),
     ]
     return jnp.concatenate(parts)
 

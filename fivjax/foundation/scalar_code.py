@@ -5,8 +5,8 @@ is carried out on their names, and loops are not known: this is for functions of
 one point.
 """
 
-import itertools
 from collections.abc import Callable
+from itertools import count, repeat
 
 import jax
 import jax.numpy as jnp
@@ -43,23 +43,20 @@ BY_NUMBER = {
     "copy_p": "{}",
     "stop_gradient": "{}",
 }
-# Primitives that move numbers without computing anything.
-MOVING = {
-    "reshape",
-    "broadcast_in_dim",
-    "squeeze",
-    "slice",
-    "transpose",
-    "rev",
-    "concatenate",
-    "stack",
-    "gather",
-    "dynamic_slice",
-    "dynamic_update_slice",
-    "scatter",
-    "expand_dims",
-    "split",
+# Primitives that move numbers without computing anything. (Done by NumPy: JAX compiles a program for each size.)
+MOVING: dict[str, Callable] = {
+    "reshape": lambda part, p: part.reshape(p["new_sizes"]),
+    "squeeze": lambda part, p: np.squeeze(part, tuple(p["dimensions"])),
+    "slice": lambda part, p: part[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or repeat(1)))],
+    "transpose": lambda part, p: np.transpose(part, p["permutation"]),
+    "rev": lambda part, p: np.flip(part, p["dimensions"]),
+    "broadcast_in_dim": lambda part, p: _broadcast(part, p["shape"], p["broadcast_dimensions"]),
+    "split": lambda part, p: np.split(part, np.cumsum(p["sizes"])[:-1], p["axis"]),
+    "concatenate": lambda *parts: np.concatenate(parts[:-1], parts[-1]["dimension"]),
+    "stack": lambda *parts: np.stack(parts[:-1], parts[-1]["axis"]),
 }
+# The same, with operands that say where; and how many operands are moved.
+MOVING_TO_PLACES = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2, "scatter": 3}
 # Reductions, by the primitive that they repeat.
 FOLDED = {
     "reduce_sum": "add",
@@ -96,7 +93,7 @@ class _Writer:
 
     def __init__(self):
         self.lines: list[str] = []
-        self.count = itertools.count()
+        self.count = count()
 
     def run(self, jaxpr: Jaxpr, consts, given) -> list[np.ndarray]:
         """The results of a traced function."""
@@ -118,6 +115,9 @@ class _Writer:
         if within is not None:
             return self.run(within.jaxpr, within.consts, operands)
         kinds = [variable.aval.dtype for variable in equation.outvars]
+        if name in MOVING:
+            found = MOVING[name](*operands, equation.params)
+            return list(found) if primitive.multiple_results else [found]
         if all(map(_is_known, operands)):
             values = [
                 jnp.asarray(np.array(part.tolist(), atom.aval.dtype).reshape(part.shape))
@@ -127,8 +127,8 @@ class _Writer:
             return [_of_numbers(part) for part in (found if primitive.multiple_results else [found])]
         if name == "select_n" and len(operands) == 3 and _is_known(operands[0]):
             return [np.where(operands[0].astype(bool), operands[2], operands[1])]
-        if name in MOVING:
-            return _moved(equation, operands)
+        if name in MOVING_TO_PLACES:
+            return [_moved_to_places(equation, operands)]
         if name == "scatter-add":
             return [self.added_at(equation, operands)]
         if name in FOLDED:
@@ -213,27 +213,29 @@ def _within(params) -> ClosedJaxpr | None:
     )
 
 
-def _moved(equation, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Where the entries of the operands go; operands that are numbers are places to take them from, unless nothing else is."""
+def _broadcast(part: np.ndarray, shape: tuple[int, ...], along: tuple[int, ...]) -> np.ndarray:
+    """The array with its axes at these places among those of the shape."""
+    own = [1] * len(shape)
+    for axis, size in zip(along, part.shape, strict=True):
+        own[axis] = size
+    return np.broadcast_to(part.reshape(own), shape)
+
+
+def _moved_to_places(equation, operands: list[np.ndarray]) -> np.ndarray:
+    """Where the entries of operands go: the numbers of entries are moved in their stead."""
     name = equation.primitive.name
-    carried = (
-        len(operands) if name in ("concatenate", "stack") else {"scatter": 3, "dynamic_update_slice": 2}.get(name, 1)
-    )
-    places, entries = [], []
+    given, entries = [], []
     for position, (operand, atom) in enumerate(zip(operands, equation.invars, strict=True)):
-        is_place = (name == "scatter" and position == 1) or position >= carried
-        if is_place:
-            places.append(jnp.asarray(np.array(operand.tolist(), atom.aval.dtype).reshape(operand.shape)))
+        if (name == "scatter" and position == 1) or position >= MOVING_TO_PLACES[name]:
+            given.append(jnp.asarray(np.array(operand.tolist(), atom.aval.dtype).reshape(operand.shape)))
         else:
-            places.append(jnp.arange(len(entries), len(entries) + operand.size).reshape(operand.shape))
+            given.append(jnp.arange(len(entries), len(entries) + operand.size).reshape(operand.shape))
             entries += list(operand.ravel())
     params = dict(equation.params)
     if "fill_value" in params:
         params["fill_value"] = None
-    found = equation.primitive.bind(*places, **params)
-    every = np.array([*entries, None], object)
-    results = found if equation.primitive.multiple_results else [found]
-    return [np.asarray(every[np.asarray(part)], object) for part in results]
+    found = equation.primitive.bind(*given, **params)
+    return np.asarray(np.array([*entries, None], object)[np.asarray(found)], object)
 
 
 def _of_numbers(value) -> np.ndarray:

@@ -199,14 +199,34 @@ def _same_mode(status, direction, other, other_direction):
 def directions(dimension: int) -> Float[np.ndarray, "d f"]:
     """Directions that fill the unit sphere evenly, in opposite pairs, including the axes."""
     from scipy.special import ndtri
-    from scipy.stats import qmc
 
     axes = np.eye(dimension)
     count = max(DIRECTIONS // 2 - dimension, 1)
-    # Halton points without scrambling are the same every time; the first of them is a corner and is left out.
-    inside = qmc.Halton(dimension, scramble=False).random(count + 1)[1:]
+    inside = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in _primes(dimension)], axis=1)
     spread = ndtri(inside)
     lengths = np.linalg.norm(spread, axis=1, keepdims=True)
     spread = np.where(lengths > 0, spread / np.where(lengths > 0, lengths, 1.0), axes[:1])
     half = np.concatenate([axes, spread])
     return np.concatenate([half, -half])
+
+
+def _radical_inverse(numbers: Int[np.ndarray, " m"], base: int) -> Float[np.ndarray, " m"]:
+    """The digits of these numbers behind the point in opposite order: in prime bases the coordinates of Halton's points. (SciPy's
+    take a second to import.)
+    """
+    found, left, place = np.zeros(len(numbers)), numbers, 1.0
+    while np.any(left):
+        place /= base
+        found, left = found + place * (left % base), left // base
+    return found
+
+
+def _primes(count: int) -> list[int]:
+    """The first so many prime numbers."""
+    found: list[int] = []
+    number = 2
+    while len(found) < count:
+        if all(number % prime for prime in found):
+            found.append(number)
+        number += 1
+    return found
