@@ -13,19 +13,35 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from ..cycles.section_map import mechanics_about_sliding
 from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
 from ..steppers.kernel_matrices import matrices
 from .blocks import workers
 from .flattened import Flattened, flatten
-from .kernel_programs import programs
+from .kernel_programs import Programs, programs
+from .sharing import Batch, with_values
 from .windowed_returns import KEPT
 
 # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
 AT_A_TIME, LEAST_STEPS = 4, 4096
 # Steps from one crossing of the section to the next, roughly.
 STEPS_TO_CROSSING = 9
+
+
+def built_soon(batch: Batch) -> None:
+    """Begin to compile a batch's kernels in one of its threads."""
+    scene = with_values(batch.scene, batch.names, np.zeros(len(batch.names)))
+    form = Form.of(jax.eval_shape(mechanics_about_sliding, scene))
+    batch.pool.submit(_built, form)
+
+
+def _built(form: Form) -> Programs:
+    with ONE_AT_A_TIME:
+        found = programs(form)
+        load(found.module, devices())
+    return found
 
 
 class Kernels:
@@ -36,8 +52,7 @@ class Kernels:
         mechanics, prepared = tree.mechanics, tree.prepared
         form = Form.of(mechanics, leading=1)
         self.pool, self.wp = pool, wp
-        with ONE_AT_A_TIME:
-            self.types, self.programs = stepping(form).types, programs(form)
+        self.types, self.programs = stepping(form).types, _built(form)
         # The proofs that are not left to kernels do not need the matrices.
         without = eqx.tree_at(lambda shared: shared.prepared, tree, None, is_leaf=lambda leaf: leaf is None)
         self.for_conclusions = flatten(jax.tree.map(np.asarray, without))
@@ -53,7 +68,6 @@ class Kernels:
         self.of_groups = {
             device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups] for device in self.devices
         }
-        load(self.programs.module, self.devices)
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int = KEPT):
         """What `moved_in_windows` gives, for motions from these states of the section; with the last `kept` crossings."""

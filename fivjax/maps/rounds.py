@@ -16,7 +16,7 @@ from .attractors import Attractors, add_cycle, add_tori, come_to, has_crossed, s
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct, stable_cycles
 from .flattened import Flattened
 from .following import begun, follow
-from .kernels import Kernels
+from .kernels import Kernels, built_soon
 from .parting import followed_on
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
@@ -58,6 +58,8 @@ def follow_all(
     have ended.
     """
     of_groups, group = grouped(values, states)
+    if batch.by_kernel:
+        built_soon(batch)
     shared = shared_by(batch, of_groups)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in (*batch.history, *states))], axis=-1)[:, 1:]
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
