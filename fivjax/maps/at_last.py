@@ -35,6 +35,25 @@ def fates(
     """What becomes of motions from these states; their loads are final. `of_group` are the attractors known of each group, and
     gets those that are found.
     """
+    at = maps.returns(group, at, 1).at
+    chaotic, attractor = np.zeros(len(group), bool), dict[int, Cycle | Torus]()
+    left = np.all(np.isfinite(at.y), axis=1)
+    # A few of each group first: mostly the others are by now where these come to.
+    for rows in (distinct(maps.weights * at.y, group, left), np.arange(len(group))):
+        rows = rows[left[rows]]
+        left[rows] = False
+        captured = come_to(maps, group[rows], at.rows(rows), at.y[rows], np.ones(len(rows), bool), of_group)
+        attractor |= {int(rows[row]): one for row, one in captured.items()}
+        rows = np.delete(rows, list(captured))
+        if len(rows):
+            found = _followed(maps, group[rows], at.rows(rows), of_group, report)
+            chaotic[rows] = found.chaotic
+            attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
+    return Fates(chaotic, attractor)
+
+
+def _followed(maps: ReturnMaps, group, at: Section, of_group: dict[int, Attractors], report) -> Fates:
+    """The same of motions each of which is followed for thousands of returns."""
     followed = followed_on(maps, group, at)
     attractor: dict[int, Cycle | Torus] = {}
     left = ~followed.chaotic & np.all(np.isfinite(followed.at.y), axis=1)

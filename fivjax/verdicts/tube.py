@@ -15,6 +15,9 @@ RADIUS = 0.04
 STARTS = 16
 # Number of crossings in a row that must lie within half the tube.
 HOME = 16
+# Products of numbers at a time in distances to all states. OpenBLAS shares more among threads, which then wait for each other;
+# maps have a thread for each core already.
+PRODUCTS = 2**18
 
 
 def directions_from(
@@ -68,7 +71,16 @@ def nearest(
     points: Float[np.ndarray, "m 2n"], states: Float[np.ndarray, "k 2n"], others: bool = False
 ) -> Float[np.ndarray, " m"]:
     """The distance of each point to the nearest of the states; with `others` the states are the points, and none is its own."""
-    apart = np.sum(points**2, axis=-1)[:, None] - 2 * points @ states.T + np.sum(states**2, axis=-1)
-    if others:
-        np.fill_diagonal(apart, np.inf)
-    return np.sqrt(np.maximum(np.min(apart, axis=1), 0.0))
+    # One product of a few points at a time gives their squared distances but for their own squares: that stays in the cache.
+    table = np.concatenate([-2 * states.T, np.sum(states**2, axis=-1)[None]])
+    extended = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    least = np.empty(len(points))
+    count = max(1, PRODUCTS // table.size)
+    for begin in range(0, len(points), count):
+        some = slice(begin, begin + count)
+        apart = extended[some] @ table
+        if others:
+            rows = np.arange(len(apart))
+            apart[rows, begin + rows] = np.inf
+        least[some] = np.min(apart, axis=1)
+    return np.sqrt(np.maximum(least + np.sum(points**2, axis=-1), 0.0))
