@@ -31,9 +31,9 @@ from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, many_of_each, moved_in_wi
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
 DERIVED_BLOCK = 16
-# Step of central differences, relative to a state's size: about the cube root of the rounding unit; and the most crossings over
-# which a difference is taken.
-STEP, DIFFERENCED = 5e-6, 16
+# Steps of central differences, relative to a state's size: about the cube root of the rounding unit; smaller ones where motions
+# have other events that far away. And the most crossings over which a difference is taken.
+STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
 
 
 class Section(NamedTuple):
@@ -142,22 +142,28 @@ class ReturnMaps:
         free = np.zeros((count, size), bool)
         for own, status in zip(free, at.status, strict=True):
             own[free_on_section(self.structure.size, self.tangential, self.normal, int(status))] = True
-        lengths = STEP * np.linalg.norm(self.weights * at.y, axis=1)
+        lengths = np.linalg.norm(self.weights * at.y, axis=1)
         row, place = np.nonzero(free)
-        step = lengths[row] / self.weights[place]
-        away = np.zeros((len(row), size))
-        away[np.arange(len(row)), place] = step
-        starts = np.concatenate([at.y, at.y[row] + away, at.y[row] - away])
-        rows = np.concatenate([np.arange(count), row, row])
-        image = self.returns(group[rows], Section(starts, at.status[rows], at.direction[rows]), crossings[rows])
-        base, ahead, behind = (
-            image.at.rows(part) for part in np.split(np.arange(len(rows)), [count, count + len(row)])
-        )
-        alike = (ahead.status == behind.status) & (ahead.status == base.status[row])
+        base = self.returns(group, at, crossings)
         derivatives = np.zeros((count, size, size))
-        slopes = (ahead.y - behind.y) / (2 * step[:, None])
-        derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
-        return base, image.time[:count], derivatives
+        for step in STEPS:
+            lengthwise = step * lengths[row] / self.weights[place]
+            away = np.zeros((len(row), size))
+            away[np.arange(len(row)), place] = lengthwise
+            starts = np.concatenate([at.y[row] + away, at.y[row] - away])
+            rows = np.tile(row, 2)
+            image = self.returns(group[rows], Section(starts, at.status[rows], at.direction[rows]), crossings[rows])
+            ahead, behind = image.at.rows(slice(None, len(row))), image.at.rows(slice(len(row), None))
+            alike = (ahead.status == behind.status) & (ahead.status == base.at.status[row])
+            slopes = (ahead.y - behind.y) / (2 * lengthwise[:, None])
+            derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
+            # Next to the onset of an event a step may lead to motions that have it.
+            events = base.events[row]
+            other = (image.events[: len(row)] != events) | (image.events[len(row) :] != events)
+            row, place = row[other], place[other]
+            if not len(row):
+                break
+        return base.at, base.time, derivatives
 
     def peaks_and_ends(self, group, at: Section, crossings) -> tuple[Float[np.ndarray, " m"], Section]:
         """`peaks`, and the states at the end."""
