@@ -12,14 +12,14 @@ from jaxtyping import Bool, Int
 
 from .attractors import Attractors, add_cycle, add_tori, come_to
 from .captures import MORE_CROSSINGS, Cycle, distinct, stable_cycles
-from .parting import Followed, followed_on
+from .parting import followed_on
 from .section import ReturnMaps, Section
-from .tori import TUBES, Torus
+from .tori import AT_A_TIME, TUBES, Torus, is_drifting
 
 # Crossings of cycles on which neighbours close in.
 MOST_CROSSINGS = 512
-# Times that a few more motions of each group are asked.
-TIMES = 4
+# Times that a few more motions of each group are asked; and returns that those take which drift in between.
+TIMES, ONWARD = 4, 4096
 
 
 class Fates(NamedTuple):
@@ -55,29 +55,53 @@ def fates(
 def _followed(maps: ReturnMaps, group, at: Section, of_group: dict[int, Attractors], report) -> Fates:
     """The same of motions each of which is followed for thousands of returns."""
     followed = followed_on(maps, group, at)
+    now = followed.at
     attractor: dict[int, Cycle | Torus] = {}
-    left = ~followed.chaotic & np.all(np.isfinite(followed.at.y), axis=1)
+    left = ~followed.chaotic & np.all(np.isfinite(now.y), axis=1)
     asks = left.copy()
     for time in range(TIMES + 1):
-        new = come_to(maps, group, followed.at, followed.at.y, left, of_group)
+        new = come_to(maps, group, now, now.y, left, of_group)
         attractor |= new
         left[list(new)] = False
-        picked = distinct(maps.weights * followed.at.y, group, asks & left)
-        if time == TIMES or not len(picked):
+        if time == TIMES or not np.any(left):
             break
-        asks[picked] = False
         report(0)
-        _search(maps, group, followed, picked, of_group, report)
+        picked = distinct(maps.weights * now.y, group, asks & left)
+        if len(picked):
+            _search(maps, group, now, followed.closing_in, picked, of_group, report)
+        asks[picked] = False
+        asks |= _further(maps, group, now, left)
     return Fates(followed.chaotic, attractor)
 
 
+def _further(maps: ReturnMaps, group, now: Section, left: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Which of the motions `left` drift, as they do away from a cycle that repels weakly, or past a fold: these are followed
+    further.
+    """
+    rows, drifting = np.flatnonzero(left), np.zeros(len(left), bool)
+    at, path = maps.path(group[rows], now.rows(rows), AT_A_TIME)
+    drifting[rows] = [is_drifting(maps.weights * one) for one in path]
+    rows = rows[drifting[rows]]
+    if len(rows):
+        now.put(rows, maps.returns(group[rows], at.rows(drifting[left]), ONWARD).at)
+    drifting[rows] = np.all(np.isfinite(now.y[rows]), axis=1)
+    left[rows] = drifting[rows]
+    return drifting
+
+
 def _search(
-    maps: ReturnMaps, group, followed: Followed, picked: Int[np.ndarray, " r"], of_group: dict[int, Attractors], report
+    maps: ReturnMaps,
+    group,
+    at: Section,
+    closing_in: Bool[np.ndarray, " m"],
+    picked: Int[np.ndarray, " r"],
+    of_group: dict[int, Attractors],
+    report,
 ) -> None:
-    """Adds the attractors that the picked motions are on, where they are new."""
-    at, on_torus = followed.at, ~followed.closing_in[picked]
-    for closing_in, most in ((True, MOST_CROSSINGS), (False, MORE_CROSSINGS)):
-        here = np.flatnonzero(followed.closing_in[picked] == closing_in)
+    """Adds the attractors that the picked motions are on, where they are new. On some of them neighbours are `closing_in`."""
+    on_torus = ~closing_in[picked]
+    for closes_in, most in ((True, MOST_CROSSINGS), (False, MORE_CROSSINGS)):
+        here = np.flatnonzero(closing_in[picked] == closes_in)
         if not len(here):
             continue
         known = {g: one.cycles for g, one in of_group.items()}

@@ -165,7 +165,12 @@ def _growth(path: Float[np.ndarray, "k 2n"]) -> float:
 
 def _may_be_torus(path: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether a motion neither drifts nor shrinks nor repeats, as far as its weighted states on the section tell."""
-    return _goes_on(path) and not drifts(path, DRIFT) and abs(_growth(path)) <= SHRINKS
+    return _goes_on(path) and not is_drifting(path)
+
+
+def is_drifting(path: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether the mean or the extent of weighted states on the section changes with time."""
+    return drifts(path, DRIFT) or not abs(_growth(path)) <= SHRINKS
 
 
 def _goes_on(path: Float[np.ndarray, "k 2n"]) -> bool:
