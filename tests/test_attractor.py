@@ -208,6 +208,35 @@ def test_amplitudes_are_the_references_whichever_way_the_fastest_motion_is(mu, v
     np.testing.assert_allclose(m["amplitude"].values[0, squeal], theirs.amplitude[squeal], rtol=1e-6)
 
 
+RING = dict(m1=1.3002593313829536, m2=0.13445419199839012, k1=270529.97355975525, k2=151036.22328616967)
+RING |= dict(theta=0.09123089866361907, c1=0.40623432617301763, c2=0.3444405126582572)
+EDGE = dict(m1=1.0553635758339588, m2=0.08099191514168808, k1=415199.8197264089, k2=201914.27176295719)
+EDGE |= dict(theta=0.16878469667751425, c1=1.0092378686004728, c2=0.3029637745454267)
+REPELLED = dict(m1=0.157045424580618, m2=0.010180922348615335, k1=230306.45302661796, k2=116928.96710609985)
+REPELLED |= dict(theta=0.42108456857757953, c1=0.2555934258420111, c2=3.318136134842078)
+
+
+@pytest.mark.parametrize(
+    ("mu", "v", "parts", "kick"),
+    [
+        # Eighteen crossings within 1e-4 of each other; other events 2e-6 away.
+        (1.0582676904629036, 0.5698310189567666, RING, 0.1389),
+        # A multiplier of 0.9995, and other events 8e-6 away.
+        (1.229556063695308, 0.467728818845026, EDGE, 0.1732),
+        # The motion leaves a cycle with a multiplier of 1.0006, for which it takes ten thousand returns.
+        (0.49047164000367716, 1.3202275538006947, REPELLED, 0.0921),
+    ],
+)
+def test_next_to_the_onset_of_an_event_and_to_a_weak_repeller_motions_are_followed_to_their_cycle(mu, v, parts, kick):
+    """Multipliers from differences across the onset said that these cycles repel, or that none is there."""
+    scene = paper(mu, v, **parts)
+    m = fj.bistability_map(scene, p=[kick], progress=False)
+    assert m["attractor_kind"].values.tolist() == ["periodic"]
+    theirs = reference.fate([{**reference.of_scene(scene), "p": kick}], periods=60_000)
+    assert theirs.fate.tolist() == ["sustained"]
+    assert m["amplitude"].item() == pytest.approx(theirs.amplitude[0], rel=1e-6)
+
+
 def test_a_belt_that_runs_backwards_is_the_mirrored_one(paper_scene):
     """Seen in a mirror the belt runs the other way and the incline has the other sign; the torus is the same."""
     mirrored = fj.Scene(fj.belt_oscillator(theta=-0.01), fj.Coulomb(0.227), -3.0, paper_scene.load)
