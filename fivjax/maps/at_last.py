@@ -37,7 +37,7 @@ def fates(
     """
     at = maps.returns(group, at, 1).at
     chaotic, attractor = np.zeros(len(group), bool), dict[int, Cycle | Torus]()
-    left = np.all(np.isfinite(at.y), axis=1)
+    left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
     for rows in (distinct(maps.weights * at.y, group, left), np.arange(len(group))):
         rows = rows[left[rows]]
@@ -46,14 +46,27 @@ def fates(
         attractor |= {int(rows[row]): one for row, one in captured.items()}
         rows = np.delete(rows, list(captured))
         if len(rows):
-            found = _followed(maps, group[rows], at.rows(rows), of_group, report)
+            found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report)
             chaotic[rows] = found.chaotic
             attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
+            # Where these come to nothing, neither do others that go on.
+            open_ = ~found.chaotic
+            open_[list(found.attractor)] = False
+            onward &= ~np.isin(group, group[rows[open_]])
     return Fates(chaotic, attractor)
 
 
-def _followed(maps: ReturnMaps, group, at: Section, of_group: dict[int, Attractors], report) -> Fates:
-    """The same of motions each of which is followed for thousands of returns."""
+def _followed(
+    maps: ReturnMaps,
+    group,
+    at: Section,
+    onward: Bool[np.ndarray, " m"],
+    of_group: dict[int, Attractors],
+    report,
+) -> Fates:
+    """The same of motions each of which is followed for thousands of returns, and those to be followed `onward`, if they drift,
+    for tens of thousands.
+    """
     followed = followed_on(maps, group, at)
     now = followed.at
     attractor: dict[int, Cycle | Torus] = {}
@@ -70,22 +83,20 @@ def _followed(maps: ReturnMaps, group, at: Section, of_group: dict[int, Attracto
         if len(picked):
             _search(maps, group, now, followed.closing_in, picked, of_group, report)
         asks[picked] = False
-        asks |= _further(maps, group, now, left)
+        asks |= _drifted(maps, group, now, left & onward)
+        left &= np.all(np.isfinite(now.y), axis=1)
     return Fates(followed.chaotic, attractor)
 
 
-def _further(maps: ReturnMaps, group, now: Section, left: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Which of the motions `left` drift, as they do away from a cycle that repels weakly, or past a fold: these are followed
-    further.
-    """
-    rows, drifting = np.flatnonzero(left), np.zeros(len(left), bool)
-    at, path = maps.path(group[rows], now.rows(rows), AT_A_TIME)
-    drifting[rows] = [is_drifting(maps.weights * one) for one in path]
-    rows = rows[drifting[rows]]
+def _drifted(maps: ReturnMaps, group, now: Section, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: `now` they are further."""
+    rows, drifting = np.flatnonzero(asked), np.zeros(len(asked), bool)
     if len(rows):
-        now.put(rows, maps.returns(group[rows], at.rows(drifting[left]), ONWARD).at)
-    drifting[rows] = np.all(np.isfinite(now.y[rows]), axis=1)
-    left[rows] = drifting[rows]
+        at, path = maps.path(group[rows], now.rows(rows), AT_A_TIME)
+        own = np.array([is_drifting(maps.weights * one) for one in path])
+        rows = rows[own]
+        now.put(rows, maps.returns(group[rows], at.rows(own), ONWARD).at)
+        drifting[rows] = True
     return drifting
 
 

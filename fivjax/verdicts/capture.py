@@ -211,8 +211,8 @@ def directions(dimension: int) -> Float[np.ndarray, "d f"]:
 
 
 def _radical_inverse(numbers: Int[np.ndarray, " m"], base: int) -> Float[np.ndarray, " m"]:
-    """The digits of these numbers behind the point in opposite order: in prime bases the coordinates of Halton's points. (SciPy's
-    take a second to import.)
+    """The digits of these numbers behind the point in opposite order: in prime bases the coordinates of Halton's points.
+    (SciPy's take a second to import.)
     """
     found, left, place = np.zeros(len(numbers)), numbers, 1.0
     while np.any(left):
