@@ -237,6 +237,19 @@ def test_next_to_the_onset_of_an_event_and_to_a_weak_repeller_motions_are_follow
     assert m["amplitude"].item() == pytest.approx(theirs.amplitude[0], rel=1e-6)
 
 
+LIGHT = dict(m1=0.19476150509392423, m2=0.02207121417728487, k1=542698.6936374899, k2=516183.31086244836)
+LIGHT |= dict(theta=0.026992390494823812, c1=7.524142752276637, c2=0.5333433607574884)
+
+
+def test_a_motion_whose_events_cease_after_many_thousand_periods_slides():
+    """A hundred-thousandth below the critical friction it has two events a period, with 2e-7 of its size lost in each."""
+    scene = paper(0.03713611239400394, 20.390745498650233, **LIGHT)
+    m = fj.bistability_map(scene, p=[3.1], progress=False)
+    assert m["verdict"].item() == fj.Verdict.SLIDING
+    theirs = reference.fate([{**reference.of_scene(scene), "p": 3.1}], periods=100_000)
+    assert theirs.fate.tolist() == ["slides"] and theirs.last_event[0] > 20.0
+
+
 def test_a_belt_that_runs_backwards_is_the_mirrored_one(paper_scene):
     """Seen in a mirror the belt runs the other way and the incline has the other sign; the torus is the same."""
     mirrored = fj.Scene(fj.belt_oscillator(theta=-0.01), fj.Coulomb(0.227), -3.0, paper_scene.load)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from ..verdicts.tube import HOME
 from .attractors import Attractors, add_cycle, add_tori, come_to
 from .captures import MORE_CROSSINGS, Cycle, distinct, stable_cycles
 from .parting import followed_on
@@ -19,14 +20,18 @@ from .tori import AT_A_TIME, TUBES, Torus, is_drifting
 # Crossings of cycles on which neighbours close in.
 MOST_CROSSINGS = 512
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
-TIMES, ONWARD = 4, 4096
+TIMES, ONWARD = 4, 8192
 
 
 class Fates(NamedTuple):
-    """What becomes of trajectories: which are chaotic, and the attractors of others, by row."""
+    """What becomes of trajectories: which are chaotic, the attractors of others, by row, and which have no events any more, at
+    least for some time, with where they are by then.
+    """
 
     chaotic: Bool[np.ndarray, " m"]
     attractor: dict[int, Cycle | Torus]
+    without_events: Bool[np.ndarray, " m"]
+    at: Section
 
 
 def fates(
@@ -36,7 +41,8 @@ def fates(
     gets those that are found.
     """
     at = maps.returns(group, at, 1).at
-    chaotic, attractor = np.zeros(len(group), bool), dict[int, Cycle | Torus]()
+    attractor: dict[int, Cycle | Torus] = {}
+    chaotic, quiet = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
     for rows in (distinct(maps.weights * at.y, group, left), np.arange(len(group))):
@@ -47,13 +53,14 @@ def fates(
         rows = np.delete(rows, list(captured))
         if len(rows):
             found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report)
-            chaotic[rows] = found.chaotic
+            chaotic[rows], quiet[rows] = found.chaotic, found.without_events
+            at.put(rows, found.at)
             attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
-            # Where these come to nothing, neither do others that go on.
-            open_ = ~found.chaotic
-            open_[list(found.attractor)] = False
-            onward &= ~np.isin(group, group[rows[open_]])
-    return Fates(chaotic, attractor)
+            # Where none of these comes to anything, neither do others that go on.
+            ended = found.chaotic | found.without_events
+            ended[list(found.attractor)] = True
+            onward &= np.isin(group, group[rows[ended]])
+    return Fates(chaotic, attractor, quiet, at)
 
 
 def _followed(
@@ -68,10 +75,10 @@ def _followed(
     for tens of thousands.
     """
     followed = followed_on(maps, group, at)
-    now = followed.at
+    now, chaotic = followed.at, followed.chaotic
     attractor: dict[int, Cycle | Torus] = {}
-    left = ~followed.chaotic & np.all(np.isfinite(now.y), axis=1)
-    asks = left.copy()
+    left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
+    asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
     for time in range(TIMES + 1):
         new = come_to(maps, group, now, now.y, left, of_group)
         attractor |= new
@@ -83,9 +90,15 @@ def _followed(
         if len(picked):
             _search(maps, group, now, followed.closing_in, picked, of_group, report)
         asks[picked] = False
-        asks |= _drifted(maps, group, now, left & onward)
+        drifting = _drifted(maps, group, now, left & onward)
         left &= np.all(np.isfinite(now.y), axis=1)
-    return Fates(followed.chaotic, attractor)
+        asks, further = asks | drifting, further | drifting
+    rows = np.flatnonzero(left & further)
+    if len(rows):
+        quiet[rows] = maps.returns(group[rows], now.rows(rows), HOME).events == 0
+        rows = rows[~quiet[rows]]
+        chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
+    return Fates(chaotic, attractor, quiet, now)
 
 
 def _drifted(maps: ReturnMaps, group, now: Section, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:

@@ -1,16 +1,23 @@
 """The verdict on one trajectory, as far as it can be proved at a given time and without the attractors."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..verdicts.sliding_proof import slides_forever
+from ..contact import Contact, Mechanics
+from ..foundation.compiling import compiled
+from ..verdicts.sliding_proof import SlidingModes, slides_forever
 from ..verdicts.slow_growth import slid_on
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
-from .flattened import Flattened
+from .blocks import in_blocks
+from .flattened import Flattened, flatten
 from .progress import Progress, Setting
+from .section import BLOCK, Section
 
 # A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
 GROWTH = 1e9
@@ -58,6 +65,25 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
     )
     now = eqx.tree_at(lambda now: now.verdict, now, verdict.astype(jnp.int8))
     return _slid_on(setting, now, quiet_load) if _may_slide_on(setting, now) else now
+
+
+def slide_for_ever(
+    shared: Flattened, group: Int[np.ndarray, " m"], at: Section, pool: ThreadPoolExecutor
+) -> Bool[np.ndarray, " m"]:
+    """Which motions from these states, under their final loads, are certain to slide for ever."""
+    own = flatten(jax.tree.map(np.asarray, (shared.tree.mechanics, shared.tree.modes)))
+    rows = flatten((at.y, np.asarray(at.status, np.int32), np.asarray(at.direction, float)))
+    return in_blocks(_slide_for_ever, own, group, rows, 1, pool, size=BLOCK).tree.astype(bool)
+
+
+@compiled
+def _slide_for_ever(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
+        mechanics, modes = shared
+        return slides_forever(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
+
+    of_group = jax.vmap(one, in_axes=(None, 0, 0, 0))
+    return flatten(jax.vmap(of_group)(shared.tree, *rows.tree), row_axes=2)
 
 
 def _may_slide_on(setting: Setting, now: Progress) -> bool:

@@ -14,6 +14,7 @@ from . import attractors
 from .at_last import fates
 from .attractors import Attractors, add_cycle, add_tori, come_to, has_crossed, section_of
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct, stable_cycles
+from .conclusion import slide_for_ever
 from .flattened import Flattened
 from .following import begun, follow
 from .kernels import Kernels, built_soon
@@ -88,8 +89,8 @@ def follow_all(
         finished = (verdict != Verdict.UNDECIDED) | ~in_time
         late = finished & (verdict == Verdict.UNDECIDED)
         # Who says how long to follow says which motions count.
-        chaotic, at_last = basins.at_last(pending, now, late, proving=t_max is None, report=report)
-        verdict[list(at_last)] = Verdict.LIMIT_CYCLE
+        chaotic, at_last, sliding = basins.at_last(pending, now, late, proving=t_max is None, report=report)
+        verdict[list(at_last)], verdict[sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
         ended = Ended(verdict, *_described(len(pending), entered | at_last, chaotic))
         chosen = np.flatnonzero(finished)
         record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
@@ -195,21 +196,25 @@ class Basins:
 
     def at_last(
         self, pending: np.ndarray, now, late: np.ndarray, proving: bool, report
-    ) -> tuple[np.ndarray, dict[int, Cycle | Torus]]:
+    ) -> tuple[np.ndarray, dict[int, Cycle | Torus], np.ndarray]:
         """Of trajectories whose time is over: which are chaotic, and, if that is to be proved, the attractors that others have
-        come to.
+        come to, and which slide for ever.
         """
-        chaotic = np.zeros(len(pending), bool)
+        chaotic, none = np.zeros(len(pending), bool), np.zeros(0, int)
         asks = np.flatnonzero(late & has_crossed(now))
         if self.maps is None or not len(asks):
-            return chaotic, {}
+            return chaotic, {}, none
         group, at = self.group[pending[asks]], section_of(now).rows(asks)
         if not proving:
             chaotic[asks] = followed_on(self.maps, group, at).chaotic
-            return chaotic, {}
+            return chaotic, {}, none
         for g in np.unique(group).tolist():
             if g not in self.known_at_last:
                 self.known_at_last[g] = self.known[g].copy()
         found = fates(self.maps, group, at, self.known_at_last, report)
         chaotic[asks] = found.chaotic
-        return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}
+        sliding = np.flatnonzero(found.without_events)
+        if len(sliding):
+            certain = slide_for_ever(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
+            sliding = sliding[certain]
+        return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding]
