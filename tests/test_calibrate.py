@@ -63,6 +63,7 @@ def known_to_slide(monkeypatch):
     monkeypatch.setattr("fivjax.calibration.fit.slid_throughout", lambda *_: True)
 
 
+@pytest.mark.slow
 def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit, known_to_slide):
     """Data of the first of two contacts give what the fit with one contact gives. Modes that the data cannot show are no
     poles of the recording: noise was taken for them, and no parameter was found."""

@@ -163,6 +163,7 @@ def test_forward_derivatives_up_to_the_second():
     assert abs(second - expected) < 1e-6 * abs(expected)
 
 
+@pytest.mark.slow
 def test_gradients_without_double_precision():
     """Where a user never turned it on, as in the process that runs the tests."""
     assert not jax.config.jax_enable_x64 and jnp.ones(1).dtype == np.float32

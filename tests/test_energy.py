@@ -170,6 +170,7 @@ def test_every_line_agrees_with_quadrature_of_the_oracle(name):
     assert expected["detach_time"] > 0 or expected["stick_time"] > 0
 
 
+@pytest.mark.slow
 def test_the_loss_of_each_impact_agrees_with_the_oracle():
     """The drop of the oracle's energy over each of its own re-contacts, taken to the instant from both sides."""
     parameters, t1 = CASES["everything"]
@@ -778,6 +779,7 @@ def test_a_map_keeps_the_ledger_of_each_lane(paper_scene):
     assert plain["verdict"].equals(m["verdict"]) and "energy_residual" not in plain
 
 
+@pytest.mark.slow
 def test_the_balance_closes_however_little_moves_under_however_high_a_load(paper_scene):
     """Kicks of nanoseconds under loads that store 10¹³ times what they move; and soft structures that fly off for ever.
 

@@ -189,6 +189,7 @@ def test_failures_are_verdicts_of_their_own(paper_scene):
     assert np.all(unloaded["verdict"].sel(belt_speed=3.0) == fj.Verdict.SLIDING)
 
 
+@pytest.mark.slow
 def test_a_structure_that_jams_grows_without_bound():
     """Leaning into the belt, with more friction at rest than sliding: the oracle sticks for ever, pressed on ever harder."""
     scene = fj.Scene(fj.belt_oscillator(theta=-0.8, m2=0.5), fj.Coulomb(0.3, 1.3), 0.5, fj.Pulse(100.0, 3.0))

@@ -16,6 +16,20 @@ def cycle() -> fj.LimitCycle:
     return fj.limit_cycle(SCENE)
 
 
+def test_forward_derivatives_are_those_of_the_cycle(cycle):
+    """In a caller's own program, at a friction beside the one at which the cycle was found."""
+
+    def amplitude(mu):
+        return fj.nearby_cycle(SCENE.replace(mu=mu), cycle).amplitude
+
+    with jax.enable_x64(True):
+        value, slope = jax.jit(lambda mu: jax.jvp(amplitude, (mu,), (jnp.ones_like(mu),)))(jnp.asarray(0.21))
+    above, here, below = (fj.limit_cycle(SCENE.replace(mu=mu), cycle).amplitude for mu in (0.21001, 0.21, 0.20999))
+    assert value == pytest.approx(here, rel=1e-12)
+    assert slope == pytest.approx((above - below) / 2e-5, rel=1e-6)
+
+
+@pytest.mark.slow
 def test_reverse_derivatives_of_a_batch_are_those_of_neighbouring_cycles(cycle):
     """In a caller's own program: amplitude and its derivatives over friction, one of it below the fold, where no cycle is."""
     mus, step = np.array([0.21, 0.1, 0.22]), {"mu": 1e-5, "k1": 1.0}

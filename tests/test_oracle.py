@@ -150,7 +150,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+RARER = ("larger static coefficient", "elastic impact")
+
+
+@pytest.mark.parametrize("case", [pytest.param(k, marks=pytest.mark.slow if k in RARER else ()) for k in CASES])
 def test_engines_agree(case):
     model = paper_model(**CASES[case])
     t = np.linspace(0.0, 0.7, 1401)

@@ -53,6 +53,7 @@ def test_single_precision_input_does_not_become_single_precision_physics():
     )
 
 
+@pytest.mark.slow
 def test_transformations_around_simulate_without_double_precision(paper_scene):
     """Rejects `jit` that ends in an error of the compiler, and `grad` that fails without the sentence that has the remedy."""
 

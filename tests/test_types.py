@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 # In a process of its own, because the package has to be imported under the hook. An `int` passes for a `float`, as for
 # every static checker (PEP 484); beartype asks for that to be said.
 CHECKED = """
@@ -70,6 +72,7 @@ def in_process(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_annotations_hold_in_a_simulation_a_stability_limit_and_a_map():
     """No annotation says what is not so; and the checker is at work, because it refuses arrays that do not match."""
     done = in_process(CHECKED + WORK + MISTAKE)

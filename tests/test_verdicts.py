@@ -61,8 +61,12 @@ def prover(scene: fj.Scene):
 
 @pytest.mark.parametrize(
     "friction",
-    [fj.Coulomb(0.1), fj.Coulomb(0.227), fj.Coulomb(0.2282), fj.ExponentialDecay(0.2, 0.19, 0.5)],
-    ids=["low", "close", "closer", "falling"],
+    [
+        pytest.param(fj.Coulomb(0.1), id="low", marks=pytest.mark.slow),
+        pytest.param(fj.Coulomb(0.227), id="close", marks=pytest.mark.slow),
+        pytest.param(fj.Coulomb(0.2282), id="closer"),
+        pytest.param(fj.ExponentialDecay(0.2, 0.19, 0.5), id="falling"),
+    ],
 )
 def test_proved_sliding_never_meets_an_event_and_the_proof_is_not_idle(friction):
     """Random states: where the proof holds, a long run must show no event; and it must hold for the smaller ones."""
