@@ -93,10 +93,11 @@ def _followed(
         drifting = _drifted(maps, group, now, left & onward)
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
-    rows = np.flatnonzero(left & further)
+    rows = np.flatnonzero(left)
     if len(rows):
         quiet[rows] = maps.returns(group[rows], now.rows(rows), HOME).events == 0
-        rows = rows[~quiet[rows]]
+    rows = np.flatnonzero(left & further & ~quiet)
+    if len(rows):
         chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
     return Fates(chaotic, attractor, quiet, now)
 
