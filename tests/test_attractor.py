@@ -149,6 +149,11 @@ def paper(mu, v, **parts):
     return fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(mu), v, fj.Pulse(100.0, 1.2))
 
 
+def by_reference(scene, kicks, **options):
+    """Where the independent solver says that kicks lead."""
+    return reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], **options)
+
+
 @pytest.mark.parametrize("count", [31, 32])
 def test_the_ghost_of_a_fold_is_no_limit_cycle(count):
     """Just below the fold of the paper's cycle at 1 m/s everything slides, and lingers where the cycle was; however many."""
@@ -162,7 +167,7 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
     """At 0.5 m/s cycles coexist; those kicked like this end on the smaller one, whoever stands beside them."""
     m = fj.bistability_map(paper(0.227, 0.5), mu=[0.227], p=np.linspace(1.0537, 1.0545, count), progress=False)
     assert np.all(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
-    theirs = reference.fate([{**reference.of_scene(paper(0.227, 0.5)), "p": 1.054}])
+    theirs = by_reference(paper(0.227, 0.5), [1.054])
     assert theirs.fate[0] == "sustained"
     np.testing.assert_allclose(m["amplitude"], theirs.amplitude[0], rtol=1e-4)
     assert m["attractor_amplitude"].item() == m["amplitude"].values[0, 0]
@@ -202,7 +207,7 @@ def test_amplitudes_are_the_references_whichever_way_the_fastest_motion_is(mu, v
     """Between the samples of a window the highest peak may stand beside none of the largest samples."""
     scene = paper(mu, v, **parts)
     m = fj.bistability_map(scene, mu=[mu], p=kicks, progress=False)
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=2000)
+    theirs = by_reference(scene, kicks, periods=2000)
     squeal = (m["verdict"].values[0] == fj.Verdict.LIMIT_CYCLE) & (theirs.fate == "sustained")
     assert squeal.sum() >= 3
     np.testing.assert_allclose(m["amplitude"].values[0, squeal], theirs.amplitude[squeal], rtol=1e-6)
@@ -232,7 +237,7 @@ def test_next_to_the_onset_of_an_event_and_to_a_weak_repeller_motions_are_follow
     scene = paper(mu, v, **parts)
     m = fj.bistability_map(scene, p=[kick], progress=False)
     assert m["attractor_kind"].values.tolist() == ["periodic"]
-    theirs = reference.fate([{**reference.of_scene(scene), "p": kick}], periods=60_000)
+    theirs = by_reference(scene, [kick], periods=60_000)
     assert theirs.fate.tolist() == ["sustained"]
     assert m["amplitude"].item() == pytest.approx(theirs.amplitude[0], rel=1e-6)
 
@@ -246,7 +251,7 @@ def test_a_motion_whose_events_cease_after_many_thousand_periods_slides():
     scene = paper(0.03713611239400394, 20.390745498650233, **LIGHT)
     m = fj.bistability_map(scene, p=[3.1], progress=False)
     assert m["verdict"].item() == fj.Verdict.SLIDING
-    theirs = reference.fate([{**reference.of_scene(scene), "p": 3.1}], periods=100_000)
+    theirs = by_reference(scene, [3.1], periods=100_000)
     assert theirs.fate.tolist() == ["slides"] and theirs.last_event[0] > 20.0
 
 
@@ -293,7 +298,7 @@ def test_late_trajectories_have_the_references_amplitudes_and_their_verdict_alon
     """
     scene, kicks = paper(0.2980455667638255, 1.5691123393166873, **MANY), [1.5793, 2.2167, 3.1512, 4.3208, 5.1958]
     together = fj.bistability_map(scene, p=kicks, progress=False)
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks])
+    theirs = by_reference(scene, kicks)
     assert theirs.fate.tolist() == ["sustained"] * len(kicks)
     assert np.all(together["verdict"] == fj.Verdict.LIMIT_CYCLE)
     np.testing.assert_allclose(together["amplitude"], theirs.amplitude, rtol=1e-2)
@@ -309,7 +314,7 @@ def test_a_slow_approach_to_a_cycle_is_no_torus():
     its way to a cycle of eight crossings. It has been called a torus although the cycle was known.
     """
     scene, kicks = paper(0.7139242445761025, 1.9298605700607168, **SLOW), [2.283155, 2.858622]
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks])
+    theirs = by_reference(scene, kicks)
     m = fj.bistability_map(scene, p=kicks, progress=False)
     assert m["attractor_kind"].values.tolist() == ["periodic"]
     np.testing.assert_allclose(m["amplitude"], theirs.amplitude, rtol=1e-6)
@@ -321,7 +326,7 @@ def test_two_tori_beside_each_other_capture_each_trajectory_alone_too(paper_scen
     meets on both, and that a tube of a hundredth of their size holds motions of both. This kick was undecided by itself.
     """
     scene, kicks = paper_scene.replace(mu=0.1568, belt_speed=2.4), [2.0, 2.0727]
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=3e3)
+    theirs = by_reference(scene, kicks, periods=3e3)
     assert theirs.fate.tolist() == ["sustained"] * 2
     for chosen in ([0], [0, 1]):
         m = fj.bistability_map(scene, p=np.array(kicks)[chosen], progress=False)
@@ -342,7 +347,7 @@ def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_n
     scene = paper(0.2624679100513595, 0.13967129502237938, **fading)
     fade = fj.bistability_map(scene, p=[1.7767, 1.9584], progress=False)
     assert np.all(fade["verdict"] == fj.Verdict.UNDECIDED) and not np.any(fade["chaotic"])
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in (1.7767, 1.9584)], periods=1e5)
+    theirs = by_reference(scene, (1.7767, 1.9584), periods=1e5)
     assert theirs.fate.tolist() == ["slides", "slides"]
 
 
@@ -355,7 +360,7 @@ def test_a_whole_ensemble_that_fades_slowly_is_on_no_torus():
     scene, kicks = paper(0.09031944429179249, 0.053627612342134166, **fading), [0.2355, 1.8389, 3.4629, 5.4348]
     m = fj.bistability_map(scene, p=kicks, progress=False)
     assert not np.any(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
-    theirs = reference.fate([{**reference.of_scene(scene), "p": p} for p in kicks], periods=1e4)
+    theirs = by_reference(scene, kicks, periods=1e4)
     assert theirs.fate.tolist() == ["slides"] * len(kicks)
 
 

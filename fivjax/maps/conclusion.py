@@ -3,7 +3,6 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -17,7 +16,7 @@ from ..verdicts.verdict import Verdict
 from .blocks import in_blocks
 from .flattened import Flattened, flatten
 from .progress import Progress, Setting
-from .section import BLOCK, Section
+from .section import BLOCK, Section, of_block
 
 # A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
 GROWTH = 1e9
@@ -67,23 +66,22 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
     return _slid_on(setting, now, quiet_load) if _may_slide_on(setting, now) else now
 
 
-def slide_for_ever(
+def slide_forever(
     shared: Flattened, group: Int[np.ndarray, " m"], at: Section, pool: ThreadPoolExecutor
 ) -> Bool[np.ndarray, " m"]:
     """Which motions from these states, under their final loads, are certain to slide for ever."""
-    own = flatten(jax.tree.map(np.asarray, (shared.tree.mechanics, shared.tree.modes)))
-    rows = flatten((at.y, np.asarray(at.status, np.int32), np.asarray(at.direction, float)))
-    return in_blocks(_slide_for_ever, own, group, rows, 1, pool, size=BLOCK).tree.astype(bool)
+    tree = shared.tree
+    own = flatten((tree.mechanics, tree.modes))
+    return in_blocks(_slide_forever, own, group, at.flattened(), 1, pool, size=BLOCK).tree.astype(bool)
 
 
 @compiled
-def _slide_for_ever(shared: Flattened, rows: Flattened) -> Flattened:
+def _slide_forever(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
         mechanics, modes = shared
         return slides_forever(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
 
-    of_group = jax.vmap(one, in_axes=(None, 0, 0, 0))
-    return flatten(jax.vmap(of_group)(shared.tree, *rows.tree), row_axes=2)
+    return of_block(one, shared, rows)
 
 
 def _may_slide_on(setting: Setting, now: Progress) -> bool:

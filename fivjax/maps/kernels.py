@@ -30,7 +30,7 @@ AT_A_TIME, LEAST_STEPS = 4, 4096
 STEPS_TO_CROSSING = 9
 
 
-def built_soon(batch: Batch) -> None:
+def begin_building(batch: Batch) -> None:
     """Begin to compile a batch's kernels in one of its threads."""
     scene = with_values(batch.scene, batch.names, np.zeros(len(batch.names)))
     form = Form.of(jax.eval_shape(mechanics_about_sliding, scene))

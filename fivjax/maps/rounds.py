@@ -14,10 +14,10 @@ from . import attractors
 from .at_last import fates
 from .attractors import Attractors, add_cycle, add_tori, come_to, has_crossed, section_of
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct, stable_cycles
-from .conclusion import slide_for_ever
+from .conclusion import slide_forever
 from .flattened import Flattened
 from .following import begun, follow
-from .kernels import Kernels, built_soon
+from .kernels import Kernels, begin_building
 from .parting import followed_on
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
@@ -60,7 +60,7 @@ def follow_all(
     """
     of_groups, group = grouped(values, states)
     if batch.by_kernel:
-        built_soon(batch)
+        begin_building(batch)
     shared = shared_by(batch, of_groups)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in (*batch.history, *states))], axis=-1)[:, 1:]
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
@@ -215,6 +215,6 @@ class Basins:
         chaotic[asks] = found.chaotic
         sliding = np.flatnonzero(found.without_events)
         if len(sliding):
-            certain = slide_for_ever(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
+            certain = slide_forever(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
             sliding = sliding[certain]
         return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding]

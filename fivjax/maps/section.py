@@ -26,7 +26,7 @@ from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
 from .sharing import Batch
-from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, many_of_each, moved_in_windows, no_path, with_newest
+from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, in_rows_of_several, moved_in_windows, no_path, with_newest
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -50,6 +50,11 @@ class Section(NamedTuple):
         """Write these rows at the chosen indices."""
         for whole, part in zip(self, rows, strict=True):
             whole[chosen] = part
+
+    def flattened(self, *more: np.ndarray) -> Flattened:
+        """As one array, with what else there is of each row."""
+        status, direction = np.asarray(self.status, np.int32), np.asarray(self.direction, float)
+        return flatten((np.asarray(self.y), status, direction, *more))
 
 
 class Images(NamedTuple):
@@ -176,7 +181,7 @@ class ReturnMaps:
         if self.kernels is not None:
             return self.kernels.returns(group, *at, crossings, peaks)
         rows = _rows(at, crossings, np.full(len(at.y), peaks))
-        width, size = (SIDE_BY_SIDE, self.block) if many_of_each(group) else (1, FEW)
+        width, size = (SIDE_BY_SIDE, self.block) if in_rows_of_several(group) else (1, FEW)
         return in_blocks(moved_in_windows, self.windows, group, rows, width, self.pool, size=size).tree
 
     def _exactly(self, program, size: int, group, at: Section, crossings):
@@ -184,9 +189,7 @@ class ReturnMaps:
 
 
 def _rows(at: Section, crossings, *more) -> Flattened:
-    status, direction = np.asarray(at.status, np.int32), np.asarray(at.direction, float)
-    crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(status))
-    return flatten((np.asarray(at.y), status, direction, crossings.copy(), *more))
+    return at.flattened(np.broadcast_to(np.asarray(crossings, np.int32), len(at.y)).copy(), *more)
 
 
 def _images(found) -> Images:
@@ -220,14 +223,16 @@ def _with_path(shared, y, status, direction, crossings):
     return y, after.contact.status, after.contact.direction, events, longest - after.left, path
 
 
-def _of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
-    of_group = jax.vmap(one, in_axes=(None, 0, 0, 0, 0))
-    return flatten(jax.vmap(of_group)(shared.tree, *rows.tree), row_axes=2)
+def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
+    """A function of what a group shares and of one row's own, for all rows of a block."""
+    own = rows.tree
+    of_group = jax.vmap(one, in_axes=(None, *[0] * len(own)))
+    return flatten(jax.vmap(of_group)(shared.tree, *own), row_axes=2)
 
 
 @compiled
 def _returned(shared: Flattened, rows: Flattened) -> Flattened:
-    return _of_block(_with_path, shared, rows)
+    return of_block(_with_path, shared, rows)
 
 
 @compiled
@@ -243,7 +248,7 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
 
         return jax.vmap(along, out_axes=(None, 1))(jnp.eye(y.shape[0], dtype=y.dtype))
 
-    return _of_block(one, shared, rows)
+    return of_block(one, shared, rows)
 
 
 @compiled
@@ -253,4 +258,4 @@ def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
         point = Point(y, Contact(status.astype(jnp.int32), direction))
         return peak_speed_along(EventExact(), mechanics, point, crossings, longest * crossings, MOST_SEGMENTS)[0]
 
-    return _of_block(one, shared, rows)
+    return of_block(one, shared, rows)

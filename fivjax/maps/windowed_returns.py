@@ -20,8 +20,12 @@ SIDE_BY_SIDE, FEW = 8, 8
 KEPT = 16
 
 
-def many_of_each(group: Int[np.ndarray, " m"]) -> bool:
-    """Whether these motions' groups have so many of them that rows of several are not mostly padding."""
+def in_rows_of_several(group: Int[np.ndarray, " m"]) -> bool:
+    """Whether these motions go by rows of several: not where those were mostly padding. Off the CPU blocks are large, and each
+    row more has its group's matrices.
+    """
+    if jax.default_backend() != "cpu":
+        return True
     _, count = np.unique(group, return_counts=True)
     return bool(SIDE_BY_SIDE * np.sum(-(-count // SIDE_BY_SIDE)) <= 2 * len(group))
 
