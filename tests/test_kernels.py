@@ -163,6 +163,16 @@ def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch):
     np.testing.assert_allclose(found.amplitude.values[cycles], expected.amplitude.values[cycles], rtol=2e-3)
 
 
+def test_a_map_over_masses_by_kernels_is_that_of_each_structure(paper_scene):
+    """A mass has to be positive, also in what is compiled before its values are looked at."""
+    p = [1.0, 2.0]
+    found = fj.bistability_map(paper_scene, m1=[0.45, 0.55], p=p, progress=False)
+    for m1, row in zip(found["m1"].values, found.verdict.transpose("m1", "p"), strict=True):
+        alone = fj.bistability_map(paper_scene.replace(m1=float(m1)), p=p, progress=False)
+        np.testing.assert_array_equal(row, alone.verdict)
+    assert len(np.unique(found.verdict)) == 2
+
+
 def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "warp", None)
     warp_library._initialised.cache_clear()

@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ..cycles.section_map import mechanics_about_sliding
 from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
@@ -30,9 +30,9 @@ AT_A_TIME, LEAST_STEPS = 4, 4096
 STEPS_TO_CROSSING = 9
 
 
-def begin_building(batch: Batch) -> None:
-    """Begin to compile a batch's kernels in one of its threads."""
-    scene = with_values(batch.scene, batch.names, np.zeros(len(batch.names)))
+def begin_building(batch: Batch, of_group: Float[np.ndarray, " k"]) -> None:
+    """Begin to compile a batch's kernels, with the parameters of any of its groups, in one of its threads."""
+    scene = with_values(batch.scene, batch.names, of_group)
     form = Form.of(jax.eval_shape(mechanics_about_sliding, scene))
     batch.pool.submit(_built, form)
 
