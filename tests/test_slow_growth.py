@@ -102,7 +102,6 @@ def test_chaos_is_no_torus():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="weakly locked: taken as the torus it was found as, whose peak is 5.5 % higher", strict=True)
 @pytest.mark.skipif(not reference.available(), reason="needs a C++ compiler")
 def test_on_a_locked_torus_the_amplitude_is_that_of_its_cycle():
     """Eleven crossings a period; the torus about it has peaks that its cycle has not."""

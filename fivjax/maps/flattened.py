@@ -1,6 +1,8 @@
 """A tree of arrays as one array of numbers, with one row per trajectory: calls with few arrays start faster."""
 
+import functools
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,17 +24,16 @@ class Flattened(eqx.Module):
     def tree(self) -> PyTree:
         """The tree again. For a NumPy array its real leaves are views: writing to them changes this array."""
         structure, shapes, types = self.form
-        leaves, start, rows = [], 0, self.numbers.shape[:-1]
-        for shape, kind in zip(shapes, types, strict=True):
-            is_complex = np.issubdtype(kind, np.complexfloating)
-            size = math.prod(shape) * (2 if is_complex else 1)
-            part = self.numbers[..., start : start + size]
-            if is_complex:
+        rows = self.numbers.shape[:-1]
+
+        def leaf(place: _Place) -> Array | np.ndarray:
+            part = self.numbers[..., place.numbers]
+            if place.is_complex:
                 part = part.reshape(*rows, -1, 2)
                 part = part[..., 0] + 1j * part[..., 1]
-            leaves.append(part.reshape(*rows, *shape).astype(kind, copy=False))
-            start += size
-        return jax.tree.unflatten(structure, leaves)
+            return part.reshape(*rows, *place.shape).astype(place.kind, copy=False)
+
+        return jax.tree.unflatten(structure, [leaf(place) for place in _places(shapes, types)])
 
     def compacted(self, rows: Int[np.ndarray, " r"]) -> "Flattened":
         """Only these rows, in rising order, moved in place to the beginning of the array, without a second array."""
@@ -43,6 +44,26 @@ class Flattened(eqx.Module):
             # No row moves to a higher index, so no row that is still needed is overwritten.
             self.numbers[start : start + len(chosen)] = self.numbers[chosen]
         return Flattened(self.numbers[: len(rows)], self.form)
+
+
+class _Place(NamedTuple):
+    """Where a leaf is among the numbers of a row, and its shape and type."""
+
+    numbers: slice
+    shape: tuple[int, ...]
+    kind: np.dtype
+    is_complex: bool
+
+
+@functools.cache
+def _places(shapes: tuple, types: tuple) -> list[_Place]:
+    places, start = [], 0
+    for shape, kind in zip(shapes, map(np.dtype, types), strict=True):
+        is_complex = np.issubdtype(kind, np.complexfloating)
+        end = start + math.prod(shape) * (2 if is_complex else 1)
+        places.append(_Place(slice(start, end), shape, kind, is_complex))
+        start = end
+    return places
 
 
 def flatten(tree: PyTree, row_axes: int = 1) -> Flattened:

@@ -25,7 +25,7 @@ COST_OF_STANDING_ALONE = 4
 # much; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
-GROUPS_IN_A_JOB = 256
+GROUPS_IN_A_JOB = 512
 # Memory that a job may take, bytes: trajectories in small groups take much.
 OF_A_JOB = 2.5e8
 

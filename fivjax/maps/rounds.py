@@ -22,7 +22,7 @@ from .parting import followed_on
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .section import ReturnMaps
 from .sharing import Batch, grouped, shared_by
-from .tori import Torus
+from .tori import TUBES, Torus
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4
@@ -31,7 +31,7 @@ OWN_FROM, OWN_AGAIN = 16, 2
 # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long anyway.
 MORE_FROM = 64
 # Ensembles that are followed at once: the paths of motions that may be on tori take memory, some 0.2 MB each.
-ENSEMBLES = 128
+ENSEMBLES = 256
 # How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
 LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 # Where a cycle is known that attracts slowly: for so many of its time constants, but not for more periods than so many.
@@ -176,7 +176,7 @@ class Basins:
             part = alone[start : start + ENSEMBLES]
             own = group[picked[part]]
             before = [len(self.known[g].cycles) for g in own]
-            add_tori(self.maps, own, at.rows(part), self.known, report)
+            add_tori(self.maps, own, at.rows(part), self.known, report, TUBES)
             for g, count in zip(own, before, strict=True):
                 self._wait_for(g, self.known[g].cycles[count:])
 

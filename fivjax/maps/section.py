@@ -98,16 +98,34 @@ class ReturnMaps:
 
     def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
         """The next `count` states on the section from each row: the last one with its contact mode; and all of them."""
+        at, states, _ = self._path(group, at, count)
+        return at, states
+
+    def path_and_peaks(
+        self, group, at: Section, count: int
+    ) -> tuple[Section, Float[np.ndarray, "m count 2n"], Float[np.ndarray, " m"]]:
+        """The same, and the largest tangential speed (m/s) on the way."""
+        if self.windows is None:
+            end, states = self.path(group, at, count)
+            return end, states, self.peaks(group, at, count)
+        return self._path(group, at, count, peaks=True)
+
+    def _path(self, group, at: Section, count: int, peaks: bool = False):
         if self.kernels is not None:
-            *end, _, _, path, _ = self.kernels.returns(group, *at, count, False, kept=count)
-            return Section(*end), path
-        states = []
+            *end, _, _, path, peak = self.kernels.returns(group, *at, count, peaks, kept=count)
+            return Section(*end), path, peak
+        states, highest = [], np.zeros(len(at.y))
         while count > 0:
             part = min(count, KEPT)
-            image = self.returns(group, at, part)
-            at, count = image.at, count - part
-            states.append(image.path[:, KEPT - part :])
-        return at, np.concatenate(states, axis=1)
+            if self.windows is None:
+                image = self.returns(group, at, part)
+                at, path = image.at, image.path
+            else:
+                *end, _, _, path, peak = self._in_windows(group, at, part, peaks)
+                at, highest = Section(*end), np.maximum(highest, peak)
+            count -= part
+            states.append(path[:, KEPT - part :])
+        return at, np.concatenate(states, axis=1), highest
 
     def derived(
         self, group, at: Section, crossings
@@ -169,13 +187,6 @@ class ReturnMaps:
             if not len(row):
                 break
         return base.at, base.time, derivatives
-
-    def peaks_and_ends(self, group, at: Section, crossings) -> tuple[Float[np.ndarray, " m"], Section]:
-        """`peaks`, and the states at the end."""
-        if self.windows is None:
-            return self.peaks(group, at, crossings), self.returns(group, at, crossings).at
-        *found, peak = self._in_windows(group, at, crossings, peaks=True)
-        return peak, Section(*found[:3])
 
     def _in_windows(self, group, at: Section, crossings, peaks: bool = False):
         if self.kernels is not None:

@@ -13,7 +13,7 @@ from ..verdicts import tube
 from ..verdicts.tube import nearest
 from ..verdicts.tube_of_several import starts_of_several
 from .captures import CROSSINGS, KNOWN_TO, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
-from .parting import PARTING_OVER, parting_rates
+from .parting import parting_rates
 from .section import ReturnMaps, Section
 from .windowed_returns import KEPT
 
@@ -41,11 +41,24 @@ LOCKED = -0.01
 # On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
 # within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
 SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
-# The largest speed in so many returns is the torus' amplitude if it has changed by no more than this share in so many returns,
-# or in as many as starts about the torus took to come back, if these are more. Else the motions settle, each time for twice as
-# long, so often at most: a set whose amplitude still drifts is not accepted. (What shrinks slowly beats more than it shrinks in
-# a short time, and may seem to stand still; and the highest beats may be rare.)
-PEAK_OVER, SETTLE_OVER, SETTLED, SETTLE_TIMES = 128, 384, 7.5e-4, 6
+# The largest speed in the later half of the states is the torus' amplitude if that in the earlier half differs by no more than
+# this share. Else the motion is followed further, for so many returns at most: a set whose amplitude still drifts is not
+# accepted. (What shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats
+# may be rare.)
+SETTLED, SETTLED_WITHIN = 7.5e-4, 24576
+# Returns that starts about a torus take from the edge of the tube to the torus, once they are back.
+COME_NEARER = 128
+
+
+class Traced(NamedTuple):
+    """What a motion that may be on a torus traces on the section."""
+
+    states: Float[np.ndarray, "k 2n"]  # weighted deviations, in order
+    amplitude: float  # m/s
+
+    def thinned(self, count: int) -> "Traced":
+        """With some `count` of the states."""
+        return self._replace(states=self.states[:: max(len(self.states) // count, 1)])
 
 
 class Torus(NamedTuple):
@@ -78,9 +91,8 @@ def tori_from(
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
-            open_ = {row: path for row, path in paths.items() if row in traced}
-            sets = [(row, path[:: max(len(path) // count, 1)]) for row, path in open_.items()]
-            sets = [(row, states) for row, states in sets if not _holds_one_of(maps, states, cycles[row], radius)]
+            open_ = [(row, one.thinned(count)) for row, one in paths.items() if row in traced]
+            sets = [(row, one) for row, one in open_ if not _holds_one_of(maps, one.states, cycles[row], radius)]
             if not sets:
                 continue
             new, of_locked = _attracting(maps, group, sets, cycles, radius, report)
@@ -127,25 +139,38 @@ def _holds(torus: Torus, ends: Float[np.ndarray, "h m 2n"]):
 
 def _traced(
     maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, tori: list[list[Torus]], count: int
-) -> dict[int, Float[np.ndarray, "_ 2n"]]:
-    """At least so many weighted states of those motions, by row, that may be on a torus that is none of the known ones."""
-    running, paths = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1]))
-    traced: dict[int, Float[np.ndarray, "_ 2n"]] = {}
-    for length in range(AT_A_TIME, LONGER + 1, AT_A_TIME):
+) -> dict[int, Traced]:
+    """At least so many states of those motions, by row, that may be on a torus that is none of the known ones."""
+    running, paths, peaks = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1])), np.zeros((len(group), 0))
+    traced: dict[int, Traced] = {}
+    for length in range(AT_A_TIME, SETTLED_WITHIN + 1, AT_A_TIME):
         if not len(running):
             break
-        at, more = maps.path(group[running], at, AT_A_TIME)
+        if length == AT_A_TIME:
+            # Most are left out after this, and peaks take as long as the motion.
+            at, more = maps.path(group[running], at, AT_A_TIME)
+        else:
+            at, more, highest = maps.path_and_peaks(group[running], at, AT_A_TIME)
+            peaks = np.concatenate([peaks, highest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
         more *= maps.weights
-        paths, left = np.concatenate([paths, more], axis=1), np.zeros(len(running), bool)
+        paths = np.concatenate([paths, more], axis=1)[:, -LONGER:]
+        left = np.zeros(len(running), bool)
         for k, (row, path, now) in enumerate(zip(running, paths, more, strict=True)):
             if not _may_come_to_torus(now, tori[row]):
                 continue
-            if length >= count and _may_be_torus(path):
-                traced[int(row)] = path
+            may_be = length >= count and _may_be_torus(path)
+            if may_be and (amplitude := _settled(peaks[k])):
+                traced[int(row)] = Traced(path, amplitude)
             else:
-                left[k] = True
-        running, at, paths = running[left], at.rows(left), paths[left]
+                left[k] = may_be or length < LONGER
+        running, at, paths, peaks = running[left], at.rows(left), paths[left], peaks[left]
     return traced
+
+
+def _settled(peaks: Float[np.ndarray, " k"]) -> float | None:
+    """The largest of successive peaks (m/s), unless it differs much from half of them to the other."""
+    earlier, later = np.max(peaks[: len(peaks) // 2]), np.max(peaks[len(peaks) // 2 :])
+    return float(later) if abs(later / earlier - 1) <= SETTLED else None
 
 
 def _may_come_to_torus(path: Float[np.ndarray, "k 2n"], known: list[Torus]) -> bool:
@@ -187,35 +212,37 @@ def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
     return bool(np.median(nearest(states, states, others=True)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
 
 
-def _traced_around(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Float[np.ndarray, "_ 2n"]]
-) -> dict[int, Float[np.ndarray, "_ 2n"]]:
-    """The states of motions about those that are in clusters."""
-    rows = [row for row, path in traced.items() if _in_clusters(path)]
+def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
+    """The motions that are in clusters, with the states that others about them trace; their amplitudes are their own."""
+    rows = [row for row, one in traced.items() if _in_clusters(one.states)]
     if not rows:
         return {}
-    own, at = _starts(maps, group[rows], [traced[row] for row in rows], tube.RADIUS)
+    own, at = _starts(maps, group[rows], [traced[row].states for row in rows], tube.RADIUS)
     _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // tube.STARTS)
     states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
-    return {row: whole for row, whole in zip(rows, states, strict=True) if np.all(np.isfinite(whole))}
+    return {
+        row: traced[row]._replace(states=whole)
+        for row, whole in zip(rows, states, strict=True)
+        if np.all(np.isfinite(whole))
+    }
 
 
 def _attracting(
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
-    sets: list[tuple[int, Float[np.ndarray, "k 2n"]]],
+    sets: list[tuple[int, Traced]],
     known: list[list[Cycle]],
     radius: float,
     report,
 ) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
     """Which of these sets, each with its row, are tori; and the cycles of those that are locked."""
     own = np.array([groups[row] for row, _ in sets])
-    back, last, taken = _back(maps, own, [states for _, states in sets], radius, report)
+    back, last = _back(maps, own, [one.states for _, one in sets], radius, report)
     if not len(back):
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
-    group, at = own[chosen // tube.STARTS], last.rows(chosen)
-    peak, at = _highest(maps, group, at)
+    group = own[chosen // tube.STARTS]
+    at = maps.returns(group, last.rows(chosen), COME_NEARER).at
     growth, period, later, path = parting_rates(maps, group, at)
     growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
     lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
@@ -236,21 +263,11 @@ def _attracting(
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
         kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
-    if not len(kept):
-        return {}, cycles
-    rows = _of_each(kept)
-    peak = _settled_peak(maps, group[rows], later.rows(rows), peak[kept], taken[back[kept]])
     tori = {}
-    for k, mean, highest in zip(kept, period[kept], peak, strict=True):
-        row, states = sets[back[k]]
-        if np.isfinite(mean) and np.isfinite(highest):
-            tori[row] = Torus(states.copy(), radius, float(highest), float(mean))
+    for k in kept[np.isfinite(period[kept])]:
+        row, one = sets[back[k]]
+        tori[row] = Torus(one.states.copy(), radius, one.amplitude, float(period[k]))
     return tori, cycles
-
-
-def _of_each(tori: Int[np.ndarray, " t"]) -> Int[np.ndarray, " s"]:
-    """The places of the motions on each of these tori."""
-    return (FURTHER * tori[:, None] + np.arange(FURTHER)).ravel()
 
 
 def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: list[Cycle], radius: float) -> bool:
@@ -260,20 +277,24 @@ def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: l
 
 def _back(
     maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "k 2n"]], radius: float, report
-) -> tuple[Int[np.ndarray, " t"], Section, Int[np.ndarray, " s"]]:
-    """About which of the sets all starts come back; where the starts are then, set by set; and in how many crossings."""
+) -> tuple[Int[np.ndarray, " t"], Section]:
+    """About which of the sets all starts come back; and where the starts are then, set by set."""
     weights, count = maps.weights, tube.STARTS
     own, last = _starts(maps, group, sets, radius)
-    back, ok, taken = np.zeros(len(own), bool), np.ones(len(sets), bool), np.zeros(len(sets), int)
+    back, ok = np.zeros(len(own), bool), np.ones(len(sets), bool)
     smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
     place, of_set = np.arange(len(own)) % count, np.arange(len(own)) // count
     for among in (place < FIRST, place >= FIRST):
         running = np.flatnonzero(among & ok[of_set])
-        for crossed in range(KEPT, BACK_WITHIN + 1, KEPT):
+        crossed = 0
+        while crossed < BACK_WITHIN:
             if not len(running):
                 break
             report(0)
-            image = maps.returns(own[running], last.rows(running), KEPT)
+            # Most are back soon; the others are looked at in growing steps.
+            further = min(max(KEPT, crossed // 2), BACK_WITHIN - crossed)
+            crossed += further
+            image = maps.returns(own[running], last.rows(running), further)
             last.put(running, image.at)
             ends = weights * np.moveaxis(image.path, 1, 0)
             # One that fades, or fails, does not come back.
@@ -283,10 +304,9 @@ def _back(
             for k in np.unique(of_set[running]):
                 mine = of_set[running] == k
                 back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine], CLOSER * radius)
-            taken[of_set[running]] = np.maximum(taken[of_set[running]], crossed)
             running = running[ok[of_set[running]] & ~back[running]]
         ok[of_set[among & ~back]] = False
-    return np.flatnonzero(ok), last, taken
+    return np.flatnonzero(ok), last
 
 
 def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
@@ -305,41 +325,6 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
     return bool(
         np.max(apart) <= SAME_MEAN * extent(whole) and np.all(missed <= NEAR_OTHERS * np.array(steps) + rounding)
     )
-
-
-def _highest(maps: ReturnMaps, group, at: Section) -> tuple[Float[np.ndarray, " t"], Section]:
-    """The largest tangential speed (m/s) in the next `PEAK_OVER` returns of motions on tori, `FURTHER` on each; and where the
-    motions are then.
-    """
-    highest, end = maps.peaks_and_ends(group, at, PEAK_OVER)
-    return np.max(highest.reshape(-1, FURTHER), axis=1), end
-
-
-def _settled_peak(
-    maps: ReturnMaps, group, at: Section, before: Float[np.ndarray, " t"], over: Int[np.ndarray, " t"]
-) -> Float[np.ndarray, " t"]:
-    """The same once it has settled, from what it was `before`; not a number where it does not settle, each time `over` twice as
-    many returns.
-    """
-    peak, last = np.full(len(before), np.nan), before.copy()
-    over = np.maximum(over, SETTLE_OVER)
-    running, further = np.arange(len(peak)), over - 2 * PARTING_OVER
-    for _ in range(SETTLE_TIMES):
-        going = running[further[running] > 0]
-        rows = _of_each(going)
-        if len(rows):
-            at.put(rows, maps.returns(group[rows], at.rows(rows), np.repeat(further[going], FURTHER)).at)
-        rows = _of_each(running)
-        now, end = _highest(maps, group[rows], at.rows(rows))
-        at.put(rows, end)
-        done = np.abs(now / last[running] - 1) <= SETTLED
-        peak[running[done]], last[running] = now[done], now
-        running = running[~done & np.isfinite(now)]
-        if not len(running):
-            break
-        over *= 2
-        further = over
-    return peak
 
 
 def _starts(

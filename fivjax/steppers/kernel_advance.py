@@ -272,14 +272,19 @@ def stepping(form: Form) -> Stepping:
         highest = wp.abs(end[velocity])
         speeds = speeds_of()
         turned = speeds_of()
-        for k in range(INTERVALS + 1):
+        # Parabolas through three samples tell peaks apart: one sample behind the end counts, too.
+        for k in range(wp.min(int(steps) + 2, INTERVALS + 1)):
             speeds[k] = sample(m, w, samples + of_sample * k, here)[velocity]
             turned[k] = -speeds[k]
             if real(k) <= steps:
                 highest = wp.max(highest, wp.abs(speeds[k]))
         upper = int(fastest_sample(speeds, one_number(steps))[0])
         lower = int(fastest_sample(turned, one_number(steps))[0])
-        highest = wp.max(highest, highest_near(m, w, here, load, upper, steps, interval))
-        return wp.max(highest, highest_near(m, w, here, load, lower, steps, interval))
+        # Next to a sample that is much slower than others there is no highest peak.
+        if speeds[upper] > half * highest:
+            highest = wp.max(highest, highest_near(m, w, here, load, upper, steps, interval))
+        if turned[lower] > half * highest:
+            highest = wp.max(highest, highest_near(m, w, here, load, lower, steps, interval))
+        return highest
 
     return Stepping(law.name, t, advance, peak)

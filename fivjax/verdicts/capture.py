@@ -35,6 +35,7 @@ The state of a crossing must be known much better than the radius. The states th
 errors of some thousandths, which is only enough to choose the trajectories to test.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -196,6 +197,7 @@ def _same_mode(status, direction, other, other_direction):
     return np.all(same, axis=-1) if np.ndim(other) else same
 
 
+@functools.cache
 def directions(dimension: int) -> Float[np.ndarray, "d f"]:
     """Directions that fill the unit sphere evenly, in opposite pairs, including the axes."""
     from scipy.special import ndtri
