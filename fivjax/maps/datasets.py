@@ -35,7 +35,7 @@ def map_dataset(
 ) -> xr.Dataset:
     """The labelled dataset of a grid of trajectories.
 
-    `source`, if not all trajectories were computed: for each one the trajectory whose result it takes.
+    `source`, if not all trajectories were computed: for each one the trajectory whose result it takes, in `verdicts` itself.
     """
     axes, shape = grid.axes, grid.shape
     place, table = attractor_table(grid.groups, verdicts)
@@ -43,7 +43,10 @@ def map_dataset(
     if source is not None:
         own = source == np.arange(len(source))
         computed["computed"] = (tuple(axes), own.reshape(shape), {"long_name": "whether it was computed", "units": "1"})
-        place, verdicts = place[source], jax.tree.map(lambda leaf: leaf[source], verdicts)
+        place = place[source]
+        # One after the other in place: together they take as much memory as all the rest.
+        for leaf in jax.tree.leaves(verdicts):
+            leaf[:] = leaf[source]
     dataset = xr.Dataset(
         {
             "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),

@@ -1,5 +1,6 @@
 """Adaptive maps: a coarse grid that is refined where neighbours differ, and checked at random elsewhere."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -42,7 +43,9 @@ def refined(
     them; a computed point takes its own. Of the points that were never computed, a share `audit` is computed in the end and
     compared. After an interrupt nothing more is computed, and the finer points take their own (missing) results.
     """
-    places = np.arange(np.prod(shape)).reshape(shape)
+    # Arrays of a map of many millions of points take hundreds of megabytes each.
+    small = np.int32 if math.prod(shape) < 2**31 else np.int64
+    places = np.arange(math.prod(shape), dtype=small).reshape(shape)
     source = places.ravel().copy()
 
     def every(step: int) -> tuple[slice, ...]:
@@ -70,7 +73,9 @@ def refined(
         going = compute(new[wanted], f"halving {level} of {halvings}")
     others = np.flatnonzero(source != places.ravel())
     count = min(len(others), int(np.ceil(audit * len(others)))) if going else 0
-    chosen = np.sort(np.random.default_rng(0).choice(others, count, replace=False)) if count else others[:0]
+    chosen = (
+        others[np.sort(np.random.default_rng(0).choice(len(others), count, replace=False))] if count else others[:0]
+    )
     compute(chosen, "audit")
     chosen = chosen[~verdicts.pending[chosen]]
     wrong = verdicts.verdict[chosen] != verdicts.verdict[source[chosen]]
