@@ -227,12 +227,7 @@ def _checked(scene: Scene, by, free, bounds):
             raise ValueError(
                 f"Parameter `{name}` is zero, so a relative change of it has no meaning. Leave it out of `free`."
             )
-        pair = arguments.numeric_array(f"bounds[{name!r}]", bounds.get(name, sorted((0.5 * own, 2 * own))))
-        if pair.shape != (2,) or not np.all(np.isfinite(pair)) or not pair[0] <= own <= pair[1] or pair[0] == pair[1]:
-            raise ValueError(
-                f"The bounds of `{name}` must be two numbers that hold its own value {own:g}, the lower one first, but are "
-                f"{pair.tolist()}."
-            )
+        pair = arguments.bounds_about(name, bounds.get(name, sorted((0.5 * own, 2 * own))), own)
         limits.append((pair - own) / abs(own))
     low, high = np.array(limits).T
     return names, start, low, high

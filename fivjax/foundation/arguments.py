@@ -55,6 +55,17 @@ def numeric_array(name: str, value) -> np.ndarray:
     return array
 
 
+def bounds_about(name: str, pair, own: float) -> np.ndarray:
+    """The lowest and the highest value that the parameter `name` may take, between which its `own` value lies."""
+    pair = numeric_array(f"bounds[{name!r}]", pair)
+    if pair.shape != (2,) or not np.all(np.isfinite(pair)) or pair[0] >= pair[1] or not pair[0] <= own <= pair[1]:
+        raise ValueError(
+            f"The bounds of `{name}` must be two numbers that hold its own value {own:g}, the lower one first, but are "
+            f"{pair.tolist()}."
+        )
+    return pair
+
+
 def axis(name: str, values) -> np.ndarray:
     """The values of one axis of a batch: one-dimensional, not empty, finite, strictly increasing."""
     array = numeric_array(name, values).astype(np.float64)

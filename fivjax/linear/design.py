@@ -211,17 +211,7 @@ def _checked_bounds(structure: Structure, bounds, tied):
         if key not in structure.parameters:
             raise ValueError(f"Structure has no parameter `{key}`; it has: {known}.")
     for key, pair in bounds.items():
-        pair = arguments.numeric_array(f"bounds[{key!r}]", pair)
-        if pair.shape != (2,) or not np.all(np.isfinite(pair)) or pair[0] >= pair[1]:
-            raise ValueError(
-                f"The bounds of `{key}` must be two numbers, the lower one first, but are {pair.tolist()}."
-            )
-        own = float(structure.parameters[key])
-        if not pair[0] <= own <= pair[1]:
-            raise ValueError(
-                f"The bounds of `{key}` must hold the structure's own value {own:g}, where the search starts, but are "
-                f"{pair.tolist()}."
-            )
+        pair = arguments.bounds_about(key, pair, float(structure.parameters[key]))
         structure.replace(**{key: pair[0]})
         structure.replace(**{key: pair[1]})
     table = np.array([bounds[key] for key in bounds], dtype=np.float64)
