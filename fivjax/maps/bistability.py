@@ -136,6 +136,7 @@ def bistability_map(
             run(label=f"map, {what}", verdicts=verdicts, places=places, attractors=found)
 
         source, checked = refined(grid.shape, refine, audit, verdicts, level)
+        found.clear()  # of a large map they take as much memory as its results
     dataset = map_dataset(scene, method, t_max, grid, verdicts, source=source)
     dataset.attrs.update(audit_note(checked))
     return dataset

@@ -41,7 +41,7 @@ def map_dataset(
     place, table = attractor_table(grid.groups, verdicts)
     computed = {}
     if source is not None:
-        own = source == np.arange(len(source))
+        own = source == np.arange(len(source), dtype=source.dtype)
         computed["computed"] = (tuple(axes), own.reshape(shape), {"long_name": "whether it was computed", "units": "1"})
         place = place[source]
         # One after the other in place: together they take as much memory as all the rest.

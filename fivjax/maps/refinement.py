@@ -71,16 +71,21 @@ def refined(
         before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
         source[new[rest]] = source[before[rest]]
         going = compute(new[wanted], f"halving {level} of {halvings}")
-    others = np.flatnonzero(source != places.ravel())
-    count = min(len(others), int(np.ceil(audit * len(others)))) if going else 0
-    chosen = (
-        others[np.sort(np.random.default_rng(0).choice(len(others), count, replace=False))] if count else others[:0]
-    )
+    chosen = _audited(np.flatnonzero(source == places.ravel()), places.size, audit if going else 0.0)
     compute(chosen, "audit")
     chosen = chosen[~verdicts.pending[chosen]]
     wrong = verdicts.verdict[chosen] != verdicts.verdict[source[chosen]]
     source[chosen] = chosen
     return source, Audit(len(chosen), int(wrong.sum()))
+
+
+def _audited(computed: Int[np.ndarray, " k"], total: int, share: float) -> Int[np.ndarray, " r"]:
+    """A random share of the points that were not `computed`, without a list of them all."""
+    left = total - len(computed)
+    count = min(left, math.ceil(share * left))
+    which = np.sort(np.random.default_rng(0).choice(left, count, replace=False))
+    # So many points that were not computed come before each that was.
+    return which + np.searchsorted(computed - np.arange(len(computed)), which, side="right")
 
 
 def audit_note(audit: Audit) -> dict[str, float | int]:

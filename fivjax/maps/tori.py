@@ -163,6 +163,10 @@ def _traced(
                 traced[int(row)] = Traced(path, amplitude)
             else:
                 left[k] = may_be or length < LONGER
+        if length == LONGER and np.any(left):
+            # What never settles is chaos, mostly.
+            growth, *_ = parting_rates(maps, group[running[left]], at.rows(left))
+            left[left] = growth < PARTING
         running, at, paths, peaks = running[left], at.rows(left), paths[left], peaks[left]
     return traced
 
