@@ -81,6 +81,7 @@ class Winding:
     """A return map by which states wind about a circle that each keeps; section states are weighted by 2 and 1."""
 
     weights = np.array([2.0, 1.0])
+    known_to = 0.01
 
     def __init__(self):
         self.asked: list[int] = []

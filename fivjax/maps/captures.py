@@ -30,8 +30,6 @@ NEWTON_STEPS, MISSES = 14, 3
 NOMINATED = 2
 # The same cycle: a state this close to one of its own, relative to their size.
 SAME = 1e-6
-# How well crossings are known that tell which trajectories to ask, relative to the cycle's size.
-KNOWN_TO = 0.01
 
 
 class Cycle(NamedTuple):
@@ -253,7 +251,7 @@ def captured(
         n = cycle.neighbourhood
         with np.errstate(invalid="ignore"):
             apart = np.linalg.norm(weights * (latest[rows][:, None] - cycle.points), axis=2)
-            close = apart.min(axis=1) <= n.radius + KNOWN_TO * np.linalg.norm(weights * n.centre)
+            close = apart.min(axis=1) <= n.radius + maps.known_to * np.linalg.norm(weights * n.centre)
         chosen = rows[close]
         if len(chosen):
             crossings = len(cycle.points) - apart[close].argmin(axis=1)

@@ -35,6 +35,9 @@ DERIVED_BLOCK = 16
 # have other events that far away. And the most crossings over which a difference is taken.
 STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
 
+# Relative errors of trajectories' crossings, at most: kernels compute them to rounding, `Windowed` interpolates samples.
+ROUNDED, INTERPOLATED = 1e-6, 1e-2
+
 
 class Section(NamedTuple):
     """States on the section, or on the way to it, in rows: deviations from the sliding equilibrium, with contact modes."""
@@ -74,6 +77,8 @@ class ReturnMaps:
         longest = np.asarray(tree.longest_return)
         self.mechanics = flatten((tree.mechanics, longest))
         self.windows = flatten((tree.prepared, longest)) if isinstance(batch.method, Windowed) else None
+        # How well trajectories' latest crossings are known, relative to their size: they tell which to ask for attractors.
+        self.known_to = ROUNDED if kernels is not None else INTERPOLATED
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)

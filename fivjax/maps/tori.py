@@ -12,7 +12,7 @@ from ..cycles.torus import drifts, extent, smooth_mean
 from ..verdicts import tube
 from ..verdicts.tube import nearest
 from ..verdicts.tube_of_several import starts_of_several
-from .captures import CROSSINGS, KNOWN_TO, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
+from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
 from .section import ReturnMaps, Section
 from .windowed_returns import KEPT
@@ -116,7 +116,7 @@ def reached(
     """
     near = []
     for rows, torus in known:
-        width = (0.5 * torus.radius + KNOWN_TO) * tube.mean_size(torus.states)
+        width = (0.5 * torus.radius + maps.known_to) * tube.mean_size(torus.states)
         with np.errstate(invalid="ignore"):
             near.append(rows[nearest(maps.weights * latest[rows], torus.states) <= width])
     asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
