@@ -110,9 +110,6 @@ class ReturnMaps:
         self, group, at: Section, count: int
     ) -> tuple[Section, Float[np.ndarray, "m count 2n"], Float[np.ndarray, " m"]]:
         """The same, and the largest tangential speed (m/s) on the way."""
-        if self.windows is None:
-            end, states = self.path(group, at, count)
-            return end, states, self.peaks(group, at, count)
         return self._path(group, at, count, peaks=True)
 
     def _path(self, group, at: Section, count: int, peaks: bool = False):
@@ -122,13 +119,14 @@ class ReturnMaps:
         states, highest = [], np.zeros(len(at.y))
         while count > 0:
             part = min(count, KEPT)
-            if self.windows is None:
-                image = self.returns(group, at, part)
-                at, path = image.at, image.path
-            else:
+            if self.windows is not None:
                 *end, _, _, path, peak = self._in_windows(group, at, part, peaks)
-                at, highest = Section(*end), np.maximum(highest, peak)
-            count -= part
+                end = Section(*end)
+            else:
+                # Most paths need no peaks, so these are of another program.
+                end, _, _, path = self.returns(group, at, part)
+                peak = self.peaks(group, at, part) if peaks else highest
+            at, highest, count = end, np.maximum(highest, peak), count - part
             states.append(path[:, KEPT - part :])
         return at, np.concatenate(states, axis=1), highest
 
