@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from ..cycles.section_map import mechanics_about_sliding
 from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
@@ -30,10 +30,14 @@ AT_A_TIME, LEAST_STEPS = 4, 4096
 STEPS_TO_CROSSING = 9
 
 
-def begin_building(batch: Batch, of_group: Float[np.ndarray, " k"]) -> None:
-    """Begin to compile a batch's kernels, with the parameters of any of its groups, in one of its threads."""
-    scene = with_values(batch.scene, batch.names, of_group)
-    form = Form.of(jax.eval_shape(mechanics_about_sliding, scene))
+def begin_building(batch: Batch) -> None:
+    """Begin to compile a batch's kernels in one of its threads."""
+
+    def mechanics(row):
+        return mechanics_about_sliding(with_values(batch.scene, batch.names, row))
+
+    # Without values: those of a group may be none that a scene could have.
+    form = Form.of(jax.eval_shape(mechanics, np.zeros(len(batch.names))))
     batch.pool.submit(_built, form)
 
 

@@ -60,7 +60,7 @@ def follow_all(
     """
     of_groups, group = grouped(values, states)
     if batch.by_kernel:
-        begin_building(batch, of_groups[0])
+        begin_building(batch)
     shared = shared_by(batch, of_groups)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in (*batch.history, *states))], axis=-1)[:, 1:]
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
