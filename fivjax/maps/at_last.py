@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from ..verdicts.tube import HOME
-from .attractors import Attractors, add_cycle, add_tori, come_to
-from .captures import MORE_CROSSINGS, Cycle, distinct, stable_cycles
+from .attractors import Attractors, add_cycles, add_tori, come_to
+from .captures import MORE_CROSSINGS, Cycle, distinct
 from .parting import followed_on
 from .section import ReturnMaps, Section
 from .tori import AT_A_TIME, TUBES, Torus, is_drifting
@@ -129,11 +129,8 @@ def _search(
         here = np.flatnonzero(closing_in[picked] == closes_in)
         if not len(here):
             continue
-        known = {g: one.cycles for g, one in of_group.items()}
         rows = picked[here]
-        for g, led, cycle in stable_cycles(maps, group[rows], at.rows(rows), known, most, settled=True):
-            on_torus[here[led]] = False
-            add_cycle(maps, of_group[g], cycle)
+        on_torus[here] &= ~add_cycles(maps, group[rows], at.rows(rows), of_group, most, settled=True)
     rows = picked[on_torus]
     if len(rows):
         add_tori(maps, group[rows], at.rows(rows), of_group, report, TUBES)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
-from .captures import CROSSINGS, Cycle, captured, distinct, is_new, stable_cycles
+from .captures import CROSSINGS, NEARLY, Cycle, captured, distinct, is_new, stable_cycles
 from .flattened import Flattened
 from .following import begun, follow
 from .kernels import Kernels
@@ -83,13 +83,8 @@ def _left_by_cycles(
     captured_by = come_to(maps, group, at, latest, usable, of_group)
     usable[list(captured_by)] = moving[list(captured_by)] = False
     picked = distinct(maps.weights * latest, group, usable)
-    if len(picked):
-        known = {g: one.cycles for g, one in of_group.items()}
-        new = stable_cycles(maps, group[picked], at.rows(picked), known, nearly=nearly)
-        for g, _, cycle in new:
-            add_cycle(maps, of_group[g], cycle)
-        if new:
-            moving[list(come_to(maps, group, at, latest, usable, of_group))] = False
+    if len(picked) and np.any(add_cycles(maps, group[picked], at.rows(picked), of_group, nearly=nearly)):
+        moving[list(come_to(maps, group, at, latest, usable, of_group))] = False
     return np.flatnonzero(moving)
 
 
@@ -107,6 +102,25 @@ def _add_tori(maps: ReturnMaps, group, now, of_group: dict[int, Attractors], rep
         usable[list(come_to(maps, group, at, latest, usable, of_group))] = False
 
 
+def add_cycles(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    of_group: dict[int, Attractors],
+    crossings: int = CROSSINGS,
+    settled: bool = False,
+    nearly: float = NEARLY,
+) -> Bool[np.ndarray, " m"]:
+    """Adds the stable cycles that motions from these states are near to (`captures.stable_cycles`) to those known of their
+    groups; and which of the motions are near to one, new or known.
+    """
+    near, known = np.zeros(len(group), bool), {g: one.cycles for g, one in of_group.items()}
+    for g, rows, cycle in stable_cycles(maps, group, at, known, crossings, settled, nearly):
+        near[rows] = True
+        _add_cycle(maps, of_group[g], cycle)
+    return near
+
+
 def add_tori(
     maps: ReturnMaps,
     group: Int[np.ndarray, " m"],
@@ -121,15 +135,12 @@ def add_tori(
     for row, torus in tori.items():
         known[row].tori.append(torus)
     for row, cycle in locked:
-        add_cycle(maps, known[row], cycle)
+        _add_cycle(maps, known[row], cycle)
 
 
-def add_cycle(maps: ReturnMaps, known: Attractors, cycle: Cycle) -> bool:
-    """Adds a cycle if it is none of those known; and whether it was."""
-    new = is_new(maps, cycle, known.cycles)
-    if new:
+def _add_cycle(maps: ReturnMaps, known: Attractors, cycle: Cycle) -> None:
+    if is_new(maps, cycle, known.cycles):
         known.cycles.append(cycle)
-    return new
 
 
 def come_to(

@@ -12,8 +12,8 @@ import numpy as np
 from ..verdicts.verdict import Verdict
 from . import attractors
 from .at_last import fates
-from .attractors import Attractors, add_cycle, add_tori, come_to, has_crossed, section_of
-from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct, stable_cycles
+from .attractors import Attractors, add_cycles, add_tori, come_to, has_crossed, section_of
+from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct
 from .conclusion import slide_forever
 from .flattened import Flattened
 from .following import begun, follow
@@ -163,22 +163,16 @@ class Basins:
             return
         group = self.group[pending]
         picked = distinct(self.maps.weights * np.array(now.crossing), group, asks)
-        led_to_one = np.zeros(len(picked), bool)
-        at = section_of(now).rows(picked)
-        known = {g: one.cycles for g, one in self.known.items()}
-        for g, rows, cycle in stable_cycles(self.maps, group[picked], at, known, crossings):
-            led_to_one[rows] = True
-            if add_cycle(self.maps, self.known[g], cycle):
-                self._wait_for(g, [cycle])
-        alone = np.flatnonzero(~led_to_one & ~np.array([self.known[g].locked for g in group[picked]]))
-        alone = alone[np.unique(group[picked[alone]], return_index=True)[1]]
+        at, own = section_of(now).rows(picked), group[picked]
+        before = {g: len(self.known[g].cycles) for g in own.tolist()}
+        near = add_cycles(self.maps, own, at, self.known, crossings)
+        alone = np.flatnonzero(~near & ~np.array([self.known[g].locked for g in own]))
+        alone = alone[np.unique(own[alone], return_index=True)[1]]
         for start in range(0, len(alone), ENSEMBLES):
             part = alone[start : start + ENSEMBLES]
-            own = group[picked[part]]
-            before = [len(self.known[g].cycles) for g in own]
-            add_tori(self.maps, own, at.rows(part), self.known, report, TUBES)
-            for g, count in zip(own, before, strict=True):
-                self._wait_for(g, self.known[g].cycles[count:])
+            add_tori(self.maps, own[part], at.rows(part), self.known, report, TUBES)
+        for g, count in before.items():
+            self._wait_for(g, self.known[g].cycles[count:])
 
     def _wait_for(self, g: int, cycles: list[Cycle]) -> None:
         """From now on trajectories of the group have the time that these cycles take to attract."""
