@@ -152,7 +152,7 @@ class Basins:
         for g in groups:
             # What trajectories find by themselves is not of the group alone.
             self.known[int(g)] = known[keys[g]].copy()
-            self._wait_for(g, self.known[int(g)].cycles)
+            self._wait_for_cycles(int(g))
 
     def search_alone(self, pending: np.ndarray, now, crossings: int, report) -> None:
         """Finds attractors from where a few trajectories of each group are that have taken long: cycles of up to so many
@@ -164,19 +164,18 @@ class Basins:
         group = self.group[pending]
         picked = distinct(self.maps.weights * np.array(now.crossing), group, asks)
         at, own = section_of(now).rows(picked), group[picked]
-        before = {g: len(self.known[g].cycles) for g in own.tolist()}
         near = add_cycles(self.maps, own, at, self.known, crossings)
         alone = np.flatnonzero(~near & ~np.array([self.known[g].locked for g in own]))
         alone = alone[np.unique(own[alone], return_index=True)[1]]
         for start in range(0, len(alone), ENSEMBLES):
             part = alone[start : start + ENSEMBLES]
             add_tori(self.maps, own[part], at.rows(part), self.known, report, TUBES)
-        for g, count in before.items():
-            self._wait_for(g, self.known[g].cycles[count:])
+        for g in np.unique(own).tolist():
+            self._wait_for_cycles(g)
 
-    def _wait_for(self, g: int, cycles: list[Cycle]) -> None:
-        """From now on trajectories of the group have the time that these cycles take to attract."""
-        for cycle in cycles:
+    def _wait_for_cycles(self, g: int) -> None:
+        """From now on trajectories of the group have the time that its known cycles take to attract."""
+        for cycle in self.known[g].cycles:
             constants = TIME_CONSTANTS * cycle.period / (1 - cycle.multiplier)
             most = MOST_PERIODS * self.shared.tree.modes.slowest_period[g]
             self.settled_by[g] = max(self.settled_by[g], min(constants, most))

@@ -291,9 +291,7 @@ def _back(
     for among in (place < FIRST, place >= FIRST):
         running = np.flatnonzero(among & ok[of_set])
         crossed = 0
-        while crossed < BACK_WITHIN:
-            if not len(running):
-                break
+        while crossed < BACK_WITHIN and len(running):
             report(0)
             # Most are back soon; the others are looked at in growing steps.
             further = min(max(KEPT, crossed // 2), BACK_WITHIN - crossed)
