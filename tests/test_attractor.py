@@ -13,11 +13,13 @@ from fivjax.maps.tori import (
     Torus,
     _holds_one_of,
     _in_clusters,
-    _may_be_torus,
     _on_one_torus,
+    goes_on,
+    is_drifting,
     reached,
 )
 from fivjax.verdicts import tube
+from fivjax.verdicts.tube import Tube
 
 STATES = 256
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -29,28 +31,36 @@ def wound(turn=GOLDEN / 14, radius=0.5, returns=TRACED):
     return np.stack([4 + radius * np.cos(phase), radius * np.sin(phase)], axis=-1)
 
 
+def may_be_torus(path):
+    """The same for one motion as beside another."""
+    both = np.stack([path, wound()], axis=1)
+    alone = goes_on(path) & ~is_drifting(path)
+    assert alone == (goes_on(both) & ~is_drifting(both))[0]
+    return alone
+
+
 def test_a_motion_that_winds_around_a_curve_may_be_on_a_torus():
-    assert _may_be_torus(wound())
+    assert may_be_torus(wound())
     # However small: next to the bifurcation that it was born in, a torus is.
-    assert _may_be_torus(wound(radius=1e-4))
+    assert may_be_torus(wound(radius=1e-4))
 
 
 @pytest.mark.parametrize("rate", [1e-4, 1e-5, 1e-6])
 def test_a_motion_that_fades_slowly_is_on_no_torus(rate):
     """The whole motion by e in ten thousand to a million returns; and a beat that dies away about a periodic motion."""
     fading = np.exp(-rate * np.arange(TRACED))[:, None]
-    assert not _may_be_torus(wound() * fading)
+    assert not may_be_torus(wound() * fading)
     dying = wound(radius=0.5 * np.exp(-100 * rate * np.arange(TRACED)))
-    assert not _may_be_torus(dying)
+    assert not may_be_torus(dying)
 
 
 def test_a_periodic_motion_of_few_crossings_is_on_no_torus():
     for crossings in (1, 2, CROSSINGS):
-        assert not _may_be_torus(wound(turn=1 / crossings))
-    assert not _may_be_torus(wound(turn=0.0))
+        assert not may_be_torus(wound(turn=1 / crossings))
+    assert not may_be_torus(wound(turn=0.0))
     approached = wound(turn=1 / 3, radius=0.5 + 0.1 * 0.99 ** np.arange(TRACED))
-    assert not _may_be_torus(approached)
-    assert not _may_be_torus(np.where(np.arange(TRACED)[:, None] > 2000, np.nan, wound()))
+    assert not may_be_torus(approached)
+    assert not may_be_torus(np.where(np.arange(TRACED)[:, None] > 2000, np.nan, wound()))
 
 
 def test_a_locked_motion_shows_by_its_clusters():
@@ -96,8 +106,8 @@ class Winding:
 def test_a_torus_captures_what_stays_in_half_its_tube():
     """Motions beside it that will leave are none of its own, however near they are; those far off are not even asked."""
     maps = Winding()
-    torus = Torus(wound(returns=512), tube.RADIUS, 1.0, 0.1)
-    half = 0.5 * tube.RADIUS * tube.mean_size(torus.states)
+    torus = Torus(Tube(wound(returns=512), tube.RADIUS), 1.0, 0.1)
+    half = 0.5 * tube.RADIUS * torus.tube.size
     radii = 0.5 + half * np.array([0.0, 0.9, -0.9, 1.1, -1.1, 3.0])
     states = np.stack([4 + radii, 0 * radii], axis=-1) / maps.weights
     at = Section(states, np.zeros(6, np.int32), np.ones(6))
@@ -139,11 +149,12 @@ def test_a_start_is_home_with_all_of_its_last_crossings_and_not_with_nearly_all(
     states = circle()
     size = np.mean(np.linalg.norm(states, axis=1))
     ends = np.stack([states[: 5 * tube.HOME].reshape(tube.HOME, 5, 4)] * 2, axis=1).reshape(tube.HOME, 10, 4)
-    assert np.all(tube.home(states, ends))
+    about = Tube(states, tube.RADIUS)
+    assert np.all(about.home(ends))
     ends[3, 7, 1] = 0.6 * tube.RADIUS * size
     others = np.arange(10) != 7
-    np.testing.assert_array_equal(tube.home(states, ends), others)
-    np.testing.assert_array_equal(tube.home(states, np.where(ends == ends[3, 7, 1], np.nan, ends)), others)
+    np.testing.assert_array_equal(about.home(ends), others)
+    np.testing.assert_array_equal(about.home(np.where(ends == ends[3, 7, 1], np.nan, ends)), others)
 
 
 def paper(mu, v, **parts):
@@ -278,8 +289,8 @@ def test_a_set_that_holds_a_known_cycle_is_no_torus():
     on_it = np.array([[4.5, 0.0], [3.5, 0.01]]) / Maps.weights
     for points, expected in ((on_it, True), (on_it * [[1.0, 1.0], [1.2, 1.0]], False)):
         cycle = Cycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
-        assert _holds_one_of(Maps, ring, [cycle], tube.RADIUS) == expected  # type: ignore[arg-type]
-    assert not _holds_one_of(Maps, ring, [], tube.RADIUS)  # type: ignore[arg-type]
+        assert _holds_one_of(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
+    assert not _holds_one_of(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
 
 
 MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)

@@ -13,6 +13,7 @@ from fivjax.maps.attractor_files import from_bytes, to_bytes
 from fivjax.maps.attractors import Attractors, Torus
 from fivjax.maps.captures import Cycle
 from fivjax.verdicts.capture import Neighbourhood
+from fivjax.verdicts.tube import Tube
 
 AXES = {"mu": np.linspace(0.1, 0.2, 6), "p": np.linspace(1.0, 3.0, 7)}
 
@@ -140,14 +141,14 @@ def test_attractors_come_back_from_a_file_bit_for_bit():
     cycle = Cycle(rng.normal(size=(2, 6)), 0.1, 0.5, 3.0, near)
     found = {
         b"one": Attractors([cycle, cycle], []),
-        b"two": Attractors([], [Torus(rng.normal(size=(9, 6)), radius, 2.0, 0.3) for radius in (0.04, 0.01)]),
+        b"two": Attractors([], [Torus(Tube(rng.normal(size=(9, 6)), radius), 2.0, 0.3) for radius in (0.04, 0.01)]),
     }
     again = from_bytes(to_bytes(found))
     assert list(again) == list(found)
     assert not again[b"one"].tori and not again[b"two"].cycles
     for mine, theirs in zip(again[b"two"].tori, found[b"two"].tori, strict=True):
-        np.testing.assert_array_equal(mine.states, theirs.states)
-        assert mine[1:] == theirs[1:]
+        np.testing.assert_array_equal(mine.tube.states, theirs.tube.states)
+        assert (mine.tube.radius, *mine[1:]) == (theirs.tube.radius, *theirs[1:])
     for mine in again[b"one"].cycles:
         for part, theirs in zip((*mine[:-1], *mine[-1]), (*cycle[:-1], *near), strict=True):
             np.testing.assert_array_equal(part, theirs)

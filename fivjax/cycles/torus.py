@@ -26,7 +26,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..contact import Contact, Status
 from ..model.scene import Scene
@@ -155,22 +155,23 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def extent(weighted: Float[np.ndarray, "k state"]) -> float:
+def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray, "*m"]:
     """The root mean square distance of points from their mean."""
-    return float(np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1))))
+    return np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1), axis=0))
 
 
-def drifts(weighted: Float[np.ndarray, "k state"], share: float = DRIFT) -> bool:
+def drifts(weighted: Float[np.ndarray, "k *m state"], share: float = DRIFT) -> Bool[np.ndarray, "*m"]:
     """Whether the mean of the points changes with time by more than this share of their extent: on a torus it does not."""
     third = len(weighted) // 3
     early, late = (smooth_mean(part) for part in (weighted[:third], weighted[-third:]))
-    return bool(np.linalg.norm(late - early) > share * extent(weighted))
+    return np.linalg.norm(late - early, axis=-1) > share * extent(weighted)
 
 
 def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*state"]:
     """A mean whose weights vanish smoothly at both ends: of a quasi-periodic sequence it is much better than equal weights."""
     x = (np.arange(len(values)) + 0.5) / len(values)
-    return np.average(values, axis=0, weights=np.exp(-1.0 / (x * (1 - x))))
+    weights = np.exp(-1.0 / (x * (1 - x)))
+    return np.tensordot(weights / np.sum(weights), values, axes=1)
 
 
 def tube_radius(weighted: Float[np.ndarray, "k state"]) -> float:

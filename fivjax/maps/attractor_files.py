@@ -6,6 +6,7 @@ import json
 import numpy as np
 
 from ..verdicts.capture import Neighbourhood
+from ..verdicts.tube import Tube
 from .attractors import Attractors, Torus
 from .captures import Cycle
 
@@ -20,7 +21,9 @@ def to_bytes(found: dict[bytes, Attractors]) -> bytes:
             del fields["neighbourhood"]
             arrays |= {f"{number}.{k}.{name}": np.asarray(value) for name, value in fields.items()}
         for k, torus in enumerate(one.tori):
-            arrays |= {f"{number}.torus{k}.{name}": np.asarray(value) for name, value in torus._asdict().items()}
+            fields = {**torus._asdict(), "states": torus.tube.states, "radius": torus.tube.radius}
+            del fields["tube"]
+            arrays |= {f"{number}.torus{k}.{name}": np.asarray(value) for name, value in fields.items()}
     content = io.BytesIO()
     np.savez_compressed(content, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)
     return content.getvalue()
@@ -37,9 +40,12 @@ def from_bytes(content: bytes) -> dict[bytes, Attractors]:
             names = [name for name in kind._fields if name not in others]
             return kind(**others, **{name: _plain(arrays[f"{own}.{prefix}{name}"]) for name in names})
 
+        def tube(k, own=number):
+            return Tube(*(_plain(arrays[f"{own}.torus{k}.{name}"]) for name in ("states", "radius")))
+
         found[bytes.fromhex(key)] = Attractors(
             [of(Cycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)],
-            [of(Torus, f"torus{k}.") for k in range(tori)],
+            [of(Torus, f"torus{k}.", tube=tube(k)) for k in range(tori)],
         )
     return found
 

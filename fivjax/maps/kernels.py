@@ -88,7 +88,9 @@ class Kernels:
         arrived = (crossed >= crossings) & np.all(np.isfinite(y), axis=1)
         y[~arrived], peak[~arrived] = np.nan, np.nan
         # The states were kept in a ring; the newest comes last.
-        path = np.take_along_axis(path, ((crossed[:, None] + np.arange(kept)) % kept)[..., None], axis=1)
+        turned = np.flatnonzero(crossed % kept)
+        places = (crossed[turned, None] + np.arange(kept)) % kept
+        path[turned] = path[turned[:, None], places]
         return y, mode[:, 0].astype(np.int32), mode[:, 1], events, time, path, peak
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> Flattened:

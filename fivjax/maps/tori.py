@@ -5,12 +5,12 @@ how high they go.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
 from ..cycles.torus import drifts, extent, smooth_mean
 from ..verdicts import tube
-from ..verdicts.tube import nearest
+from ..verdicts.tube import Tube, tree_of
 from ..verdicts.tube_of_several import starts_of_several
 from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
@@ -31,9 +31,9 @@ DRIFT, SHRINKS = 5e-3, 0.05
 # they have come to it, after so many returns. Its states are in clusters: distances between neighbours are mostly smaller than
 # this share of those on a curve.
 REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
-# Crossings in which starts in the tube have to be back, so much closer than elsewhere: next to a slow fade there is a direction
-# in which they come back hardly at all. The first few starts tell most sets that do not attract.
-BACK_WITHIN, CLOSER, FIRST = 1536, 0.5, 4
+# Crossings in which starts on the tube's edge have to be back in this share of it, which is less than what captures: next to a
+# slow fade there is a direction in which they come back hardly at all. The first few starts tell most sets that do not attract.
+BACK_WITHIN, BACK_TO, FIRST = 1536, 0.25, 4
 # Starts about a torus that are followed further. In chaos neighbours part by so much per return, and more.
 FURTHER, PARTING = 8, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
@@ -56,16 +56,11 @@ class Traced(NamedTuple):
     states: Float[np.ndarray, "k 2n"]  # weighted deviations, in order
     amplitude: float  # m/s
 
-    def thinned(self, count: int) -> "Traced":
-        """With some `count` of the states."""
-        return self._replace(states=self.states[:: max(len(self.states) // count, 1)])
-
 
 class Torus(NamedTuple):
     """A set of crossing states about which everything was seen to come back."""
 
-    states: Float[np.ndarray, "k 2n"]  # weighted deviations
-    radius: float  # of the tube from which all comes back, relative to the states' mean size; half of it captures
+    tube: Tube  # about weighted deviations; all comes back from its edge, and half of it captures
     amplitude: float  # m/s
     period: float  # mean time between crossings, s
 
@@ -91,12 +86,12 @@ def tori_from(
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
-            open_ = [(row, one.thinned(count)) for row, one in paths.items() if row in traced]
-            sets = [(row, one) for row, one in open_ if not _holds_one_of(maps, one.states, cycles[row], radius)]
-            if not sets:
+            tried = [(row, Tube(_thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
+            tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
+            if not tried:
                 continue
-            new, of_locked = _attracting(maps, group, sets, cycles, radius, report)
-            found |= new
+            new, of_locked = _attracting(maps, group, tried, cycles, report)
+            found |= {row: Torus(one, traced[row].amplitude, period) for row, (one, period) in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
                 del traced[row]
@@ -116,9 +111,8 @@ def reached(
     """
     near = []
     for rows, torus in known:
-        width = (0.5 * torus.radius + maps.known_to) * tube.mean_size(torus.states)
-        with np.errstate(invalid="ignore"):
-            near.append(rows[nearest(maps.weights * latest[rows], torus.states) <= width])
+        within = 0.5 + maps.known_to / torus.tube.radius
+        near.append(rows[torus.tube.holds(maps.weights * latest[rows], within)])
     asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
     if not len(asked):
         return {}
@@ -128,13 +122,8 @@ def reached(
         open_ = np.array([row for row in rows if row not in found], int)
         if len(open_):
             ends = maps.weights * np.moveaxis(paths[np.searchsorted(asked, open_)], 1, 0)
-            found |= dict.fromkeys(open_[_holds(torus, ends)].tolist(), torus)
+            found |= dict.fromkeys(open_[torus.tube.home(ends)].tolist(), torus)
     return found
-
-
-def _holds(torus: Torus, ends: Float[np.ndarray, "h m 2n"]):
-    """Which motions a torus has captured, by their weighted crossing states."""
-    return tube.home(torus.states, ends, torus.radius)
 
 
 def _traced(
@@ -154,15 +143,19 @@ def _traced(
             peaks = np.concatenate([peaks, highest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGER:]
-        left = np.zeros(len(running), bool)
-        for k, (row, path, now) in enumerate(zip(running, paths, more, strict=True)):
-            if not _may_come_to_torus(now, tori[row]):
-                continue
-            may_be = length >= count and _may_be_torus(path)
-            if may_be and (amplitude := _settled(peaks[k])):
-                traced[int(row)] = Traced(path, amplitude)
-            else:
-                left[k] = may_be or length < LONGER
+        ends = np.moveaxis(more, 1, 0)
+        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(CHANGES))
+        for k in np.flatnonzero(left):
+            left[k] = not any(one.tube.home(ends[-tube.HOME :, k : k + 1]).item() for one in tori[running[k]])
+        if length >= count:
+            whole = np.moveaxis(paths, 1, 0)
+            may_be = left & goes_on(whole) & ~is_drifting(whole)
+            for k in np.flatnonzero(may_be):
+                amplitude = _settled(peaks[k])
+                if amplitude is not None:
+                    traced[int(running[k])] = Traced(paths[k].copy(), amplitude)
+                    left[k] = False
+            left &= may_be | (length < LONGER)
         if length == LONGER and np.any(left):
             # What never settles is chaos, mostly.
             growth, *_ = parting_rates(maps, group[running[left]], at.rows(left))
@@ -177,43 +170,44 @@ def _settled(peaks: Float[np.ndarray, " k"]) -> float | None:
     return float(later) if abs(later / earlier - 1) <= SETTLED else None
 
 
-def _may_come_to_torus(path: Float[np.ndarray, "k 2n"], known: list[Torus]) -> bool:
-    """Whether a motion may be on the way to a torus that is none of the `known` ones, as far as its latest states tell."""
-    if not _goes_on(path):
-        return False
-    new = not any(_holds(torus, path[-tube.HOME :, None]).item() for torus in known)
-    return new and abs(_growth(path)) <= np.log(CHANGES)
-
-
-def _growth(path: Float[np.ndarray, "k 2n"]) -> float:
+def _growth(paths: Float[np.ndarray, "k *m 2n"]) -> Float[np.ndarray, "*m"]:
     """The logarithm of the growth of the extent of states from the first third of them to the last."""
-    third = len(path) // 3
+    third = len(paths) // 3
     with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.log(extent(path[-third:]) / extent(path[:third])))
+        return np.log(extent(paths[-third:]) / extent(paths[:third]))
 
 
-def _may_be_torus(path: Float[np.ndarray, "k 2n"]) -> bool:
-    """Whether a motion neither drifts nor shrinks nor repeats, as far as its weighted states on the section tell."""
-    return _goes_on(path) and not is_drifting(path)
-
-
-def is_drifting(path: Float[np.ndarray, "k 2n"]) -> bool:
+def is_drifting(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
     """Whether the mean or the extent of weighted states on the section changes with time."""
-    return drifts(path, DRIFT) or not abs(_growth(path)) <= SHRINKS
+    with np.errstate(invalid="ignore"):
+        return drifts(paths, DRIFT) | ~(np.abs(_growth(paths)) <= SHRINKS)
 
 
-def _goes_on(path: Float[np.ndarray, "k 2n"]) -> bool:
-    """Whether a motion goes on, and the last of its states is none of those up to `CROSSINGS` before."""
-    if not np.all(np.isfinite(path)) or extent(path) <= ROUNDING * tube.mean_size(path):
-        return False
-    apart = np.linalg.norm(path[-1 - CROSSINGS : -1] - path[-1], axis=1)
-    return bool(np.min(apart) > REPEATS * extent(path))
+def goes_on(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
+    """Whether a motion goes on, by its weighted states on the section, and the last of them is none of those up to `CROSSINGS`
+    before.
+    """
+    with np.errstate(invalid="ignore"):
+        width = extent(paths)
+        moving = width > ROUNDING * np.mean(np.linalg.norm(paths, axis=-1), axis=0)
+        apart = np.linalg.norm(paths[-1 - CROSSINGS : -1] - paths[-1], axis=-1)
+        return moving & (np.min(apart, axis=0) > REPEATS * width)
 
 
 def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will."""
-    states = path[:: len(path) // TUBES[0][1]]
-    return bool(np.median(nearest(states, states, others=True)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
+    states = _thinned(path, TUBES[0][1])
+    return bool(np.median(_spacing(states)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
+
+
+def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
+    """The distance of each state to the nearest of the others."""
+    return tree_of(states).query(states, k=2)[0][:, 1]
+
+
+def _thinned(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
+    """Some `count` of the states."""
+    return states[:: max(len(states) // count, 1)]
 
 
 def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
@@ -221,7 +215,7 @@ def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[
     rows = [row for row, one in traced.items() if _in_clusters(one.states)]
     if not rows:
         return {}
-    own, at = _starts(maps, group[rows], [traced[row].states for row in rows], tube.RADIUS)
+    own, at = _starts(maps, group[rows], [Tube(traced[row].states, tube.RADIUS) for row in rows])
     _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // tube.STARTS)
     states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
     return {
@@ -234,14 +228,15 @@ def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[
 def _attracting(
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
-    sets: list[tuple[int, Traced]],
+    tubes: list[tuple[int, Tube]],
     known: list[list[Cycle]],
-    radius: float,
     report,
-) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
-    """Which of these sets, each with its row, are tori; and the cycles of those that are locked."""
-    own = np.array([groups[row] for row, _ in sets])
-    back, last = _back(maps, own, [one.states for _, one in sets], radius, report)
+) -> tuple[dict[int, tuple[Tube, float]], list[tuple[int, Cycle]]]:
+    """Which of these tubes, each with its row, are about tori, with the mean time between crossings (s); and the cycles of tori
+    that are locked.
+    """
+    own = np.array([groups[row] for row, _ in tubes])
+    back, last = _back(maps, own, [one for _, one in tubes], report)
     if not len(back):
         return {}, []
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
@@ -253,7 +248,7 @@ def _attracting(
     closing_in = np.flatnonzero(growth < LOCKED)
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
-    of_group = {int(groups[row]): known[row] for row, _ in sets}
+    of_group = {int(groups[row]): known[row] for row, _ in tubes}
     # One motion of each after the other, because most lead to the same cycle. What is no torus for sure has no better
     # attractor than a cycle with a narrow neighbourhood.
     for nominee, settled in (*((k, False) for k in range(0, FURTHER, FURTHER // NOMINATED)), (0, True)):
@@ -263,33 +258,33 @@ def _attracting(
             continue
         for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS, settled):
             of_torus = asks[rows] // FURTHER
-            cycles.append((sets[back[of_torus[0]]][0], cycle))
+            cycles.append((tubes[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
         kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
     tori = {}
     for k in kept[np.isfinite(period[kept])]:
-        row, one = sets[back[k]]
-        tori[row] = Torus(one.states.copy(), radius, one.amplitude, float(period[k]))
+        row, one = tubes[back[k]]
+        tori[row] = one, float(period[k])
     return tori, cycles
 
 
-def _holds_one_of(maps: ReturnMaps, states: Float[np.ndarray, "k 2n"], cycles: list[Cycle], radius: float) -> bool:
-    """Whether a stable cycle lies in the inner half of the tube about a set: motions there may come to that instead."""
-    return any(tube.home(states, maps.weights * cycle.points[:, None], radius).item() for cycle in cycles)
+def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[Cycle]) -> bool:
+    """Whether a stable cycle lies in the inner half of a tube: motions there may come to that instead."""
+    return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
 
 
 def _back(
-    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "k 2n"]], radius: float, report
+    maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube], report
 ) -> tuple[Int[np.ndarray, " t"], Section]:
-    """About which of the sets all starts come back; and where the starts are then, set by set."""
+    """From the edges of which tubes all starts come back; and where the starts are then, tube by tube."""
     weights, count = maps.weights, tube.STARTS
-    own, last = _starts(maps, group, sets, radius)
-    back, ok = np.zeros(len(own), bool), np.ones(len(sets), bool)
-    smallest = np.array([np.min(np.linalg.norm(states, axis=1)) for states in sets])
-    place, of_set = np.arange(len(own)) % count, np.arange(len(own)) // count
+    own, last = _starts(maps, group, tubes)
+    back, ok = np.zeros(len(own), bool), np.ones(len(tubes), bool)
+    smallest = np.array([np.min(np.linalg.norm(one.states, axis=1)) for one in tubes])
+    place, of_tube = np.arange(len(own)) % count, np.arange(len(own)) // count
     for among in (place < FIRST, place >= FIRST):
-        running = np.flatnonzero(among & ok[of_set])
+        running = np.flatnonzero(among & ok[of_tube])
         crossed = 0
         while crossed < BACK_WITHIN and len(running):
             report(0)
@@ -301,13 +296,13 @@ def _back(
             ends = weights * np.moveaxis(image.path, 1, 0)
             # One that fades, or fails, does not come back.
             with np.errstate(invalid="ignore"):
-                lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[of_set[running]])
-            ok[of_set[running[lost]]] = False
-            for k in np.unique(of_set[running]):
-                mine = of_set[running] == k
-                back[running[mine]] = tube.home(sets[k], ends[-tube.HOME :, mine], CLOSER * radius)
-            running = running[ok[of_set[running]] & ~back[running]]
-        ok[of_set[among & ~back]] = False
+                lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[of_tube[running]])
+            ok[of_tube[running[lost]]] = False
+            for k in np.unique(of_tube[running]):
+                mine = of_tube[running] == k
+                back[running[mine]] = tubes[k].home(ends[-tube.HOME :, mine], BACK_TO)
+            running = running[ok[of_tube[running]] & ~back[running]]
+        ok[of_tube[among & ~back]] = False
     return np.flatnonzero(ok), last
 
 
@@ -316,25 +311,23 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
     if not np.all(np.isfinite(paths)):
         return False
     whole = paths.reshape(-1, paths.shape[-1])
-    means = np.stack([smooth_mean(path) for path in paths])
+    means = smooth_mean(np.moveaxis(paths, 1, 0))
     apart = np.linalg.norm(means - np.mean(means, axis=0), axis=1)
     third = paths.shape[1] // 3
     early = paths[:, :third].reshape(-1, paths.shape[-1])
     late = paths[:, -third:]
-    steps = [np.median(nearest(part, part, others=True)) for part in late]
-    missed = [np.median(nearest(part, early)) for part in late]
+    steps = [np.median(_spacing(part)) for part in late]
+    missed = np.median(tree_of(early).query(late)[0], axis=1)
     rounding = ROUNDING * tube.mean_size(whole)
     return bool(
         np.max(apart) <= SAME_MEAN * extent(whole) and np.all(missed <= NEAR_OTHERS * np.array(steps) + rounding)
     )
 
 
-def _starts(
-    maps: ReturnMaps, group: Int[np.ndarray, " s"], sets: list[Float[np.ndarray, "_ 2n"]], radius: float
-) -> tuple[Int[np.ndarray, " m"], Section]:
-    """The starts about each of these sets, with their groups."""
+def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -> tuple[Int[np.ndarray, " m"], Section]:
+    """The starts on the edge of each of these tubes, with their groups."""
     own = np.repeat(group, tube.STARTS)
-    starts = [about(maps, states[:: len(states) // tube.STARTS] / maps.weights, radius) for states in sets]
+    starts = [about(maps, _thinned(one.states, tube.STARTS) / maps.weights, one.radius) for one in tubes]
     return own, section_at(np.concatenate(starts) / maps.weights, maps.normal, maps.sliding[own])
 
 

@@ -6,6 +6,9 @@ in other directions, come back to within half of that distance and stay there fo
 ghost of a cycle just past its fold, they do not come back: starts that are displaced inwards go on inwards.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,9 +18,6 @@ RADIUS = 0.04
 STARTS = 16
 # Number of crossings in a row that must lie within half the tube.
 HOME = 16
-# Products of numbers at a time in distances to all states. OpenBLAS shares more among threads, which then wait for each other;
-# maps have a thread for each core already.
-PRODUCTS = 2**18
 
 
 def directions_from(
@@ -56,31 +56,37 @@ def starts(
     return found
 
 
-def home(
-    states: Float[np.ndarray, "k 2n"], ends: Float[np.ndarray, "h m 2n"], radius: float = RADIUS
-) -> Bool[np.ndarray, " m"]:
-    """Which starts have come back: all of their last crossing states lie within half the tube."""
-    size = mean_size(states)
-    points = np.where(np.isfinite(ends), ends, np.inf).reshape(-1, ends.shape[-1])
-    finite = np.all(np.isfinite(points), axis=-1)
-    inside = finite & (nearest(np.where(finite[:, None], points, 0.0), states) <= 0.5 * radius * size)
-    return np.all(inside.reshape(ends.shape[:-1]), axis=0)
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """What lies within `radius` of a set of weighted crossing states, relative to their mean size."""
+
+    states: Float[np.ndarray, "k 2n"]
+    radius: float
+
+    @cached_property
+    def size(self) -> float:
+        """The mean size of the states."""
+        return mean_size(self.states)
+
+    @cached_property
+    def _tree(self):
+        return tree_of(self.states)
+
+    def holds(self, points: Float[np.ndarray, "*m 2n"], within: float = 0.5) -> Bool[np.ndarray, "*m"]:
+        """Which points lie in this share of the tube; those that are not finite do not."""
+        finite = np.all(np.isfinite(points), axis=-1)
+        most = within * self.radius * self.size
+        # The tree looks no further than that: what is nearest there or beyond is infinitely far.
+        apart, _ = self._tree.query(np.where(finite[..., None], points, 0.0), distance_upper_bound=most)
+        return finite & np.isfinite(apart)
+
+    def home(self, ends: Float[np.ndarray, "h m 2n"], within: float = 0.5) -> Bool[np.ndarray, " m"]:
+        """Which motions have come back: all of their last crossing states lie in this share of the tube."""
+        return np.all(self.holds(ends, within), axis=0)
 
 
-def nearest(
-    points: Float[np.ndarray, "m 2n"], states: Float[np.ndarray, "k 2n"], others: bool = False
-) -> Float[np.ndarray, " m"]:
-    """The distance of each point to the nearest of the states; with `others` the states are the points, and none is its own."""
-    # One product of a few points at a time gives their squared distances but for their own squares: that stays in the cache.
-    table = np.concatenate([-2 * states.T, np.sum(states**2, axis=-1)[None]])
-    extended = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    least = np.empty(len(points))
-    count = max(1, PRODUCTS // table.size)
-    for begin in range(0, len(points), count):
-        some = slice(begin, begin + count)
-        apart = extended[some] @ table
-        if others:
-            rows = np.arange(len(apart))
-            apart[rows, begin + rows] = np.inf
-        least[some] = np.min(apart, axis=1)
-    return np.sqrt(np.maximum(least + np.sum(points**2, axis=-1), 0.0))
+def tree_of(states: Float[np.ndarray, "k 2n"]):
+    """A tree of states, in which nearest ones are found fast."""
+    from scipy.spatial import KDTree
+
+    return KDTree(states)
