@@ -19,9 +19,11 @@ from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.event_exact import EventExact
 from .around import seen_around
+from .branch_points import Point, seen
 from .closing import closed_as
 from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
-from .following import Point, follow_branch, seen, sliding_rates
+from .following import follow_branch
+from .meeting_sliding import sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
 from .pseudo_arclength import Curve, Family
 from .saddle import saddle_cycle

@@ -10,8 +10,9 @@ rounding.
 import numpy as np
 from jaxtyping import Float
 
-from .following import Point, sliding_rates
+from .branch_points import Point
 from .grazing import looked_at, row_of
+from .meeting_sliding import sliding_rates
 from .multiple_shooting import images, moved_along, parameter_direction
 from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
 from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier

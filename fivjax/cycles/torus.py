@@ -177,7 +177,7 @@ def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*st
 def tube_radius(weighted: Float[np.ndarray, "k state"]) -> float:
     """The radius of the tube about a curve through these weighted points."""
     size = float(np.mean(np.linalg.norm(weighted, axis=-1)))
-    return min(TUBE * size, TUBE_OF_EXTENT * extent(weighted))
+    return min(TUBE * size, TUBE_OF_EXTENT * float(extent(weighted)))
 
 
 def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:

@@ -35,7 +35,7 @@ DERIVED_BLOCK = 16
 # have other events that far away. And the most crossings over which a difference is taken.
 STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
 
-# Relative errors of trajectories' crossings, at most: kernels compute them to rounding, `Windowed` interpolates samples.
+# Relative errors of trajectories' crossings, at most: kernels and `EventExact` compute them to rounding, others interpolate.
 ROUNDED, INTERPOLATED = 1e-6, 1e-2
 
 
@@ -78,7 +78,8 @@ class ReturnMaps:
         self.mechanics = flatten((tree.mechanics, longest))
         self.windows = flatten((tree.prepared, longest)) if isinstance(batch.method, Windowed) else None
         # How well trajectories' latest crossings are known, relative to their size: they tell which to ask for attractors.
-        self.known_to = ROUNDED if kernels is not None else INTERPOLATED
+        exact = kernels is not None or isinstance(batch.method, EventExact)
+        self.known_to = ROUNDED if exact else INTERPOLATED
         self.pool = batch.pool
         self.structure = batch.scene.structure
         self.weights = np.asarray(batch.scene.structure.weights)

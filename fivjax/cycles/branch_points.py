@@ -1,0 +1,37 @@
+"""The points of a branch of cycles."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex
+
+from .pseudo_arclength import Curve, Family, Place, multipliers_of
+from .special_points import Special
+from .verification import Real, real_motion
+
+
+class Point(NamedTuple):
+    """A cycle on the branch with its multipliers, and its kind if it is a special point."""
+
+    curve: Curve
+    place: Place
+    real: Real | None
+    multipliers: Complex[np.ndarray, " m"]
+    special: Special | None = None
+
+    @property
+    def name(self) -> str:
+        """The kind of special point; empty for all others."""
+        return "" if self.special is None else self.special.name
+
+
+def seen(family: Family, curve: Curve, place: Place, special: Special | None = None) -> Point:
+    """A point of the branch from a computed cycle, with the real motion that starts on it."""
+    real = real_motion(family.at(place.parameter), family.stepper, place.phases)
+    return Point(curve, place, real, multipliers_of(place.images), special)
+
+
+def is_real(family: Family, place: Place) -> bool:
+    """Whether the real motion has the contact modes with which a cycle was computed."""
+    real = real_motion(family.at(place.parameter), family.stepper, place.phases)
+    return real is not None and real.has_the_modes_of(place.phases)
