@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fivjax.contact import Status
-from fivjax.verdicts.capture import Returned, adapted_norm, free_on_section, neighbourhood, trial
+from fivjax.verdicts.capture import Returned, adapted_norm, neighbourhood, trial
+from fivjax.verdicts.free_directions import free_coordinates
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
 WEIGHTS = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
-FREE = free_on_section(3, tangential=0, normal=2, status=Status.SLIDE)
+FREE = free_coordinates(3, tangential=0, normal=2, status=Status.SLIDE)
 SLIDING = int(Status.SLIDE), 1.0
 
 
@@ -31,12 +32,12 @@ def found(matrix, returned):
     jacobian = np.zeros((6, 6))
     scale = WEIGHTS[FREE]
     jacobian[np.ix_(FREE, FREE)] = matrix / scale[:, None] * scale
-    return neighbourhood(trial(CENTRE, *SLIDING, jacobian, WEIGHTS, FREE), returned)
+    return neighbourhood(trial(CENTRE, *SLIDING, jacobian, WEIGHTS, np.eye(6)[:, FREE]), returned)
 
 
 def test_the_section_and_the_contact_mode_hold_their_coordinates():
     assert FREE.tolist() == [0, 1, 4]
-    assert free_on_section(3, 0, 2, Status.DETACH).tolist() == [0, 1, 2, 4, 5]
+    assert free_coordinates(3, 0, 2, Status.DETACH).tolist() == [0, 1, 2, 4, 5]
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
@@ -69,7 +70,7 @@ def test_whoever_is_inside_goes_to_the_cycle(bend):
     assert inside is not None and inside.contraction < 1 and inside.points == 256
     directions = rng.normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    root = inside.norm[np.ix_(FREE, FREE)] / WEIGHTS[FREE]
+    root = inside.norm[: len(FREE), FREE] / WEIGHTS[FREE]
     x = np.linalg.solve(root, (inside.radius * rng.random((2000, 1)) * directions).T).T
     starts = CENTRE + np.zeros((2000, 6))
     starts[:, FREE] += x / WEIGHTS[FREE]
@@ -130,7 +131,7 @@ def test_it_ends_where_the_motion_passes_through_other_events():
     """Beyond a grazing the map is another one, even if it seems to contract at every point that was tried."""
     matrix = 0.5 * np.eye(3)
     inside = found(matrix, mapped(lambda x: x @ matrix.T, events=lambda x: 3 + (x[:, 0] > 0.01)))
-    assert 0.0025 < inside.radius / np.linalg.svd(inside.norm[np.ix_(FREE, FREE)] / WEIGHTS[FREE])[1][0] <= 0.01
+    assert 0.0025 < inside.radius / np.linalg.svd(inside.norm[: len(FREE), FREE] / WEIGHTS[FREE])[1][0] <= 0.01
 
 
 def test_a_motion_that_does_not_come_back_or_in_another_mode_is_not_inside():

@@ -9,7 +9,7 @@ from test_several_contacts import copies, scene_of
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, slides_uniquely
 from fivjax.linear.linearisation import linear_sliding
-from fivjax.verdicts.capture_of_several import free_directions
+from fivjax.verdicts.free_directions import directions_of_several
 from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
 
 SHARES = np.array([1.0, 0.8])
@@ -75,7 +75,7 @@ def test_free_directions_keep_the_section_and_the_contact_modes():
     """What a neighbourhood is checked in: one direction goes for the section, two for a closed contact, three for one that sticks."""
     weights, section = np.arange(1.0, 13.0), np.array([1.0, 0, 0, 1.6, 0, 0])
     for status, held in (([2, 2], 0), ([1, 2], 2), ([1, 1], 4), ([0, 1], 5)):
-        basis = free_directions(weights, section, np.array([0, 3]), np.array([2, 5]), np.array(status))
+        basis = directions_of_several(weights, section, np.array([0, 3]), np.array([2, 5]), np.array(status))
         assert basis.shape == (12, 11 - held)
         y = basis / weights[:, None]
         assert np.abs(section @ y[6:]).max() < 1e-14

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 
 from ..contact import same_mode
 from ..cycles.closing import CLOSED, EXACT
-from ..verdicts.capture import LARGEST, PROBED, SMALLEST, Neighbourhood, Returned, Trial, free_on_section, trial
-from ..verdicts.capture_of_several import free_directions, trial_of_several
+from ..verdicts.capture import LARGEST, PROBED, SMALLEST, Neighbourhood, Returned, Trial, trial
+from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .section import ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
@@ -183,11 +183,12 @@ def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
     y, status, direction = closed.at.y[row], closed.at.status[row], closed.at.direction[row]
     if len(structure.contacts) > 1:
         places = np.asarray(maps.tangential), np.asarray(maps.normal)
-        basis = free_directions(maps.weights, maps.section, *places, status)
-        return trial_of_several(y, status, direction, closed.jacobian[row], maps.weights, basis)
-    status, direction = int(status), float(direction)
-    free = free_on_section(structure.size, structure.tangential, structure.normal, status)
-    return trial(y, status, direction, closed.jacobian[row], maps.weights, free)
+        basis = directions_of_several(maps.weights, maps.section, *places, status)
+    else:
+        status, direction = int(status), float(direction)
+        free = free_coordinates(structure.size, structure.tangential, structure.normal, status)
+        basis = np.eye(len(y))[:, free]
+    return trial(y, status, direction, closed.jacobian[row], maps.weights, basis)
 
 
 def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial], smallest) -> list[Neighbourhood | None]:

@@ -21,7 +21,7 @@ from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import section_weights
 from ..steppers.windowed import Windowed
-from ..verdicts.capture import free_on_section
+from ..verdicts.free_directions import free_coordinates
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
@@ -168,7 +168,7 @@ class ReturnMaps:
         count, size = at.y.shape
         free = np.zeros((count, size), bool)
         for own, status in zip(free, at.status, strict=True):
-            own[free_on_section(self.structure.size, self.tangential, self.normal, int(status))] = True
+            own[free_coordinates(self.structure.size, self.tangential, self.normal, int(status))] = True
         lengths = np.linalg.norm(self.weights * at.y, axis=1)
         row, place = np.nonzero(free)
         base = self.returns(group, at, crossings)

@@ -42,7 +42,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status, same_mode
+from ..contact import same_mode
 
 # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
 MARGIN = 1e-6
@@ -85,14 +85,6 @@ class Returned(NamedTuple):
 
 # The return map over one period of the cycle, from many states of the section in the cycle's contact mode.
 ReturnMap = Callable[[Float[np.ndarray, "m state"]], Returned]
-
-
-def free_on_section(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:
-    """Indices in the state that the section and a contact mode leave free, in a structure of `size` coordinates."""
-    held = [size + tangential]
-    if status != Status.DETACH:
-        held += [normal, size + normal]
-    return np.delete(np.arange(2 * size), held)
 
 
 def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
@@ -147,32 +139,31 @@ class Trial(NamedTuple):
 
 def trial(
     centre: Float[np.ndarray, " state"],
-    status: int,
-    direction: float,
+    status: int | Int[np.ndarray, " c"],
+    direction: float | Float[np.ndarray, " c"],
     jacobian: Float[np.ndarray, "state state"],
     weights: Float[np.ndarray, " state"],
-    free: Int[np.ndarray, " f"],
+    basis: Float[np.ndarray, "state f"],
 ) -> Trial | None:
-    """The check to be made for a cycle; None if it is not stable by a margin.
+    """The check to be made for a cycle; None if it is not stable by a margin. (Uncoupled oscillators have a second multiplier
+    of 1, for a shift in time between them, so there is no check to make.)
 
     **Arguments:** `centre`, the cycle's state on the section; `status` and `direction`, its contact mode; `jacobian`, the
-    derivative of the return map there; `weights` of the state's coordinates; `free`, the indices that are free on the section
-    (`free_on_section`). States are deviations from the sliding equilibrium.
+    derivative of the return map there; `weights` of the state's coordinates; `basis`, the weighted directions that are free on
+    the section (`verdicts.free_directions`). States are deviations from the sliding equilibrium.
     """
-    scale = weights[free]
-    found = adapted_norm(scale[:, None] * jacobian[np.ix_(free, free)] / scale)
+    found = adapted_norm(basis.T @ (weights[:, None] * jacobian / weights) @ basis)
     size = float(np.linalg.norm(weights * centre))
     if found is None or size == 0:
         return None
     root, rate = found
-    shells = np.concatenate([share * directions(len(free)) for share in SHELLS])
+    shells = np.concatenate([share * directions(basis.shape[1]) for share in SHELLS])
     # Points of the unit ball in the norm, as deviations of the state.
-    steps = np.zeros((len(shells), len(centre)))
-    steps[:, free] = np.linalg.solve(root, shells.T).T / scale
-    norm = np.diag(weights)
-    norm[np.ix_(free, free)] = root * scale
-    sizes = np.linalg.norm(shells, axis=1)
-    return Trial(centre, status, direction, norm, steps, sizes, 0.5 * (1 + rate), LARGEST * size)
+    steps = np.linalg.solve(root, shells.T).T @ basis.T / weights
+    norm = np.concatenate([root @ basis.T, np.eye(len(weights)) - basis @ basis.T]) * weights
+    return Trial(
+        centre, status, direction, norm, steps, np.linalg.norm(shells, axis=1), 0.5 * (1 + rate), LARGEST * size
+    )
 
 
 def neighbourhood(attempt: Trial | None, returned: ReturnMap) -> Neighbourhood | None:

@@ -1,0 +1,37 @@
+"""The directions that the Poincaré section and the contact modes leave a state free.
+
+With one contact these are coordinates. With several, the section is a weighted sum of velocities, and the free directions are a
+subspace, with a basis that is orthonormal in weighted coordinates.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..contact import Status
+
+
+def free_coordinates(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:
+    """With one contact: indices in the state that are free, in a structure of `size` coordinates."""
+    held = [size + tangential]
+    if status != Status.DETACH:
+        held += [normal, size + normal]
+    return np.delete(np.arange(2 * size), held)
+
+
+def directions_of_several(
+    weights: Float[np.ndarray, " state"],
+    section: Float[np.ndarray, " n"],
+    tangential: Int[np.ndarray, " c"],
+    normal: Int[np.ndarray, " c"],
+    status: Int[np.ndarray, " c"],
+) -> Float[np.ndarray, "state f"]:
+    """With several contacts: orthonormal weighted directions that are free.
+
+    `section` has the weights of the velocities whose sum is zero on the section (`steppers.section`).
+    """
+    n = len(section)
+    closed, sticking = normal[status != Status.DETACH], tangential[status == Status.STICK]
+    held = np.eye(2 * n)[np.concatenate([closed, n + closed, n + sticking])]
+    rows = np.concatenate([held, np.concatenate([np.zeros(n), section / weights[n:]])[None]])
+    _, sizes, turned = np.linalg.svd(rows)
+    return turned[np.sum(sizes > 1e-12 * sizes[0]) :].T
