@@ -132,10 +132,10 @@ def circle(radius=0.5, count=STATES):
 def test_the_tube_is_entered_from_all_sides_on_its_edge():
     """Starts lie at the tube's radius, inwards and outwards among them; contact and the section hold."""
     states = circle()
-    starts = tube.starts(states[:, [0, 2, 1, 3]], velocity=2, gap=1, gap_rate=3)
+    starts = Tube(states[:, [0, 2, 1, 3]], tube.RADIUS).starts(section=np.array([1.0, 0.0]), gaps=np.array([1]))
     size = np.mean(np.linalg.norm(states, axis=1))
     assert np.all(starts[:, 2] == 0) and len(starts) == tube.STARTS
-    contact = tube.starts(states, velocity=3, gap=1, gap_rate=1)
+    contact = Tube(states, tube.RADIUS).starts(section=np.array([0.0, 1.0]), gaps=np.array([1]))
     assert np.all(contact[:, [1, 3]] == 0)
     apart = np.linalg.norm(contact[:, None] - states, axis=-1)
     chosen = states[np.linspace(0, STATES - 1, tube.STARTS).round().astype(int)]

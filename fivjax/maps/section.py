@@ -93,7 +93,7 @@ class ReturnMaps:
     def section(self) -> Float[np.ndarray, " n"]:
         """The weights of the velocities whose sum is zero on the section."""
         row = np.zeros(self.structure.size)
-        row[self.tangential] = section_weights(len(self.structure.contacts))
+        row[np.atleast_1d(self.tangential)] = section_weights(len(self.structure.contacts))
         return row
 
     def returns(self, group, at: Section, crossings) -> Images:

@@ -11,7 +11,6 @@ from ..contact import Status
 from ..cycles.torus import drifts, extent, smooth_mean
 from ..verdicts import tube
 from ..verdicts.tube import Tube, tree_of
-from ..verdicts.tube_of_several import starts_of_several
 from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
 from .section import ReturnMaps, Section
@@ -326,19 +325,10 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
 
 def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -> tuple[Int[np.ndarray, " m"], Section]:
     """The starts on the edge of each of these tubes, with their groups."""
-    own = np.repeat(group, tube.STARTS)
-    starts = [about(maps, _thinned(one.states, tube.STARTS) / maps.weights, one.radius) for one in tubes]
-    return own, section_at(np.concatenate(starts) / maps.weights, maps.normal, maps.sliding[own])
-
-
-def about(maps: ReturnMaps, states, radius: float = tube.RADIUS) -> Float[np.ndarray, "m 2n"]:
-    """Weighted starts on the edge of the tube of this relative `radius` about states of the section, or about one."""
-    structure = maps.structure
-    if len(structure.contacts) > 1:
-        section = maps.section / maps.weights[structure.size :]
-        return starts_of_several(maps.weights * np.atleast_2d(states), section, np.asarray(maps.normal), radius)
-    velocity, rate = structure.size + structure.tangential, structure.size + structure.normal
-    return tube.starts(maps.weights * np.atleast_2d(states), velocity, structure.normal, rate, radius)
+    own, size = np.repeat(group, tube.STARTS), maps.structure.size
+    section, gaps = maps.section / maps.weights[size:], np.atleast_1d(maps.normal)
+    starts = np.concatenate([one.starts(section, gaps) for one in tubes])
+    return own, section_at(starts / maps.weights, maps.normal, maps.sliding[own])
 
 
 def section_at(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 # The tube's radius, relative to the mean size of the states.
 RADIUS = 0.04
@@ -20,40 +20,9 @@ STARTS = 16
 HOME = 16
 
 
-def directions_from(
-    states: Float[np.ndarray, "k 2n"],
-) -> tuple[Float[np.ndarray, "m 2n"], Float[np.ndarray, "m 2n"], float]:
-    """States spread over a set; the direction in which a start is displaced from each; and the mean size of the states."""
-    chosen = states[np.linspace(0, len(states) - 1, STARTS).round().astype(int)]
-    random = np.random.default_rng(0).normal(size=chosen.shape)
-    kind = np.arange(STARTS) % 4
-    away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
-    return chosen, away, mean_size(states)
-
-
 def mean_size(states: Float[np.ndarray, "k 2n"]) -> float:
     """The mean length of weighted deviations."""
     return float(np.mean(np.linalg.norm(states, axis=-1)))
-
-
-def starts(
-    states: Float[np.ndarray, "k 2n"], velocity: int, gap: int, gap_rate: int, radius: float = RADIUS
-) -> Float[np.ndarray, "m 2n"]:
-    """States on the edge of the tube about weighted deviations `states`, whose `radius` is relative to their mean size.
-
-    `velocity`, `gap` and `gap_rate` are the indices of the tangential velocity, which is zero on the section, and of the normal
-    displacement and velocity, which are zero in contact.
-    """
-    chosen, away, size = directions_from(states)
-    # A gap this small is a rounding error of contact.
-    open_ = chosen[:, gap] > 1e-6 * size
-    away[:, velocity] = 0.0
-    away[~open_, gap] = away[~open_, gap_rate] = 0.0
-    found = chosen + radius * size * away / np.linalg.norm(away, axis=-1, keepdims=True)
-    found[:, velocity] = 0.0
-    found[open_, gap] = np.maximum(found[open_, gap], 1e-6 * size)
-    found[~open_, gap] = found[~open_, gap_rate] = 0.0
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +40,25 @@ class Tube:
     @cached_property
     def _tree(self):
         return tree_of(self.states)
+
+    def starts(self, section: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " c"]) -> Float[np.ndarray, "m 2n"]:
+        """States spread over the set and displaced to the edge of the tube: one in four outwards, one in four inwards, the
+        others at random.
+
+        `section` has the section's weights of velocities, in weighted coordinates; `gaps` are the indices of the normal
+        displacements, which are zero in contact, as are their velocities.
+        """
+        chosen = self.states[np.linspace(0, len(self.states) - 1, STARTS).round().astype(int)]
+        random = np.random.default_rng(0).normal(size=chosen.shape)
+        kind = np.arange(STARTS) % 4
+        away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
+        # A gap this small is a rounding error of contact.
+        least = 1e-6 * self.size
+        open_ = chosen[:, gaps] > least
+        away = _on_section(_in_contact(away, open_, gaps), section)
+        found = chosen + self.radius * self.size * away / np.linalg.norm(away, axis=-1, keepdims=True)
+        found[:, gaps] = np.maximum(found[:, gaps], least)
+        return _in_contact(_on_section(found, section), open_, gaps)
 
     def holds(self, points: Float[np.ndarray, "*m 2n"], within: float = 0.5) -> Bool[np.ndarray, "*m"]:
         """Which points lie in this share of the tube; those that are not finite do not."""
@@ -90,3 +78,20 @@ def tree_of(states: Float[np.ndarray, "k 2n"]):
     from scipy.spatial import KDTree
 
     return KDTree(states)
+
+
+def _in_contact(
+    states: Float[np.ndarray, "m 2n"], open_: Bool[np.ndarray, "m c"], gaps: Int[np.ndarray, " c"]
+) -> Float[np.ndarray, "m 2n"]:
+    """These states with contact where it is not `open_`."""
+    states, n = states.copy(), states.shape[1] // 2
+    for places in (gaps, n + gaps):
+        states[:, places] = np.where(open_, states[:, places], 0.0)
+    return states
+
+
+def _on_section(states: Float[np.ndarray, "m 2n"], section: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m 2n"]:
+    """These states moved to where the weighted sum of velocities is zero."""
+    states, n = states.copy(), len(section)
+    states[:, n:] -= np.outer(states[:, n:] @ section, section) / (section @ section)
+    return states
