@@ -2,7 +2,7 @@
 
 Where a limit cycle has lost its stability to a torus, no state of the section repeats. The torus is then given by a set of its
 crossing states. It attracts if all starts that are displaced from the set by a fixed share of its size, inwards, outwards and
-in other directions, come back to within half of that distance and stay there for many crossings. Near a slow fade, and near the
+in other directions, come back to well within that distance and stay there for many crossings. Near a slow fade, and near the
 ghost of a cycle just past its fold, they do not come back: starts that are displaced inwards go on inwards.
 """
 
@@ -31,6 +31,10 @@ class Tube:
 
     states: Float[np.ndarray, "k 2n"]
     radius: float
+
+    def __reduce__(self):
+        # Without the tree, which is twice as large as the states.
+        return Tube, (self.states, self.radius)
 
     @cached_property
     def size(self) -> float:
