@@ -22,13 +22,15 @@ class Flattened(eqx.Module):
 
     @property
     def tree(self) -> PyTree:
-        """The tree again. For a NumPy array its real leaves are views: writing to them changes this array."""
+        """The tree again. For a NumPy array its real and complex leaves are views: writing to them changes this array."""
         structure, shapes, types = self.form
         rows = self.numbers.shape[:-1]
 
         def leaf(place: _Place) -> Array | np.ndarray:
             part = self.numbers[..., place.numbers]
-            if place.is_complex:
+            if place.is_complex and isinstance(part, np.ndarray):
+                part = part.view(np.complex128)
+            elif place.is_complex:
                 part = part.reshape(*rows, -1, 2)
                 part = part[..., 0] + 1j * part[..., 1]
             return part.reshape(*rows, *place.shape).astype(place.kind, copy=False)

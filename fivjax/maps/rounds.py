@@ -137,6 +137,7 @@ class Basins:
         # Those of each group when the time of its trajectories is over.
         self.known_at_last: dict[int, Attractors] = {}
         self.settled_by = np.zeros(len(of_groups))  # s
+        self.most_time = MOST_PERIODS * np.asarray(shared.tree.modes.slowest_period)  # s
 
     def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
         """Finds the attractors of these groups, where they are not `known`."""
@@ -177,8 +178,7 @@ class Basins:
         """From now on trajectories of the group have the time that its known cycles take to attract."""
         for cycle in self.known[g].cycles:
             constants = TIME_CONSTANTS * cycle.period / (1 - cycle.multiplier)
-            most = MOST_PERIODS * self.shared.tree.modes.slowest_period[g]
-            self.settled_by[g] = max(self.settled_by[g], min(constants, most))
+            self.settled_by[g] = max(self.settled_by[g], min(constants, self.most_time[g]))
 
     def entered(self, pending: np.ndarray, now, undecided: np.ndarray) -> dict[int, Cycle | Torus]:
         """The attractors that have captured trajectories, by row."""
