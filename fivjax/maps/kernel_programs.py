@@ -62,7 +62,7 @@ def programs(form: Form) -> Programs:
         while left > zero and passed < crossings[i] and count < MOST_TO_CROSSING:
             after = advance(m, own, interval[g], g, y, mode, zero, left)
             if peaks > 0:
-                top = wp.max(top, peak(m, interval[g], g, y, mode, zero, after.h, after.end))
+                top = peak(m, interval[g], g, y, mode, zero, after, top)
             y = after.y
             mode = after.mode
             ended += after.ended

@@ -13,6 +13,7 @@ import xarray as xr
 from tqdm.auto import tqdm
 
 from ..foundation import arguments
+from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..io.datasets import labelled
 from ..linear.cea import eigenvalues
@@ -213,7 +214,7 @@ def _run(
 
 
 def _end_state(scene: Scene, method: AbstractStepper, t1: float) -> np.ndarray:
-    return np.asarray(jax.jit(lambda scene: _run(scene, method, t1)[0][-1])(scene), np.float64)
+    return np.asarray(compiled(lambda scene: _run(scene, method, t1)[0][-1])(scene), np.float64)
 
 
 def _state_error(state: np.ndarray, reference: np.ndarray, n: int) -> float:

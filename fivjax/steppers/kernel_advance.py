@@ -39,7 +39,7 @@ def stepping(form: Form) -> Stepping:
     """The Warp functions for scenes of this form.
 
     `advance` goes to the next event, crossing of the section, end of the time or of the window, whichever comes first; `peak`
-    is the largest tangential speed on the way.
+    is the largest tangential speed on the way, or the one from before if that was larger.
     """
     wp, law = warp(), laws(form)
     t, like, real = law.types, law.mechanics, wp.float64
@@ -66,7 +66,7 @@ def stepping(form: Form) -> Stepping:
     @wp.struct
     class Step:
         """An advance: the state and mode after it, the state before what happened at its end, its duration (s), whether the
-        section was crossed, and whether the mode has ended.
+        section was crossed, whether the mode has ended, and samples of the tangential velocity, up to one behind the end.
         """
 
         y: state
@@ -75,6 +75,14 @@ def stepping(form: Form) -> Stepping:
         h: real
         crossed: int
         ended: int
+        speeds: speeds_of
+
+    @wp.struct
+    class Scan:
+        """The first interval of a window that has to be looked at, and samples of the tangential velocity up to its end."""
+
+        interval: int
+        speeds: speeds_of
 
     @wp.func
     def matrix_of(g: int, mode: mode_of) -> int:
@@ -135,15 +143,18 @@ def stepping(form: Form) -> Stepping:
         return found
 
     @wp.func
-    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> int:
+    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> Scan:
         """The first interval that may have an event, in which the section is crossed, or in which the time ends."""
         sizes = sizes_of(m, w, here)
         whole = int(wp.floor(steps))
+        found = Scan()
         before = here[speed_at]
+        found.speeds[0] = before
         i = int(0)
         searching = int(1)
         while searching == 1 and i < whole:
             c = block(m, w, intervals + i, here)
+            found.speeds[i + 1] = c[6]
             begins = zero
             start = eight()
             if i == 0:
@@ -159,7 +170,10 @@ def stepping(form: Form) -> Stepping:
             if searching == 1:
                 before = c[6]
                 i += 1
-        return i
+        if searching == 1 and i < INTERVALS:
+            found.speeds[i + 1] = block(m, w, intervals + i, here)[6]
+        found.interval = i
+        return found
 
     @wp.func
     def advance(
@@ -175,7 +189,8 @@ def stepping(form: Form) -> Stepping:
         w = matrix_of(g, mode)
         steps = wp.min(h / interval, most)
         here = stacked(y, load)
-        i = first_interval(m, w, mode, here, steps)
+        scan = first_interval(m, w, mode, here, steps)
+        i = scan.interval
         began = y
         if i > 0:
             began = sample_of(m, w, here, i)
@@ -241,6 +256,7 @@ def stepping(form: Form) -> Stepping:
                     fires_1 = 0
         result = Step()
         result.end = reached
+        result.speeds = scan.speeds
         result.ended = wp.max(fires_0, fires_1)
         if result.ended > 0:
             how = ending(load, real(fires_0), real(fires_1), resting * interval)
@@ -265,19 +281,18 @@ def stepping(form: Form) -> Stepping:
         return highest_of(c, wp.max(-real(i), -one), wp.min(steps - real(i), one)) / interval
 
     @wp.func
-    def peak(m: t.matrices, interval: real, g: int, y: state, mode: mode_of, load: real, h: real, end: state) -> real:
+    def peak(
+        m: t.matrices, interval: real, g: int, y: state, mode: mode_of, load: real, after: Step, before: real
+    ) -> real:
         w = matrix_of(g, mode)
         here = stacked(y, load)
-        steps = h / interval
-        highest = wp.abs(end[velocity])
-        speeds = speeds_of()
-        turned = speeds_of()
-        # Parabolas through three samples tell peaks apart: one sample behind the end counts, too.
-        for k in range(wp.min(int(steps) + 2, INTERVALS + 1)):
-            speeds[k] = sample(m, w, samples + of_sample * k, here)[velocity]
-            turned[k] = -speeds[k]
-            if real(k) <= steps:
-                highest = wp.max(highest, wp.abs(speeds[k]))
+        steps = after.h / interval
+        highest = wp.max(before, wp.abs(after.end[velocity]))
+        speeds = after.speeds
+        turned = -speeds
+        for k in range(wp.min(int(steps), INTERVALS) + 1):
+            highest = wp.max(highest, wp.abs(speeds[k]))
+        # Parabolas through three samples tell peaks apart.
         upper = int(fastest_sample(speeds, one_number(steps))[0])
         lower = int(fastest_sample(turned, one_number(steps))[0])
         # Next to a sample that is much slower than others there is no highest peak.
