@@ -138,8 +138,10 @@ def test_the_tube_is_entered_from_all_sides_on_its_edge():
     contact = Tube(states, tube.RADIUS).starts(section=np.array([0.0, 1.0]), gaps=np.array([1]))
     assert np.all(contact[:, [1, 3]] == 0)
     apart = np.linalg.norm(contact[:, None] - states, axis=-1)
-    chosen = states[np.linspace(0, STATES - 1, tube.STARTS).round().astype(int)]
+    chosen = states[np.argmin(np.abs(apart - tube.RADIUS * size), axis=1)]
     np.testing.assert_allclose(np.linalg.norm(contact - chosen, axis=1), tube.RADIUS * size)
+    # From all around the set.
+    assert np.linalg.norm(np.mean(chosen - np.mean(states, axis=0), axis=0)) < 0.1
     assert apart.min(axis=1).max() > 0.5 * tube.RADIUS * size
     radial = np.linalg.norm(contact, axis=1) - np.linalg.norm(chosen, axis=1)
     assert np.sum(radial > 0.99 * tube.RADIUS * size) >= 4 and np.sum(radial < -0.99 * tube.RADIUS * size) >= 4

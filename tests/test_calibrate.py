@@ -74,6 +74,7 @@ def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit, kn
         assert fit.uncertainty[own] == pytest.approx(decay_fit.uncertainty[name], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_coupled_contacts_from_thirty_per_cent_off(known_to_slide):
     """The response of two coupled contacts, from eigenvalues of matrices that the library does not make."""
     scene = pair(2e3)

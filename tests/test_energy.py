@@ -292,6 +292,7 @@ def test_signs(squeal):
     np.testing.assert_allclose(sum(energy.work.dampers.values()), energy.work.damping, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_impacts_seen_from_the_belt_never_gain():
     """The belt moves, so an impact may leave the structure with more energy than before; but not what the two have together."""
     events = fj.energy_per_event(simulate(mode_coupling(COULOMB, 3.0).replace(p=3.0), 3.0))

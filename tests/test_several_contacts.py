@@ -90,6 +90,7 @@ def agrees_with_copies(count, t1):
     return events
 
 
+@pytest.mark.slow
 def test_two_copies_of_the_paper_s_oscillator_move_like_one_each():
     """Two uncoupled copies under different loads: each contact as if it were alone, through 100 events; so are its energies.
     They lift off at the same instants, which must not make one put the other back."""

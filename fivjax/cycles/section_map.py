@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact, Mechanics, Rest, State
+from ..foundation.carried import depending_on
 from ..foundation.compiling import compiled
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding
@@ -215,6 +216,6 @@ def points_along(scene: Scene, stepper: EventExact, starts: Point, count: int) -
         return following.point, following
 
     def of_one(start):
-        return jax.lax.scan(to_next, start, None, length=count)[1]
+        return jax.lax.scan(to_next, depending_on((mechanics, start), start), None, length=count)[1]
 
     return jax.vmap(of_one)(starts)

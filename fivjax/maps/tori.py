@@ -327,9 +327,7 @@ def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -
     """The starts on the edge of each of these tubes, with their groups."""
     own, size = np.repeat(group, tube.STARTS), maps.structure.size
     section, gaps = maps.section / maps.weights[size:], np.atleast_1d(maps.normal)
-    # From each so-many-th state the slowest start is back sooner than from those that `Tube.starts` would choose.
-    thinned = (Tube(_thinned(one.states, tube.STARTS), one.radius) for one in tubes)
-    starts = np.concatenate([one.starts(section, gaps) for one in thinned])
+    starts = np.concatenate([one.starts(section, gaps) for one in tubes])
     return own, section_at(starts / maps.weights, maps.normal, maps.sliding[own])
 
 

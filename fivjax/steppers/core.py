@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact, Mechanics, State
+from ..foundation.carried import depending_on
 from .base import MOST_ADVANCES, AbstractStepper, Advance
 
 Total = TypeVar("Total")
@@ -81,5 +82,6 @@ def follow(
         _, _, left, total = carry
         return (left > 0) if until is None else (left > 0) & ~until(total)
 
-    y, contact, left, total = eqx.internal.while_loop(going, body, (y, contact, h, total), max_steps=most, kind=kind)
+    begin = depending_on((stepper, mechanics, load, y, h), (y, contact, h, total))
+    y, contact, left, total = eqx.internal.while_loop(going, body, begin, max_steps=most, kind=kind)
     return Followed(y, contact, left, total, ~going((y, contact, left, total)))

@@ -52,7 +52,7 @@ class Tube:
         `section` has the section's weights of velocities, in weighted coordinates; `gaps` are the indices of the normal
         displacements, which are zero in contact, as are their velocities.
         """
-        chosen = self.states[np.linspace(0, len(self.states) - 1, STARTS).round().astype(int)]
+        chosen = self.states[:: max(len(self.states) // STARTS, 1)][:STARTS]
         random = np.random.default_rng(0).normal(size=chosen.shape)
         kind = np.arange(STARTS) % 4
         away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
