@@ -44,7 +44,6 @@ def test_state_in_all_parameters_through_nine_events():
     assert measure.relative(forward, expected).max() < 1e-6
 
 
-@pytest.mark.slow
 def test_bouncing_mass_and_stick_slip_block_forward():
     """Rounding alone is allowed between the solver's derivative and that of the closed form."""
     for _, found, expected in measure.closed_forms("forward", FEW):
