@@ -48,9 +48,12 @@ def test_the_body_is_transformed_fewer_times():
         def of_one(x):
             begin = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
             begin = depending_on(x, begin) if prepared else begin
-            return jax.lax.while_loop(lambda c: c[2] < 10, lambda c: (c[0] + counted(x), c[0] + c[1], c[2] + 1), begin)[
-                1
-            ]
+            _, total, _ = jax.lax.while_loop(
+                lambda carry: carry[2] < 10,
+                lambda carry: (carry[0] + counted(x), carry[0] + carry[1], carry[2] + 1),
+                begin,
+            )
+            return total
 
         found = jax.vmap(of_one)(jnp.arange(3.0))
         np.testing.assert_allclose(found, 2 * 45 * np.arange(3.0))

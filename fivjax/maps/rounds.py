@@ -137,7 +137,7 @@ class Basins:
         # Those of each group when the time of its trajectories is over.
         self.known_at_last: dict[int, Attractors] = {}
         self.settled_by = np.zeros(len(of_groups))  # s
-        self.most_time = MOST_PERIODS * np.asarray(shared.tree.modes.slowest_period)  # s
+        self.most_time = MOST_PERIODS * np.asarray(shared.tree.modes.slowest_period)  # for which cycles are waited, s
 
     def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
         """Finds the attractors of these groups, where they are not `known`."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from ..contact import Status
 from ..cycles.torus import drifts, extent, smooth_mean
 from ..verdicts import tube
-from ..verdicts.tube import Tube, tree_of
+from ..verdicts.tube import Tube, thinned, tree_of
 from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
 from .section import ReturnMaps, Section
@@ -85,7 +85,7 @@ def tori_from(
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
-            tried = [(row, Tube(_thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
+            tried = [(row, Tube(thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
             tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
             if not tried:
                 continue
@@ -195,18 +195,13 @@ def goes_on(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
 
 def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will."""
-    states = _thinned(path, TUBES[0][1])
+    states = thinned(path, TUBES[0][1])
     return bool(np.median(_spacing(states)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
 
 
 def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
     """The distance of each state to the nearest of the others."""
     return tree_of(states).query(states, k=2)[0][:, 1]
-
-
-def _thinned(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
-    """Some `count` of the states."""
-    return states[:: max(len(states) // count, 1)]
 
 
 def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:

@@ -170,6 +170,7 @@ def stepping(form: Form) -> Stepping:
             if searching == 1:
                 before = c[6]
                 i += 1
+        # Where the time ends, too, the sample behind the end is needed to tell peaks apart.
         if searching == 1 and i < INTERVALS:
             found.speeds[i + 1] = block(m, w, intervals + i, here)[6]
         found.interval = i

@@ -52,7 +52,7 @@ class Tube:
         `section` has the section's weights of velocities, in weighted coordinates; `gaps` are the indices of the normal
         displacements, which are zero in contact, as are their velocities.
         """
-        chosen = self.states[:: max(len(self.states) // STARTS, 1)][:STARTS]
+        chosen = thinned(self.states, STARTS)[:STARTS]
         random = np.random.default_rng(0).normal(size=chosen.shape)
         kind = np.arange(STARTS) % 4
         away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
@@ -75,6 +75,11 @@ class Tube:
     def home(self, ends: Float[np.ndarray, "h m 2n"], within: float = 0.5) -> Bool[np.ndarray, " m"]:
         """Which motions have come back: all of their last crossing states lie in this share of the tube."""
         return np.all(self.holds(ends, within), axis=0)
+
+
+def thinned(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
+    """Each so-many-th of the states: `count` of them, or some more."""
+    return states[:: max(len(states) // count, 1)]
 
 
 def tree_of(states: Float[np.ndarray, "k 2n"]):
