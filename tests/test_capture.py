@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fivjax.contact import Status
-from fivjax.verdicts.capture import Returned, adapted_norm, neighbourhood, trial
+from fivjax.verdicts.capture import Returned, adapted_norm, neighbourhoods, side_by_side, trial
 from fivjax.verdicts.free_directions import free_coordinates
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
@@ -18,21 +18,25 @@ SLIDING = int(Status.SLIDE), 1.0
 def mapped(law, events=lambda x: 0 * x[:, 0], status=Status.SLIDE):
     """A return map that does this to the weighted deviations (points, free) from the centre."""
 
-    def returned(y):
-        x = WEIGHTS[FREE] * (y - CENTRE)[:, FREE]
-        after = np.repeat(CENTRE[None], len(y), axis=0)
+    def returned(_, y):
+        x = WEIGHTS[FREE] * (y[0] - CENTRE)[:, FREE]
+        after = np.repeat(CENTRE[None], len(x), axis=0)
         after[:, FREE] += law(x) / WEIGHTS[FREE]
-        statuses = np.full(len(y), status)
-        return Returned(after, statuses, np.ones(len(y)), events(x).astype(int))
+        images = after, np.full(len(x), status), np.ones(len(x)), events(x).astype(int)
+        return Returned(*(part[None] for part in images))
 
     return returned
 
 
-def found(matrix, returned):
+def jacobian_of(matrix):
     jacobian = np.zeros((6, 6))
-    scale = WEIGHTS[FREE]
-    jacobian[np.ix_(FREE, FREE)] = matrix / scale[:, None] * scale
-    return neighbourhood(trial(CENTRE, *SLIDING, jacobian, WEIGHTS, np.eye(6)[:, FREE]), returned)
+    jacobian[np.ix_(FREE, FREE)] = matrix / WEIGHTS[FREE][:, None] * WEIGHTS[FREE]
+    return jacobian
+
+
+def found(matrix, returned):
+    attempt = trial(CENTRE, *SLIDING, jacobian_of(matrix), WEIGHTS, np.eye(6)[:, FREE])
+    return None if attempt is None else neighbourhoods([attempt], returned)[0]
 
 
 def test_the_section_and_the_contact_mode_hold_their_coordinates():
@@ -70,7 +74,7 @@ def test_whoever_is_inside_goes_to_the_cycle(bend):
     assert inside is not None and inside.contraction < 1 and inside.points == 256
     directions = rng.normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    root = inside.norm[: len(FREE), FREE] / WEIGHTS[FREE]
+    root = inside.norm[np.ix_(FREE, FREE)] / WEIGHTS[FREE]
     x = np.linalg.solve(root, (inside.radius * rng.random((2000, 1)) * directions).T).T
     starts = CENTRE + np.zeros((2000, 6))
     starts[:, FREE] += x / WEIGHTS[FREE]
@@ -149,3 +153,38 @@ def test_a_state_in_another_mode_or_far_away_is_not_captured():
     modes = np.array([Status.SLIDE, Status.SLIDE, Status.DETACH, Status.SLIDE, Status.SLIDE])
     captured = inside.contains(states, modes, np.array([1.0, 1.0, 1.0, -1.0, 1.0]))
     assert captured.tolist() == [True, False, False, False, False]
+
+
+def test_several_cycles_are_checked_at_once_each_by_itself():
+    """Their first radii, their bends and their last radii differ, one is a ghost, and of one no radius is large enough."""
+    derivatives = [ROTATION, 0.5 * np.eye(3), np.diag([0.9, 0.3, 0.1]), ROTATION, 0.2 * ROTATION]
+    bends, least = [0.0, 3.0, 300.0, 3.0, 40.0], [0.0, 0.0, 0.0, 1.0, 0.0]
+    trials = []
+    for derivative, share in zip(derivatives, least, strict=True):
+        one = trial(CENTRE, *SLIDING, jacobian_of(derivative), WEIGHTS, np.eye(6)[:, FREE])
+        trials.append(one._replace(smallest=max(one.smallest, share * one.largest)))
+
+    def map_of(k):
+        def law(x):
+            after = x @ derivatives[k].T + bends[k] * np.sum(x**2, axis=1, keepdims=True)
+            return after + np.array([1e-3, 0.0, 0.0]) * (k == 4)
+
+        return mapped(law)
+
+    def returned(chosen, y):
+        parts = [map_of(k)(None, y[i : i + 1]) for i, k in enumerate(chosen)]
+        return Returned(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+    together = neighbourhoods(trials, returned)
+    assert [one is None for one in together] == [False, False, False, True, True]
+    for k, one in enumerate(together):
+        alone = neighbourhoods([trials[k]], map_of(k))[0]
+        assert (one is None) == (alone is None)
+        if one is not None:
+            assert (one.radius, one.contraction, one.points) == (alone.radius, alone.contraction, alone.points)
+            assert one.contains(CENTRE, *SLIDING)
+    # Of neighbourhoods side by side each is asked for its own state.
+    three, far = together[:3], CENTRE + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    states = np.array([CENTRE, far, CENTRE])
+    modes = np.array([SLIDING[0], SLIDING[0], Status.DETACH]), np.ones(3)
+    assert side_by_side(three).contains(states, *modes).tolist() == [True, False, False]

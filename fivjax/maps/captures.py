@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..contact import same_mode
 from ..cycles.closing import CLOSED, EXACT
-from ..verdicts.capture import LARGEST, PROBED, SMALLEST, Neighbourhood, Returned, Trial, trial
+from ..verdicts.capture import LARGEST, Neighbourhood, Returned, Trial, neighbourhoods, side_by_side, trial
 from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .section import ReturnMaps, Section
 
@@ -88,31 +88,25 @@ def stable_cycles(
             kept.append(row)
             rows_of.append([near[row]])
     before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
-    largest = [float(np.max(np.abs(np.linalg.eigvals(closed.jacobian[row])))) for row in kept]
-    locked_weakly = (lag[kept] > CROSSINGS) & (np.array(largest) > WEAKLY) & (not settled)
-    attempts = [
-        _trial(maps, closed, row) if old is None and not weak else None
-        for row, old, weak in zip(kept, before, locked_weakly, strict=True)
-    ]
-    found = [
-        (int(group[near[row]]), np.array(rows), old)
-        for row, rows, old in zip(kept, rows_of, before, strict=True)
-        if old
-    ]
-    stable = [k for k, attempt in enumerate(attempts) if attempt is not None]
+    largest = np.max(np.abs(np.linalg.eigvals(closed.jacobian[kept])), axis=1)
+    many = (lag[kept] > CROSSINGS) & (not settled)
+    found, stable, trials = [], [], []
+    for k, row in enumerate(kept):
+        if before[k] is not None:
+            found.append((int(group[near[row]]), np.array(rows_of[k]), before[k]))
+        elif not (many[k] and largest[k] > WEAKLY) and (attempt := _trial(maps, closed, row, lag[row], many[k])):
+            stable.append(k)
+            trials.append(attempt)
     if not stable:
         return found
-    chosen = np.array([kept[k] for k in stable])
+    chosen = np.array(kept)[stable]
     own, centre = group[near[chosen]], closed.at.rows(chosen)
-    smallest = np.where((lag[chosen] > CROSSINGS) & (not settled), SMALLEST_OF_MANY, SMALLEST)
-    neighbourhoods = _neighbourhoods(maps, own, lag[chosen], [attempts[k] for k in stable], smallest)
+    about = neighbourhoods(trials, _return_map(maps, own, centre, lag[chosen]))
     amplitude = maps.peaks(own, centre, lag[chosen])
-    for k, (place, row) in enumerate(zip(stable, chosen, strict=True)):
-        if neighbourhoods[k] is not None:
-            cycle = Cycle(
-                points_of[row], float(closed.period[row]), largest[place], float(amplitude[k]), neighbourhoods[k]
-            )
-            found.append((int(own[k]), np.array(rows_of[place]), cycle))
+    for k, row, where, peak in zip(stable, chosen, about, amplitude, strict=True):
+        if where is not None:
+            cycle = Cycle(points_of[row], float(closed.period[row]), float(largest[k]), float(peak), where)
+            found.append((int(group[near[row]]), np.array(rows_of[k]), cycle))
     return found
 
 
@@ -178,7 +172,7 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
     return _Closed(best, closure, jacobian, period)
 
 
-def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
+def _trial(maps: ReturnMaps, closed: _Closed, row: int, crossings: int, many: bool) -> Trial | None:
     structure = maps.structure
     y, status, direction = closed.at.y[row], closed.at.status[row], closed.at.direction[row]
     if len(structure.contacts) > 1:
@@ -188,48 +182,25 @@ def _trial(maps: ReturnMaps, closed: _Closed, row: int) -> Trial | None:
         status, direction = int(status), float(direction)
         free = free_coordinates(structure.size, structure.tangential, structure.normal, status)
         basis = np.eye(len(y))[:, free]
-    return trial(y, status, direction, closed.jacobian[row], maps.weights, basis)
-
-
-def _neighbourhoods(maps: ReturnMaps, group, crossings, trials: list[Trial], smallest) -> list[Neighbourhood | None]:
-    """`verdicts.capture.neighbourhood` of several cycles at once, not smaller than so, relative to each one's size."""
-    radius = np.array([attempt.largest for attempt in trials])
-    smallest = smallest / LARGEST * radius
-    radius[np.asarray(crossings) > CROSSINGS] /= 8  # their points lie close together
-    found: list[Neighbourhood | None] = [None] * len(trials)
-    open_ = list(range(len(trials)))
-    while open_:
-        promising = open_
-        for one_in in (*PROBED, 1):
-            tried = [trials[k].probe(one_in) for k in promising]
-            passed = dict(zip(promising, _passed(maps, group, crossings, tried, radius, promising), strict=True))
-            promising = [k for k in promising if passed[k] is not None]
-        for k in promising:
-            found[k] = passed[k]
-        open_ = [k for k in open_ if found[k] is None]
-        radius[open_] *= 0.5
-        open_ = [k for k in open_ if radius[k] >= smallest[k]]
+    found = trial(y, status, direction, closed.jacobian[row], maps.weights, basis)
+    if found is not None and many:
+        found = found._replace(smallest=SMALLEST_OF_MANY / LARGEST * found.largest)
+    if found is not None and crossings > CROSSINGS:
+        # Their points lie close together.
+        found = found._replace(largest=found.largest / 8)
     return found
 
 
-def _passed(maps: ReturnMaps, group, crossings, trials: list[Trial], radius, places) -> list[Neighbourhood | None]:
-    """Which of several trials, each of the cycle at its place, are passed at their radius."""
-    if not trials:
-        return []
-    states = [one.states(radius[k]) for one, k in zip(trials, places, strict=True)]
-    counts = np.array([len(part) for part in states])
-    at = Section(
-        np.concatenate(states),
-        np.repeat(np.array([one.status for one in trials]), counts, axis=0),
-        np.repeat(np.array([one.direction for one in trials]), counts, axis=0),
-    )
-    image = maps.returns(np.repeat(group[places], counts), at, np.repeat(crossings[places], counts))
-    images = Returned(*image.at, image.events)
-    ends = np.cumsum(counts)
-    return [
-        one.passed(float(radius[k]), Returned(*(part[start:end] for part in images)))
-        for one, k, start, end in zip(trials, places, ends - counts, ends, strict=True)
-    ]
+def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
+    """The return maps of cycles, each over so many crossings and in its own contact mode (`capture.ReturnMap`)."""
+
+    def returned(chosen, y):
+        each = np.repeat(chosen, y.shape[1])
+        at = centre.rows(each)._replace(y=y.reshape(-1, y.shape[-1]))
+        image = maps.returns(group[each], at, crossings[each])
+        return Returned(*(part.reshape(*y.shape[:2], *part.shape[1:]) for part in (*image.at, image.events)))
+
+    return returned
 
 
 def captured(
@@ -245,26 +216,28 @@ def captured(
     far as their stepper knows them, good enough to tell which ones to ask. What counts is where the exact return map leads
     from where they are now (`at`).
     """
-    weights = maps.weights
     which = np.full(len(group), -1)
-    asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for place, (rows, cycle) in enumerate(known):
-        n = cycle.neighbourhood
-        with np.errstate(invalid="ignore"):
-            apart = np.linalg.norm(weights * (latest[rows][:, None] - cycle.points), axis=2)
-            close = apart.min(axis=1) <= n.radius + maps.known_to * np.linalg.norm(weights * n.centre)
-        chosen = rows[close]
-        if len(chosen):
-            crossings = len(cycle.points) - apart[close].argmin(axis=1)
-            asked.append((chosen, crossings, np.full(len(chosen), place)))
-    if not asked:
+    if not known:
         return which
-    rows, crossings, places = (np.concatenate(parts) for parts in zip(*asked, strict=True))
-    image = maps.returns(group[rows], at.rows(rows), crossings).at
-    for place in np.unique(places):
-        one = places == place
-        inside = known[place][1].neighbourhood.contains(image.y[one], image.status[one], image.direction[one])
-        which[rows[one][inside]] = place
+    weights, cycles = maps.weights, [cycle for _, cycle in known]
+    about = side_by_side([cycle.neighbourhood for cycle in cycles])
+    within = about.radius + maps.known_to * np.linalg.norm(weights * about.centre, axis=1)
+    row = np.concatenate([rows for rows, _ in known])
+    place = np.repeat(np.arange(len(known)), [len(rows) for rows, _ in known])
+    length = np.array([len(cycle.points) for cycle in cycles])
+    near, crossings = np.zeros(len(row), bool), np.zeros(len(row), int)
+    for count in np.unique(length):
+        alike, own = np.flatnonzero(length == count), np.flatnonzero(length[place] == count)
+        points = np.array([cycles[k].points for k in alike])[np.searchsorted(alike, place[own])]
+        apart = np.linalg.norm(weights * (latest[row[own], None] - points), axis=2)
+        with np.errstate(invalid="ignore"):
+            near[own] = np.min(apart, axis=1) <= within[place[own]]
+        crossings[own] = count - np.argmin(apart, axis=1)
+    row, place, crossings = row[near], place[near], crossings[near]
+    if len(row):
+        image = maps.returns(group[row], at.rows(row), crossings).at
+        inside = Neighbourhood(*(part[place] for part in about)).contains(*image)
+        which[row[inside]] = place[inside]
     return which
 
 

@@ -22,7 +22,6 @@ from .blocks import workers
 from .flattened import Flattened, flatten
 from .kernel_programs import Programs, programs
 from .sharing import Batch, with_values
-from .windowed_returns import KEPT
 
 # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
 AT_A_TIME, LEAST_STEPS = 4, 4096
@@ -73,7 +72,7 @@ class Kernels:
             device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups] for device in self.devices
         }
 
-    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int = KEPT):
+    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
         """What `moved_in_windows` gives, for motions from these states of the section; with the last `kept` crossings."""
         count, size = y.shape
         wp, state = self.wp, self.types.state

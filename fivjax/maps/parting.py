@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .section import ReturnMaps, Section
-from .windowed_returns import KEPT
 
 # Over so many returns, again and again, it is asked whether neighbours part: the first turn directions to where they grow. On a
 # torus they part no faster than linearly; in chaos exponentially.
@@ -80,15 +79,11 @@ def _parted(maps: ReturnMaps, group, at: Section, beside):
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     apart = np.linalg.norm(weights * (beside - at.y), axis=1)
     pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    path, time = [], np.zeros(len(group))
-    for _ in range(0, PARTING_OVER, KEPT):
-        image = maps.returns(np.tile(group, 2), pair, KEPT)
-        pair, time = image.at, time + image.time[: len(group)]
-        path.append(weights * image.path[: len(group)])
+    pair, _, time, path, _ = maps.returns(np.tile(group, 2), pair, PARTING_OVER, PARTING_OVER)
     at, other = pair.rows(slice(None, len(group))), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
     distance = np.linalg.norm(away, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log(distance[:, 0] / apart) / PARTING_OVER
         beside = at.y + APART * size * away / distance / weights
-    return growth, time, at, beside, np.concatenate(path, axis=1)
+    return growth, time[: len(group)], at, beside, weights * path[: len(group)]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..contact import Contact
+from ..contact import Contact, Status
 from ..cycles.around import peak_speed_along
 from ..cycles.section_map import MOST_SEGMENTS, MOST_TO_CROSSING, Point, moved, to_crossing
 from ..foundation.compiling import compiled
@@ -67,6 +67,7 @@ class Images(NamedTuple):
     events: Int[np.ndarray, " m"]  # contact events on the way
     time: Float[np.ndarray, " m"]  # s
     path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN if there were fewer
+    peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
 
 
 class ReturnMaps:
@@ -96,40 +97,40 @@ class ReturnMaps:
         row[np.atleast_1d(self.tangential)] = section_weights(len(self.structure.contacts))
         return row
 
-    def returns(self, group, at: Section, crossings) -> Images:
-        """The `crossings`-th crossing from each row."""
-        if self.windows is not None:
-            return _images(self._in_windows(group, at, crossings)[:-1])
-        return _images(self._exactly(_returned, self.block, group, at, crossings))
+    def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:
+        """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
+        `peaks` are asked for. More than `KEPT` states are kept only if they are all of them.
+        """
+        if self.kernels is not None or kept <= KEPT:
+            return self._returns(group, at, crossings, kept, peaks)
+        parts: list[Images] = []
+        for start in range(0, kept, KEPT):
+            part = min(KEPT, kept - start)
+            parts.append(self._returns(group, parts[-1].at if parts else at, part, part, peaks))
+        _, events, time, paths, peak = zip(*parts, strict=True)
+        return Images(
+            parts[-1].at,
+            np.sum(events, axis=0),
+            np.sum(time, axis=0),
+            np.concatenate(paths, axis=1),
+            np.max(peak, axis=0),
+        )
 
     def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
         """The next `count` states on the section from each row: the last one with its contact mode; and all of them."""
-        at, states, _ = self._path(group, at, count)
-        return at, states
+        images = self.returns(group, at, count, count)
+        return images.at, images.path
 
-    def path_and_peaks(
-        self, group, at: Section, count: int
-    ) -> tuple[Section, Float[np.ndarray, "m count 2n"], Float[np.ndarray, " m"]]:
-        """The same, and the largest tangential speed (m/s) on the way."""
-        return self._path(group, at, count, peaks=True)
-
-    def _path(self, group, at: Section, count: int, peaks: bool = False):
+    def _returns(self, group, at: Section, crossings, kept: int, peaks: bool) -> Images:
         if self.kernels is not None:
-            *end, _, _, path, peak = self.kernels.returns(group, *at, count, peaks, kept=count)
-            return Section(*end), path, peak
-        states, highest = [], np.zeros(len(at.y))
-        while count > 0:
-            part = min(count, KEPT)
-            if self.windows is not None:
-                *end, _, _, path, peak = self._in_windows(group, at, part, peaks)
-                end = Section(*end)
-            else:
-                # Most paths need no peaks, so these are of another program.
-                end, _, _, path = self.returns(group, at, part)
-                peak = self.peaks(group, at, part) if peaks else highest
-            at, highest, count = end, np.maximum(highest, peak), count - part
-            states.append(path[:, KEPT - part :])
-        return at, np.concatenate(states, axis=1), highest
+            return _images(self.kernels.returns(group, *at, crossings, peaks, kept))
+        if self.windows is not None:
+            images = _images(self._in_windows(group, at, crossings, peaks))
+        else:
+            # Most need no peaks, so these are of another program.
+            peak = self.peaks(group, at, crossings) if peaks else np.zeros(len(at.y))
+            images = _images((*self._exactly(_returned, self.block, group, at, crossings), peak))
+        return images._replace(path=images.path[:, KEPT - kept :])
 
     def derived(
         self, group, at: Section, crossings
@@ -143,7 +144,7 @@ class ReturnMaps:
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
         if self.windows is not None:
-            return self._in_windows(group, at, crossings, peaks=True)[-1]
+            return self.returns(group, at, crossings, peaks=True).peak
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 
     def _differences(self, group, at: Section, crossings):
@@ -166,11 +167,11 @@ class ReturnMaps:
     def _differences_of_few(self, group, at: Section, crossings):
         """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
         count, size = at.y.shape
-        free = np.zeros((count, size), bool)
-        for own, status in zip(free, at.status, strict=True):
-            own[free_coordinates(self.structure.size, self.tangential, self.normal, int(status))] = True
+        free = np.zeros((len(Status), size), bool)
+        for status in Status:
+            free[status, free_coordinates(self.structure.size, self.tangential, self.normal, status)] = True
         lengths = np.linalg.norm(self.weights * at.y, axis=1)
-        row, place = np.nonzero(free)
+        row, place = np.nonzero(free[at.status])
         base = self.returns(group, at, crossings)
         derivatives = np.zeros((count, size, size))
         for step in STEPS:
@@ -192,9 +193,7 @@ class ReturnMaps:
                 break
         return base.at, base.time, derivatives
 
-    def _in_windows(self, group, at: Section, crossings, peaks: bool = False):
-        if self.kernels is not None:
-            return self.kernels.returns(group, *at, crossings, peaks)
+    def _in_windows(self, group, at: Section, crossings, peaks: bool):
         rows = _rows(at, crossings, np.full(len(at.y), peaks))
         width, size = (SIDE_BY_SIDE, self.block) if in_rows_of_several(group) else (1, FEW)
         return in_blocks(moved_in_windows, self.windows, group, rows, width, self.pool, size=size).tree

@@ -14,7 +14,6 @@ from ..verdicts.tube import Tube, thinned, tree_of
 from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
 from .section import ReturnMaps, Section
-from .windowed_returns import KEPT
 
 # Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
 TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
@@ -138,7 +137,7 @@ def _traced(
             # Most are left out after this, and peaks take as long as the motion.
             at, more = maps.path(group[running], at, AT_A_TIME)
         else:
-            at, more, highest = maps.path_and_peaks(group[running], at, AT_A_TIME)
+            at, _, _, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
             peaks = np.concatenate([peaks, highest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGER:]
@@ -283,9 +282,9 @@ def _back(
         while crossed < BACK_WITHIN and len(running):
             report(0)
             # Most are back soon; the others are looked at in growing steps.
-            further = min(max(KEPT, crossed // 2), BACK_WITHIN - crossed)
+            further = min(max(tube.HOME, crossed // 2), BACK_WITHIN - crossed)
             crossed += further
-            image = maps.returns(own[running], last.rows(running), further)
+            image = maps.returns(own[running], last.rows(running), further, tube.HOME)
             last.put(running, image.at)
             ends = weights * np.moveaxis(image.path, 1, 0)
             # One that fades, or fails, does not come back.
@@ -294,7 +293,7 @@ def _back(
             ok[of_tube[running[lost]]] = False
             for k in np.unique(of_tube[running]):
                 mine = of_tube[running] == k
-                back[running[mine]] = tubes[k].home(ends[-tube.HOME :, mine], BACK_TO)
+                back[running[mine]] = tubes[k].home(ends[:, mine], BACK_TO)
             running = running[ok[of_tube[running]] & ~back[running]]
         ok[of_tube[among & ~back]] = False
     return np.flatnonzero(ok), last

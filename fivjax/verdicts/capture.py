@@ -61,30 +61,35 @@ class Neighbourhood(NamedTuple):
     centre: Float[np.ndarray, " state"]  # the cycle's state, as a deviation from the sliding equilibrium
     status: int | Int[np.ndarray, " c"]  # the contact mode there; with several contacts, one for each
     direction: float | Float[np.ndarray, " c"]  # the direction of friction there, if it slides
-    norm: Float[np.ndarray, "k state"]  # the norm of a state y is the length of norm @ (y - centre)
+    norm: Float[np.ndarray, "state state"]  # the norm of a state y is the length of norm @ (y - centre)
     radius: float  # in that norm, which is never less than the length of the weighted deviation
     contraction: float  # the largest ratio of norms after and before one period, of the points checked
     points: int  # the number of points checked
 
     def contains(
-        self, y: Float[np.ndarray, "*m state"], status: Int[np.ndarray, "*m"], direction: Float[np.ndarray, "*m"]
+        self,
+        y: Float[np.ndarray, "*m state"],
+        status: Int[np.ndarray, "..."],
+        direction: Float[np.ndarray, "..."],
     ) -> Bool[np.ndarray, "*m"]:
-        """Which of several states of the section lie in it: their trajectories are captured."""
-        size = np.linalg.norm((y - self.centre) @ self.norm.T, axis=-1)
-        return (size <= self.radius) & _same_mode(status, direction, self.status, self.direction)
+        """Which of several states of the section lie in it: their trajectories are captured. Of `side_by_side` neighbourhoods
+        each is asked for its own state.
+        """
+        size = np.linalg.norm(np.einsum("...kj,...j->...k", self.norm, y - self.centre), axis=-1)
+        return (size <= self.radius) & _same_mode(y, status, direction, self.status, self.direction)
 
 
 class Returned(NamedTuple):
-    """The images of several states (leading axis) under a return map; NaN where a motion does not come back."""
+    """The images of several states of several cycles under their return maps; NaN where a motion does not come back."""
 
-    y: Float[np.ndarray, "m state"]
-    status: Int[np.ndarray, "m *contacts"]
-    direction: Float[np.ndarray, "m *contacts"]
-    events: Int[np.ndarray, " m"]  # contact events on the way
+    y: Float[np.ndarray, "c m state"]
+    status: Int[np.ndarray, "c m *contacts"]
+    direction: Float[np.ndarray, "c m *contacts"]
+    events: Int[np.ndarray, "c m"]  # contact events on the way
 
 
-# The return map over one period of the cycle, from many states of the section in the cycle's contact mode.
-ReturnMap = Callable[[Float[np.ndarray, "m state"]], Returned]
+# The return maps of these cycles, by their places: each over its period, from its states of the section, in its contact mode.
+ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], Returned]
 
 
 def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
@@ -107,34 +112,17 @@ def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray
 
 
 class Trial(NamedTuple):
-    """A stable cycle with its adapted norm, about which a neighbourhood is sought."""
+    """A stable cycle with its adapted norm, about which a neighbourhood is sought; or several, `side_by_side`."""
 
-    centre: Float[np.ndarray, " state"]
-    status: int | Int[np.ndarray, " c"]
-    direction: float | Float[np.ndarray, " c"]
-    norm: Float[np.ndarray, "k state"]
-    steps: Float[np.ndarray, "m state"]  # deviations of the points to be checked, for a radius of one
-    sizes: Float[np.ndarray, " m"]  # their norms
-    allowed: float  # the contraction κ that is required
-    largest: float  # the first radius to try
-
-    def probe(self, one_in: int) -> "Trial":
-        """The same with one in so many points: most radii that are too large fail already at few."""
-        return self._replace(steps=self.steps[::one_in], sizes=self.sizes[::one_in])
-
-    def states(self, radius: float) -> Float[np.ndarray, "point state"]:
-        """The states at which the return map is to be evaluated: the centre, for comparison, and the points."""
-        return np.concatenate([self.centre[None], self.centre + radius * self.steps])
-
-    def passed(self, radius: float, images: Returned) -> Neighbourhood | None:
-        """The neighbourhood of this radius, if the images of `states` show that it is one."""
-        ratios = np.linalg.norm((images.y[1:] - self.centre) @ self.norm.T, axis=1) / (radius * self.sizes)
-        alike = _same_mode(images.status, images.direction, self.status, self.direction)
-        # NaN is not below anything, so it fails.
-        if not (np.all(alike & (images.events == images.events[0])) and np.all(ratios <= self.allowed)):
-            return None
-        contraction = float(np.max(ratios))
-        return Neighbourhood(self.centre, self.status, self.direction, self.norm, radius, contraction, len(self.sizes))
+    centre: Float[np.ndarray, "*c state"]
+    status: int | Int[np.ndarray, "..."]
+    direction: float | Float[np.ndarray, "..."]
+    norm: Float[np.ndarray, "*c state state"]
+    steps: Float[np.ndarray, "*c m state"]  # deviations of the points to be checked, for a radius of one
+    sizes: Float[np.ndarray, "*c m"]  # their norms
+    allowed: float | Float[np.ndarray, " c"]  # the contraction κ that is required
+    largest: float | Float[np.ndarray, " c"]  # the first radius to try
+    smallest: float | Float[np.ndarray, " c"]  # the last one
 
 
 def trial(
@@ -157,44 +145,87 @@ def trial(
     if found is None or size == 0:
         return None
     root, rate = found
-    shells = np.concatenate([share * directions(basis.shape[1]) for share in SHELLS])
-    # Points of the unit ball in the norm, as deviations of the state.
-    steps = np.linalg.solve(root, shells.T).T @ basis.T / weights
-    norm = np.concatenate([root @ basis.T, np.eye(len(weights)) - basis @ basis.T]) * weights
+    shells = np.concatenate([share * directions(basis.shape[1], len(weights)) for share in SHELLS])
     return Trial(
-        centre, status, direction, norm, steps, np.linalg.norm(shells, axis=1), 0.5 * (1 + rate), LARGEST * size
+        centre,
+        status,
+        direction,
+        (basis @ root @ basis.T + np.eye(len(weights)) - basis @ basis.T) * weights,
+        # Points of the unit ball in the norm, as deviations of the state.
+        np.linalg.solve(root, shells.T).T @ basis.T / weights,
+        np.linalg.norm(shells, axis=1),
+        0.5 * (1 + rate),
+        LARGEST * size,
+        SMALLEST * size,
     )
 
 
-def neighbourhood(attempt: Trial | None, returned: ReturnMap) -> Neighbourhood | None:
-    """The largest of a halving series of ellipsoids that the return map is checked to contract into itself.
+def neighbourhoods(trials: list[Trial], returned: ReturnMap) -> list[Neighbourhood | None]:
+    """Of each cycle the largest of a halving series of ellipsoids that the return map is checked to contract into itself.
 
-    None if there is no check to make, or if no ellipsoid of at least `SMALLEST` of the cycle's size passes: trajectories near
-    such a cycle stay undecided.
+    None if no ellipsoid passes, down to the smallest: trajectories near such a cycle stay undecided.
     """
-    if attempt is None:
-        return None
-    radius = attempt.largest
-    while radius >= SMALLEST / LARGEST * attempt.largest:
-        found = attempt.passed(radius, returned(attempt.states(radius)))
-        if found is not None:
-            return found
-        radius = 0.5 * radius
-    return None
+    found: list[Neighbourhood | None] = [None] * len(trials)
+    if not trials:
+        return found
+    every = side_by_side(trials)
+    radius, open_ = np.array(every.largest), np.arange(len(trials))
+    while len(open_):
+        passed = open_
+        for one_in in (*PROBED, 1):
+            ratios = _contraction(every, passed, one_in, radius[passed], returned)
+            # NaN is not below anything, so it fails.
+            passes = ratios <= every.allowed[passed]
+            passed, ratios = passed[passes], ratios[passes]
+        for k, ratio in zip(passed.tolist(), ratios.tolist(), strict=True):
+            one, own = trials[k], float(radius[k])
+            found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, own, ratio, len(one.sizes))
+        open_ = open_[~np.isin(open_, passed)]
+        radius[open_] *= 0.5
+        open_ = open_[radius[open_] >= every.smallest[open_]]
+    return found
 
 
-def _same_mode(status, direction, other, other_direction):
+def _contraction(
+    trials: Trial, chosen: Int[np.ndarray, " c"], one_in: int, radius: Float[np.ndarray, " c"], returned: ReturnMap
+) -> Float[np.ndarray, " c"]:
+    """The largest ratio of norms after and before one period, of one in so many points that are checked of each of the chosen
+    cycles; NaN unless all come back in the cycle's contact mode after as many events as the cycle has.
+    """
+    if not len(chosen):
+        return radius
+    own = Trial(*(np.asarray(part)[chosen] for part in trials))
+    centre, sizes = own.centre[:, None], own.sizes[:, ::one_in]
+    # The cycle itself comes first, for comparison.
+    steps = np.concatenate([np.zeros_like(centre), own.steps[:, ::one_in]], axis=1)
+    images = returned(chosen, centre + radius[:, None, None] * steps)
+    away = (images.y[:, 1:] - centre) @ np.swapaxes(own.norm, 1, 2)
+    ratios = np.max(np.linalg.norm(away, axis=2) / (radius[:, None] * sizes), axis=1)
+    mode = np.expand_dims(own.status, 1), np.expand_dims(own.direction, 1)
+    alike = _same_mode(images.y, images.status, images.direction, *mode)
+    return np.where(np.all(alike & (images.events == images.events[:, :1]), axis=1), ratios, np.nan)
+
+
+def side_by_side(several: list):
+    """Several `Trial`s or `Neighbourhood`s as one, whose arrays have a leading axis over them."""
+    return type(several[0])(*map(np.array, zip(*several, strict=True)))
+
+
+def _same_mode(y, status, direction, other, other_direction):
+    """Which states are in the other contact mode; with several contacts all of them have to be."""
     same = same_mode(status, direction, other, other_direction)
-    return np.all(same, axis=-1) if np.ndim(other) else same
+    return np.all(same, axis=-1) if np.ndim(status) == np.ndim(y) else same
 
 
 @functools.cache
-def directions(dimension: int) -> Float[np.ndarray, "d f"]:
-    """Directions that fill the unit sphere evenly, in opposite pairs, including the axes."""
+def directions(dimension: int, size: int) -> Float[np.ndarray, "d f"]:
+    """Directions that fill the unit sphere evenly, in opposite pairs, including the axes: as many for all cycles with states of
+    this size, however many dimensions their contact modes leave free.
+    """
     from scipy.special import ndtri
 
     axes = np.eye(dimension)
-    count = max(DIRECTIONS // 2 - dimension, 1)
+    count = max(DIRECTIONS // 2, size) - dimension
     inside = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in _primes(dimension)], axis=1)
     spread = ndtri(inside)
     lengths = np.linalg.norm(spread, axis=1, keepdims=True)
