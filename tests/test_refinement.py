@@ -26,7 +26,7 @@ def fill(truth, halvings, audit=0.01, interrupt=None):
         verdicts.amplitude[places] = truth.ravel()[places]
 
     source, checked = refined(truth.shape, halvings, audit, verdicts, run)
-    computed = (source == np.arange(truth.size)) & ~verdicts.pending
+    computed = (source == np.arange(truth.size)) & ~verdicts.pending()
     return verdicts.verdict[source].reshape(truth.shape), computed.reshape(truth.shape), checked, calls
 
 

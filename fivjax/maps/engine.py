@@ -83,17 +83,17 @@ def run_to_verdict(
     plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
     verdicts = not_run(plan.trajectories.total, energy) if verdicts is None else verdicts
     total = plan.trajectories.total if places is None else len(places)
-    pending = verdicts.pending if places is None else verdicts.pending[places]
+    asked = slice(None) if places is None else places
     attractors = {} if attractors is None else attractors
     at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
-    with stop_requests() as requested, _Bar(label, total, total - int(pending.sum()), progress) as bar:
+    with stop_requests() as requested, _Bar(label, total, total - int(verdicts.pending(asked).sum()), progress) as bar:
         try:
             # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
             needed_later = places is not None or bool(plan.parts[-1])
             for part in plan.parts:
                 _follow(plan, part, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested)
         except KeyboardInterrupt:
-            left = int(np.sum(verdicts.pending if places is None else verdicts.pending[places]))
+            left = int(verdicts.pending(asked).sum())
             warnings.warn(
                 f"Interrupted: of {counted(total, 'trajectory')}, {left} without a verdict, "
                 f"labelled {Verdict.NOT_RUN.value}.",
@@ -118,7 +118,7 @@ def _follow(
     requested: list[int],
 ) -> None:
     """Run the jobs of one part of the plan whose results are missing, and add the attractors that they find."""
-    missing = [number for number in part if np.any(verdicts.pending[plan.jobs[number]])]
+    missing = [number for number in part if np.any(verdicts.pending(plan.jobs[number]))]
     found: dict[int, dict[bytes, Attractors]] = {}
     if keeper is not None and keeper.found:
         found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}

@@ -1,5 +1,6 @@
 """Adaptive maps: a coarse grid that is refined where neighbours differ, and checked at random elsewhere."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -44,39 +45,47 @@ def refined(
     compared. After an interrupt nothing more is computed, and the finer points take their own (missing) results.
     """
     # Arrays of a map of many millions of points take hundreds of megabytes each.
-    small = np.int32 if math.prod(shape) < 2**31 else np.int64
-    places = np.arange(math.prod(shape), dtype=small).reshape(shape)
-    source = places.ravel().copy()
-
-    def every(step: int) -> tuple[slice, ...]:
-        return tuple(slice(None, None, step) for _ in shape)
+    source = np.arange(math.prod(shape), dtype=np.int32 if math.prod(shape) < 2**31 else np.int64)
 
     def compute(which: np.ndarray, what: str) -> bool:
         """Compute these points; whether all were followed to their end, which an interrupt prevents."""
         if which.size:
             run(which, what)
-        return not np.any(verdicts.pending[which])
+        return not np.any(verdicts.pending(which))
 
-    step = 2**halvings
-    going = compute(places[every(step)].ravel(), "coarse grid")
+    going = compute(_every(2**halvings, shape, source.dtype).ravel(), "coarse grid")
     for level in range(1, halvings + 1):
         if not going:
             return source, Audit(0, 0)
-        corners = places[every(step)]
-        step //= 2
-        new = places[every(step)]
-        wanted = _near_differences(_differ(verdicts, source[corners]), new.shape)
-        rest = ~wanted
-        wanted[every(2)] = rest[every(2)] = False
-        before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
-        source[new[rest]] = source[before[rest]]
-        going = compute(new[wanted], f"halving {level} of {halvings}")
-    chosen = _audited(np.flatnonzero(source == places.ravel()), places.size, audit if going else 0.0)
+        going = compute(_halved(shape, 2 ** (halvings - level), verdicts, source), f"halving {level} of {halvings}")
+    computed = np.flatnonzero(source == np.arange(len(source), dtype=source.dtype))
+    chosen = _audited(computed, len(source), audit if going else 0.0)
     compute(chosen, "audit")
-    chosen = chosen[~verdicts.pending[chosen]]
+    chosen = chosen[~verdicts.pending(chosen)]
     wrong = verdicts.verdict[chosen] != verdicts.verdict[source[chosen]]
     source[chosen] = chosen
     return source, Audit(len(chosen), int(wrong.sum()))
+
+
+def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray, "*grid"]:
+    """The indices of every so many-th point along each axis of a grid of this shape."""
+    along = (math.prod(shape[axis + 1 :]) * np.arange(0, length, step, dtype=kind) for axis, length in enumerate(shape))
+    return functools.reduce(np.add, np.ix_(*along))
+
+
+def _halved(
+    shape: tuple[int, ...], step: int, verdicts: Verdicts, source: Int[np.ndarray, " cells"]
+) -> Int[np.ndarray, " r"]:
+    """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
+    their `source`.
+    """
+    corners, new = _every(2 * step, shape, source.dtype), _every(step, shape, source.dtype)
+    wanted = _near_differences(_differ(verdicts, source[corners]), new.shape)
+    rest, old = ~wanted, tuple(slice(None, None, 2) for _ in shape)
+    wanted[old] = rest[old] = False
+    before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
+    source[new[rest]] = source[before[rest]]
+    return new[wanted]
 
 
 def _audited(computed: Int[np.ndarray, " k"], total: int, share: float) -> Int[np.ndarray, " r"]:

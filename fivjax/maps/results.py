@@ -39,10 +39,9 @@ class Verdicts(NamedTuple):
     last_event: np.ndarray  # s
     energy: dict[str, np.ndarray]  # terms of the ledger by name, J; empty where not asked for
 
-    @property
-    def pending(self) -> np.ndarray:
-        """Which trajectories have not been run."""
-        return self.verdict == Verdict.NOT_RUN
+    def pending(self, places: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Which of the trajectories at these places have not been run."""
+        return self.verdict[places] == Verdict.NOT_RUN
 
 
 def not_run(total: int, energy: bool) -> Verdicts:

@@ -64,7 +64,7 @@ def follow_all(
     shared = shared_by(batch, of_groups)
     columns = np.stack([np.zeros(len(index)), *(values[name] for name in (*batch.history, *states))], axis=-1)[:, 1:]
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
-    pending = np.flatnonzero(verdicts.pending[index])
+    pending = np.flatnonzero(verdicts.pending(index))
     trajectories = begun(batch, shared, group[pending], columns[pending])
     kernels = Kernels(shared, batch.pool) if batch.by_kernel else None
     basins = Basins(batch, shared, kernels, of_groups, group)
