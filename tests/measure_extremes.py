@@ -30,8 +30,8 @@ import xarray as xr
 import fivjax as fj
 from fivjax.maps import engine
 from fivjax.maps.results import Verdicts
+from fivjax.simulation.rows import states_at
 from fivjax.simulation.start import start_state
-from fivjax.simulation.trajectory import states_at
 from fivjax.steppers.base import MOST_ADVANCES
 from fivjax.verdicts.verdict import Verdict
 

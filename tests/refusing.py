@@ -11,7 +11,7 @@ from fivjax import cli
 ENGINES = (
     "fivjax.maps.bistability.run_to_verdict",
     "fivjax.maps.threshold.run_to_verdict",
-    "fivjax.simulation.trajectory._simulate",
+    "fivjax.simulation.trajectory.rows_in_parts",
     "fivjax.calibration.fit.misfit_of_waveform",
     "fivjax.maps.tradeoff_study._end_state",
     "fivjax.simulation.differentiation._differentiated",

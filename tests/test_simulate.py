@@ -10,6 +10,7 @@ from catalogue import LOW_ORDER, QUICK, steady
 import fivjax as fj
 from fivjax.contact import Status
 from fivjax.foundation.compiling import compiled
+from fivjax.simulation.rows import IN_A_PART
 
 CASES = {
     "detachment": ({"mu": 0.227, "belt_speed": 3.0, "p": 1.3}, 0.5),
@@ -44,10 +45,22 @@ def scene_of(parameters: dict) -> fj.Scene:
 def test_every_saved_quantity_agrees_with_the_oracle(name):
     """SciPy's `solve_ivp` with events and restarts, written apart from the package, is the reference."""
     parameters, t1 = CASES[name]
-    t = np.linspace(0.0, t1, 101)
+    agrees_with_the_oracle(parameters, t1, 100)
+
+
+def test_a_run_of_many_rows_agrees_with_the_oracle():
+    """It is computed in parts; here the load jumps where two parts meet, twice."""
+    border = IN_A_PART * 1e-4
+    parameters = {"mu": 0.227, "belt_speed": 1.0, "p": 5.0, "start": border, "duration": border}
+    agrees_with_the_oracle(parameters, 0.25, 2500)
+
+
+def agrees_with_the_oracle(parameters: dict, t1: float, intervals: int) -> None:
+    t = np.linspace(0.0, t1, intervals + 1)
     reference = oracle.simulate(oracle.paper_model(**parameters), t1, t, rtol=1e-12)
-    run = fj.simulate(scene_of(parameters), t1, t1 / 100)
-    assert run.t[0] == 0 and run.t[-1] == t1 and len(run.t) == 101
+    run = fj.simulate(scene_of(parameters), t1, t1 / intervals)
+    assert run.t[0] == 0 and run.t[-1] == t1 and len(run.t) == intervals + 1
+    np.testing.assert_allclose(run.t, t, rtol=1e-12)
     # The reference's tolerance, multiplied through the events.
     np.testing.assert_allclose(run.displacement, reference.q, atol=1e-9 * np.abs(reference.q).max())
     np.testing.assert_allclose(run.velocity, reference.v, atol=1e-9 * np.abs(reference.v).max())
@@ -224,6 +237,16 @@ def test_growth_without_bound_is_a_failure_with_a_name(paper_scene):
     assert np.nanmax(np.abs(run.velocity)) < 1e12
 
 
+def test_rows_that_are_lost_are_lost_in_all_later_parts(paper_scene):
+    run = fj.simulate(paper_scene, 25.0, 1e-2, fj.WhereSwitched(diffrax.Tsit5(), dt=5e-3))
+    assert run.outcome == fj.Ending.UNBOUNDED
+    lost = np.isnan(run.velocity).all(axis=1)
+    assert np.flatnonzero(lost)[0] < IN_A_PART
+    assert np.all(np.diff(lost.astype(int)) >= 0) and not lost[0]
+    for rows in (run.displacement, run.acceleration, run.normal_force, run.friction_force):
+        assert np.all(np.isnan(rows[lost])) and np.all(np.isfinite(rows[~lost]))
+
+
 def test_a_mass_that_nothing_holds_back_does_not_grow_without_bound():
     """Shows that free fall from rest, without a belt's motion to compare with, is no failure however far it goes."""
     structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.zeros((2, 2)), [1.0, 1.0], tangential=0, normal=1)
@@ -231,3 +254,23 @@ def test_a_mass_that_nothing_holds_back_does_not_grow_without_bound():
     run = fj.simulate(scene, 1e6, 1e5, LOW_ORDER, y0=([0.0, 1e-9], [0.0, 0.0]))
     assert run.outcome == fj.Ending.FINISHED
     assert run.displacement[-1] == pytest.approx([5e11, 5e11], rel=1e-9)
+    # Pushed once, it goes on at 1 m/s; the load in later parts would not explain how far.
+    scene = fj.Scene(structure, fj.Coulomb(0.0), 0.0, fj.Pulse(1e-15, p=1e15, duration=1.0))
+    run = fj.simulate(scene, 3e6, 1e3, LOW_ORDER, y0=([0.0, 1e-9], [0.0, 0.0]))
+    assert run.outcome == fj.Ending.FINISHED
+    assert run.displacement[-1] == pytest.approx([3e6 - 0.5] * 2, rel=1e-6)
+
+
+def test_one_program_serves_runs_of_any_length_however_often_they_save(paper_scene):
+    """Also for fixed steps of any length."""
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **about: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    for method in (None, fj.WhereSwitched(diffrax.Tsit5(), dt=1e-4)):
+        fj.simulate(paper_scene, 0.05, 1e-3, method)
+        compiled.clear()
+        for t1, dt_save in ((0.02, 1e-3), (0.3, 2e-4), (0.4, 5e-2)):
+            run = fj.simulate(paper_scene, t1, dt_save, method and fj.WhereSwitched(diffrax.Tsit5(), dt=dt_save / 4))
+            assert len(run.t) == round(t1 / dt_save) + 1 and run.t[-1] == t1
+        assert compiled == []

@@ -7,8 +7,8 @@ import pytest
 
 import fivjax as fj
 from fivjax.foundation.compiling import compiled
+from fivjax.simulation.rows import states_at
 from fivjax.simulation.start import start_state
-from fivjax.simulation.trajectory import states_at
 from fivjax.steppers.base import MOST_ADVANCES
 
 T1 = 0.3

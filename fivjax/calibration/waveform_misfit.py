@@ -10,7 +10,7 @@ from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import free_in_sliding
-from ..simulation.trajectory import states_at
+from ..simulation.rows import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from .characteristic import characteristic_residual
 from .misfit import AbstractMisfit, Compared, finite, window

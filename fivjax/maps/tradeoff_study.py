@@ -21,8 +21,8 @@ from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
 from ..simulation.energy import EnergyData
+from ..simulation.rows import states_at
 from ..simulation.start import start_state
-from ..simulation.trajectory import states_at
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched

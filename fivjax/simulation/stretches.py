@@ -41,14 +41,14 @@ class Begin(eqx.Module):
 End = tuple[State, Contact, Ledger | None, Bool[Array, ""]]
 
 
-def go_on(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
+def go_on(begin: Begin, method: AbstractStepper, most: int | Array, derivatives: str | None) -> End:
     """State, contact and ledger after the time `begin.h`; and whether `most` advances were enough."""
     if derivatives != "reverse":
         return _advances(begin, method, most, derivatives)
     return _reversible(begin, method, most)
 
 
-def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str | None) -> End:
+def _advances(begin: Begin, method: AbstractStepper, most: int | Array, derivatives: str | None) -> End:
     mechanics, load, energy_data = begin.mechanics, begin.load, begin.energy_data
     if derivatives is not None:
         # Anew in each stretch, because its reverse derivative may use nothing computed outside of it.
@@ -72,7 +72,7 @@ def _advances(begin: Begin, method: AbstractStepper, most: int, derivatives: str
     return after.y, after.contact, after.total, after.enough
 
 
-def _reversible(begin: Begin, method: AbstractStepper, most: int) -> End:
+def _reversible(begin: Begin, method: AbstractStepper, most: int | Array) -> End:
     # The method belongs to the numbers, too: its step may be an array.
     numbers, rest = eqx.partition((begin, method), eqx.is_inexact_array)
     counts, names = eqx.partition(rest, eqx.is_array)

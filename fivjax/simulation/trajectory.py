@@ -9,33 +9,30 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State, Status
+from ..contact import Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import (
     Returned,
     in_double_precision,
     is_known,
-    known_to_numpy,
     real,
     refusing_reverse_in_single_precision,
 )
 from ..io.datasets import labelled
 from ..model.contact_coordinates import in_contact_coordinates, transformation
 from ..model.scene import Scene, refuse_painleve
-from ..model.sliding import contact_coordinates
-from ..steppers.base import MOST_ADVANCES, AbstractStepper, rates
+from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
-from . import energy as accounts
-from .compiled_sizes import compiled_rows, compiled_steps, with_step_as_array
-from .ending import ENDING, GROWTH, Ending
-from .energy import Energy, EnergyData, Ledger
+from .ending import ENDING, Ending
+from .energy import Energy
+from .rows import rows_at, rows_in_parts, with_step_as_array
 from .start import checked_start, snapped_to_belt, start_state
-from .stretches import MODES, Begin, go_on
+from .stretches import MODES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -153,7 +150,8 @@ def simulate(
     finite, grows without bound, or has contact events without end, the rows from there on are NaN; `run.outcome`
     (an `Ending`) and `run.meaning` (a sentence) say which.
 
-    Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` even if double precision is off; `jax.grad` needs it on.
+    Outside of JAX's transformations one compiled program serves all runs of scenes of one kind, however long they are and
+    however often they save. Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` even if double precision is off; `jax.grad` needs it on.
 
     **Raises:** `ValueError` for times that are not positive, a `dt_save` below the fixed step of `WhereSwitched`, a start below
     the belt or of the wrong shape, a scene without sliding equilibrium to start from, or friction beyond Painlevé's limit;
@@ -190,18 +188,16 @@ def simulate(
     y0 = start_state(scene, y0)
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
-    modes, count = None if derivatives == "none" else derivatives, rows + 1
-    # Runs with known values are not differentiated. Rows are padded by repeating the last one, so that few sizes are compiled.
-    if all(map(is_known, jax.tree.leaves((scene, method, y0, dt_save, t1)))):
-        modes, count = None, compiled_rows(rows + 1)
-        steps = compiled_steps(steps)
     most = steps + MOST_ADVANCES
     # By NumPy, because JAX would compile a small program for each operation.
-    instants = np.arange(count)
-    saved = real(np.where(instants < rows, np.minimum(float(dt_save) * instants, float(t1)), float(t1)))
-    found = _simulate(scene, with_step_as_array(method), y0, saved, most, bool(energy), modes)
-    # Cut as NumPy arrays, because JAX would compile a slice for each number of rows.
-    found = jax.tree.map(lambda leaf: known_to_numpy(leaf)[: rows + 1], found)
+    saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1)).astype(y0.dtype)
+    stepper = with_step_as_array(method)
+    # Runs with known values are not differentiated.
+    if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
+        found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
+    else:
+        modes = None if derivatives == "none" else derivatives
+        found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
     grown = found.pop("grown")
     settings = (
         ("method", describe_method(method)),
@@ -210,7 +206,7 @@ def simulate(
         ("t1", float(t1)),
         ("start", start),
     )
-    return Trajectory(**found, scene=scene, outcome=_ending(scene, method, found, grown, most), settings=settings)
+    return Trajectory(**found, scene=scene, outcome=_ending(scene, stepper, found, grown, most), settings=settings)
 
 
 def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
@@ -261,14 +257,14 @@ def _ending(scene: Scene, method: AbstractStepper, rows: dict, grown, most: int)
     if first == 0:
         return np.int8(Ending.NOT_FINITE)
     start = jnp.concatenate([rows["displacement"][first - 1], rows["velocity"][first - 1]])
-    events, reached = _events_from(scene, method, real(rows["t"][first - 1]), start, most)
+    events, reached = _events_from(scene, method, real(rows["t"][first - 1]), start, np.asarray(most))
     if not np.all(np.isfinite(reached)):
         return np.int8(Ending.NOT_FINITE)
     return np.int8(Ending.TOO_MANY_EVENTS if 2 * int(events) > most else Ending.STEP_FAILURE)
 
 
 @compiled
-def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: int):
+def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: State, most: Int[Array, ""]):
     """How many of the next `most` advances end in an event, and the state after them."""
     mechanics = Mechanics(scene)
 
@@ -282,119 +278,3 @@ def _events_from(scene: Scene, method: AbstractStepper, t: Float[Array, ""], y: 
     contact = physics.status_from_forces(mechanics, scene.load(t), y)
     y, _, events = jax.lax.fori_loop(0, most, body, (y, contact, jnp.zeros((), jnp.int32)))
     return events, y
-
-
-@compiled
-def _simulate(
-    scene: Scene,
-    method: AbstractStepper,
-    y0: State,
-    saved: Float[Array, " T"],
-    most: int,
-    energy: bool,
-    modes: str | None,
-) -> dict:
-    mechanics = Mechanics(scene)
-    energy_data = EnergyData(scene) if energy else None
-    y, contacts, ledgers = states_at(scene, method, y0, saved, most, energy_data, modes)
-    load = jax.vmap(scene.load)(saved)
-    # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
-    finite = jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0
-    grown = finite & (jnp.cumsum(_grown(scene, saved, load, y)) > 0)
-    y = jnp.where((finite & ~grown)[:, None], y, jnp.nan)
-    # A row at a jump of the load shows the load and the contact just after it.
-    on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
-    contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
-    n = scene.structure.size
-    friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
-        contacts, load, y
-    )
-    return {
-        "t": saved,
-        "displacement": y[:, :n],
-        "velocity": y[:, n:],
-        "acceleration": jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y),
-        "status": contacts.status.astype(jnp.int8),
-        "normal_force": normal_force,
-        "friction_force": friction_force,
-        "load": load,
-        "grown": grown,
-        "energy": None
-        if energy_data is None
-        else accounts.along_rows(energy_data, mechanics, contacts, load, y, ledgers),
-    }
-
-
-def _grown(
-    scene: Scene, t: Float[Array, " T"], load: Float[Array, " T"], y: Float[Array, "T state"]
-) -> Bool[Array, " T"]:
-    """Which states are `GROWTH` times larger than the start, the belt's motion and the effect of the load."""
-    structure = scene.structure
-    weights, n = structure.weights, structure.size
-    tangential, _ = contact_coordinates(structure)
-    belt = jnp.max(weights[n + tangential] * jnp.abs(scene.belt_speed))
-    # A free structure is accelerated by a load for as long as it lasts.
-    pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * jnp.max(jnp.abs(load)) * t
-    expected = jnp.max(jnp.abs(weights * y[0])) + belt + pushed
-    return jnp.max(jnp.abs(weights * y), axis=-1) > GROWTH * expected
-
-
-def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
-    """The contact mode after a jump of the load, if there is a jump `now`."""
-    ended = now & (physics.guards(mechanics, contact, load, y) < 0)
-    after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
-    return after
-
-
-def states_at(
-    scene: Scene,
-    method: AbstractStepper,
-    y0: State,
-    instants: Float[Array, " T"],
-    most: int,
-    energy_data: EnergyData | None = None,
-    derivatives: str | None = None,
-) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
-    """States, contacts and, with `energy_data`, ledgers at given instants (s, in non-decreasing order, the first is the
-    start); NaN from where `most` advances between two of them were not enough.
-
-    `derivatives`: differentiable (also by the instants and the load's jumps) in "both" modes, or faster in only "forward" or
-    "reverse" mode; None, not at all. In "reverse" mode only the states at the instants are kept; the rest is computed again.
-    """
-    mechanics = Mechanics(scene)
-    # Steps end at the load's jumps as well as at the instants.
-    jumps = scene.load.jumps
-    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
-    # A jump outside does not contribute to the derivative; one exactly at an end contributes fully, where `clip` would halve
-    # it.
-    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
-    ends = jnp.sort(jnp.concatenate([instants[1:], jumps]))
-
-    def to_next(carry, end):
-        t, y, contact, ledger = carry
-        h = end - t
-        load = scene.load(0.5 * (t + end))
-        # If a jump coincides with an instant, the time between them is zero but has a derivative: the motion in that time is
-        # under the load just before the jump.
-        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
-        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
-        begin = Begin(mechanics, contact, load, y, h, ledger, energy_data)
-        moved, following, ledger, reached = go_on(begin, method, most, derivatives)
-        # States that were not reached are NaN; counts are kept.
-        moved, ledger = jax.tree.map(
-            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
-        )
-        y = jnp.where(h > 0, moved, y + drift)
-        return (end, y, following, ledger), (y, following, ledger)
-
-    contact0 = physics.status_from_forces(mechanics, scene.load(0.5 * (instants[0] + ends[0])), y0)
-    ledger0 = None if energy_data is None else accounts.open_ledger(energy_data, y0)
-    # Inside a scan common subexpressions are not merged across the checkpoint anyway.
-    step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
-    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
-    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
-
-    def with_start(first, rest):
-        return jnp.concatenate([first[None], rest[rows]])
-
-    return jax.tree.map(with_start, (y0, contact0, ledger0), after)

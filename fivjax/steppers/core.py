@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -58,7 +59,7 @@ def follow(
     observe: Callable[[Total, Segment], Total] = nothing,
     until: Callable[[Total], Bool[Array, ""]] | None = None,
     at_section: bool = False,
-    most: int = MOST_ADVANCES,
+    most: int | Array = MOST_ADVANCES,
     kind: str = "bounded",
 ) -> Followed[Total]:
     """A trajectory under a constant load, segment by segment, for a time `h` (s).
@@ -83,5 +84,14 @@ def follow(
         return (left > 0) if until is None else (left > 0) & ~until(total)
 
     begin = depending_on((stepper, mechanics, load, y, h), (y, contact, h, total))
-    y, contact, left, total = eqx.internal.while_loop(going, body, begin, max_steps=most, kind=kind)
-    return Followed(y, contact, left, total, ~going((y, contact, left, total)))
+    if kind == "lax":
+        # The bound may be an array: then one program serves for all.
+        _, last = jax.lax.while_loop(
+            lambda carry: going(carry[1]) & (carry[0] < most),
+            lambda carry: (carry[0] + 1, body(carry[1])),
+            (jnp.zeros((), jnp.int32), begin),
+        )
+    else:
+        last = eqx.internal.while_loop(going, body, begin, max_steps=most, kind=kind)
+    y, contact, left, total = last
+    return Followed(y, contact, left, total, ~going(last))

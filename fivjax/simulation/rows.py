@@ -1,0 +1,242 @@
+"""The rows of a trajectory: states, contact modes, forces and energies at saved instants.
+
+With known values they are computed in parts of one length, so that one program serves all runs of a scene, however long they
+are and however often they save.
+"""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State
+from ..foundation.compiling import compiled
+from ..foundation.precision import known_to_numpy
+from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
+from ..steppers.base import AbstractStepper, rates
+from . import energy as accounts
+from .ending import GROWTH
+from .energy import EnergyData, Ledger
+from .stretches import Begin, go_on
+
+# Intervals between saved instants in a part.
+IN_A_PART = 1024
+
+
+def with_step_as_array(method: AbstractStepper) -> AbstractStepper:
+    """A method with a fixed step, with that step as an array: as a number, each value would be compiled anew."""
+    if method.chooses_its_steps:
+        return method
+    return eqx.tree_at(lambda method: method.dt, method, np.asarray(method.dt))
+
+
+class Reached(eqx.Module):
+    """Where a run is at the end of a part."""
+
+    y: State
+    contact: Contact
+    ledger: Ledger | None
+    highest: Float[Array, ""]  # the largest load so far, N
+    ended: Bool[Array, ""]  # whether it has no finite rows any more
+
+
+def rows_in_parts(
+    scene: Scene, method: AbstractStepper, y0: State, saved: Float[np.ndarray, " T"], most: int, energy: bool
+) -> dict:
+    """`rows_at` for known values, as NumPy arrays."""
+    parts = list(_parts(scene, method, y0, saved, most, energy))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _parts(scene, method, y0, saved, most, energy) -> Iterator[dict]:
+    contacts = () if len(scene.structure.contacts) == 1 else (len(scene.structure.contacts),)
+    ledger = jax.eval_shape(lambda: accounts.open_ledger(EnergyData(scene), y0)) if energy else None
+    # Contact and ledger at the start are worked out in the first part.
+    begin = Reached(
+        y0,
+        Contact(np.zeros(contacts, np.int32), np.ones(contacts, y0.dtype)),
+        jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), ledger),
+        np.zeros((), y0.dtype),
+        np.asarray(False),
+    )
+    for first in range(0, max(len(saved) - 1, 1), IN_A_PART):
+        own = saved[first : first + IN_A_PART + 1]
+        padded = np.pad(own, (0, IN_A_PART + 1 - len(own)), mode="edge")
+        bound = np.asarray(most, np.int32)
+        found, begin = _part(scene, method, y0, begin, np.asarray(first == 0), padded, bound, energy)
+        # A part begins where the one before it ended. Cut as NumPy arrays: JAX would compile a slice for each number of rows.
+        kept = slice(min(first, 1), len(own))
+        yield jax.tree.map(lambda leaf, kept=kept: known_to_numpy(leaf)[kept], found)
+
+
+@compiled
+def _part(
+    scene: Scene,
+    method: AbstractStepper,
+    start: State,
+    begin: Reached,
+    is_first: Bool[Array, ""],
+    saved: Float[Array, " T"],
+    most: Array,
+    energy: bool,
+) -> tuple[dict, Reached]:
+    energy_data = EnergyData(scene) if energy else None
+    at_start = begun(scene, start, saved, energy_data)
+    contact, ledger = jax.tree.map(
+        lambda new, old: jnp.where(is_first, new, old), at_start, (begin.contact, begin.ledger)
+    )
+    y, contacts, ledgers = states_at(scene, method, begin.y, saved, most, energy_data, at_start=(contact, ledger))
+    load = jax.vmap(scene.load)(saved)
+    highest = jnp.maximum(begin.highest, jnp.max(jnp.abs(load)))
+    grown = _grown(scene, start, saved, highest, y)
+    found = _rows(scene, saved, load, y, contacts, ledgers, energy_data, begin.ended, grown)
+    y, contact, ledger = jax.tree.map(lambda leaf: leaf[-1], (y, contacts, ledgers))
+    return found, Reached(y, contact, ledger, highest, ~jnp.all(jnp.isfinite(found["velocity"][-1])))
+
+
+@compiled
+def rows_at(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    saved: Float[Array, " T"],
+    most: int,
+    energy: bool,
+    derivatives: str | None,
+) -> dict:
+    """What a `Trajectory` has at its saved instants, by name; and from where on it has `grown` without bound."""
+    energy_data = EnergyData(scene) if energy else None
+    y, contacts, ledgers = states_at(scene, method, y0, saved, most, energy_data, derivatives)
+    load = jax.vmap(scene.load)(saved)
+    grown = _grown(scene, y0, saved, jnp.max(jnp.abs(load)), y)
+    return _rows(scene, saved, load, y, contacts, ledgers, energy_data, jnp.asarray(False), grown)
+
+
+def _rows(scene: Scene, saved, load, y, contacts, ledgers, energy_data, ended, grown) -> dict:
+    """The rows of a run that may have `ended` before, and whose states have `grown` too large in some of them."""
+    mechanics = Mechanics(scene)
+    # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
+    finite = ~ended & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
+    grown = finite & (jnp.cumsum(grown) > 0)
+    kept = finite & ~grown
+
+    def known(rows):
+        return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.nan)
+
+    y = known(y)
+    # A row at a jump of the load shows the load and the contact just after it.
+    on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
+    contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
+    n = scene.structure.size
+    friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
+        contacts, load, y
+    )
+    return {
+        "t": saved,
+        "displacement": y[:, :n],
+        "velocity": y[:, n:],
+        # What a contact mode forbids is zero whatever the state.
+        "acceleration": known(jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y)),
+        "status": contacts.status.astype(jnp.int8),
+        "normal_force": known(normal_force),
+        "friction_force": known(friction_force),
+        "load": load,
+        "grown": grown,
+        "energy": None
+        if energy_data is None
+        else accounts.along_rows(energy_data, mechanics, contacts, load, y, ledgers),
+    }
+
+
+def _grown(
+    scene: Scene, start: State, t: Float[Array, " T"], highest: Float[Array, ""], y: Float[Array, "T state"]
+) -> Bool[Array, " T"]:
+    """Which states are `GROWTH` times larger than the start, the belt's motion and the effect of the highest load."""
+    structure = scene.structure
+    weights, n = structure.weights, structure.size
+    tangential, _ = contact_coordinates(structure)
+    belt = jnp.max(weights[n + tangential] * jnp.abs(scene.belt_speed))
+    # A free structure is accelerated by a load for as long as it lasts.
+    pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * highest * t
+    expected = jnp.max(jnp.abs(weights * start)) + belt + pushed
+    return jnp.max(jnp.abs(weights * y), axis=-1) > GROWTH * expected
+
+
+def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
+    """The contact mode after a jump of the load, if there is a jump `now`."""
+    ended = now & (physics.guards(mechanics, contact, load, y) < 0)
+    after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
+    return after
+
+
+def states_at(
+    scene: Scene,
+    method: AbstractStepper,
+    y0: State,
+    instants: Float[Array, " T"],
+    most: int | Array,
+    energy_data: EnergyData | None = None,
+    derivatives: str | None = None,
+    at_start: tuple[Contact, Ledger | None] | None = None,
+) -> tuple[Float[Array, "T state"], Contact, Ledger | None]:
+    """States, contacts and, with `energy_data`, ledgers at given instants (s, in non-decreasing order, the first is the
+    start); NaN from where `most` advances between two of them were not enough.
+
+    `derivatives`: differentiable (also by the instants and the load's jumps) in "both" modes, or faster in only "forward" or
+    "reverse" mode; None, not at all. In "reverse" mode only the states at the instants are kept; the rest is computed again.
+    `at_start` are the contact mode and the ledger at the start, unless the run begins there (`begun`).
+    """
+    mechanics = Mechanics(scene)
+    ends = _ends(scene, instants)
+
+    def to_next(carry, end):
+        t, y, contact, ledger = carry
+        h = end - t
+        load = scene.load(0.5 * (t + end))
+        # If a jump coincides with an instant, the time between them is zero but has a derivative: the motion in that time is
+        # under the load just before the jump.
+        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
+        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+        begin = Begin(mechanics, contact, load, y, h, ledger, energy_data)
+        moved, following, ledger, reached = go_on(begin, method, most, derivatives)
+        # States that were not reached are NaN; counts are kept.
+        moved, ledger = jax.tree.map(
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
+        )
+        y = jnp.where(h > 0, moved, y + drift)
+        return (end, y, following, ledger), (y, following, ledger)
+
+    contact0, ledger0 = begun(scene, y0, instants, energy_data) if at_start is None else at_start
+    # Inside a scan common subexpressions are not merged across the checkpoint anyway.
+    step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
+    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
+    rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
+
+    def with_start(first, rest):
+        return jnp.concatenate([first[None], rest[rows]])
+
+    return jax.tree.map(with_start, (y0, contact0, ledger0), after)
+
+
+def begun(
+    scene: Scene, y0: State, instants: Float[Array, " T"], energy_data: EnergyData | None
+) -> tuple[Contact, Ledger | None]:
+    """The contact mode and the ledger of a run that begins at the first of these instants."""
+    load = scene.load(0.5 * (instants[0] + _ends(scene, instants)[0]))
+    contact = physics.status_from_forces(Mechanics(scene), load, y0)
+    return contact, None if energy_data is None else accounts.open_ledger(energy_data, y0)
+
+
+def _ends(scene: Scene, instants: Float[Array, " T"]) -> Float[Array, " ends"]:
+    """Where stretches end: at the instants and at the load's jumps."""
+    jumps = scene.load.jumps
+    inside = (jumps >= instants[0]) & (jumps <= instants[-1])
+    # A jump outside does not contribute to the derivative; one exactly at an end contributes fully, where `clip` would halve
+    # it.
+    jumps = jnp.where(inside, jumps, jax.lax.stop_gradient(jnp.clip(jumps, instants[0], instants[-1])))
+    return jnp.sort(jnp.concatenate([instants[1:], jumps]))
