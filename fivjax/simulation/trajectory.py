@@ -151,7 +151,8 @@ def simulate(
     (an `Ending`) and `run.meaning` (a sentence) say which.
 
     Outside of JAX's transformations one compiled program serves all runs of scenes of one kind, however long they are and
-    however often they save. Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` even if double precision is off; `jax.grad` needs it on.
+    however often they save. Works inside `jax.jit`, `jax.vmap` and `jax.jacfwd` even if double precision is off; `jax.grad`
+    needs it on.
 
     **Raises:** `ValueError` for times that are not positive, a `dt_save` below the fixed step of `WhereSwitched`, a start below
     the belt or of the wrong shape, a scene without sliding equilibrium to start from, or friction beyond Painlevé's limit;
