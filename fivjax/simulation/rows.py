@@ -54,24 +54,21 @@ def rows_in_parts(
 
 
 def _parts(scene, method, y0, saved, most, energy) -> Iterator[dict]:
-    contacts = () if len(scene.structure.contacts) == 1 else (len(scene.structure.contacts),)
-    ledger = jax.eval_shape(lambda: accounts.open_ledger(EnergyData(scene), y0)) if energy else None
-    # Contact and ledger at the start are worked out in the first part.
-    begin = Reached(
-        y0,
-        Contact(np.zeros(contacts, np.int32), np.ones(contacts, y0.dtype)),
-        jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), ledger),
-        np.zeros((), y0.dtype),
-        np.asarray(False),
-    )
+    bound, begin = np.asarray(most, np.int32), None
     for first in range(0, max(len(saved) - 1, 1), IN_A_PART):
         own = saved[first : first + IN_A_PART + 1]
         padded = np.pad(own, (0, IN_A_PART + 1 - len(own)), mode="edge")
-        bound = np.asarray(most, np.int32)
-        found, begin = _part(scene, method, y0, begin, np.asarray(first == 0), padded, bound, energy)
+        begin = _at_start(scene, y0, padded, energy) if begin is None else begin
+        found, begin = _part(scene, method, y0, begin, padded, bound, energy)
         # A part begins where the one before it ended. Cut as NumPy arrays: JAX would compile a slice for each number of rows.
         kept = slice(min(first, 1), len(own))
         yield jax.tree.map(lambda leaf, kept=kept: known_to_numpy(leaf)[kept], found)
+
+
+@compiled
+def _at_start(scene: Scene, y0: State, saved: Float[Array, " T"], energy: bool) -> Reached:
+    contact, ledger = begun(scene, y0, saved, EnergyData(scene) if energy else None)
+    return Reached(y0, contact, ledger, jnp.zeros((), y0.dtype), jnp.asarray(False))
 
 
 @compiled
@@ -80,22 +77,15 @@ def _part(
     method: AbstractStepper,
     start: State,
     begin: Reached,
-    is_first: Bool[Array, ""],
     saved: Float[Array, " T"],
     most: Array,
     energy: bool,
 ) -> tuple[dict, Reached]:
-    energy_data = EnergyData(scene) if energy else None
-    at_start = begun(scene, start, saved, energy_data)
-    contact, ledger = jax.tree.map(
-        lambda new, old: jnp.where(is_first, new, old), at_start, (begin.contact, begin.ledger)
-    )
-    y, contacts, ledgers = states_at(scene, method, begin.y, saved, most, energy_data, at_start=(contact, ledger))
-    load = jax.vmap(scene.load)(saved)
-    highest = jnp.maximum(begin.highest, jnp.max(jnp.abs(load)))
-    grown = _grown(scene, start, saved, highest, y)
-    found = _rows(scene, saved, load, y, contacts, ledgers, energy_data, begin.ended, grown)
+    energy_data, at_start = EnergyData(scene) if energy else None, (begin.contact, begin.ledger)
+    y, contacts, ledgers = states_at(scene, method, begin.y, saved, most, energy_data, at_start=at_start)
+    found = _rows(scene, start, saved, y, contacts, ledgers, energy_data, begin.highest, begin.ended)
     y, contact, ledger = jax.tree.map(lambda leaf: leaf[-1], (y, contacts, ledgers))
+    highest = jnp.maximum(begin.highest, jnp.max(jnp.abs(found["load"])))
     return found, Reached(y, contact, ledger, highest, ~jnp.all(jnp.isfinite(found["velocity"][-1])))
 
 
@@ -112,17 +102,17 @@ def rows_at(
     """What a `Trajectory` has at its saved instants, by name; and from where on it has `grown` without bound."""
     energy_data = EnergyData(scene) if energy else None
     y, contacts, ledgers = states_at(scene, method, y0, saved, most, energy_data, derivatives)
-    load = jax.vmap(scene.load)(saved)
-    grown = _grown(scene, y0, saved, jnp.max(jnp.abs(load)), y)
-    return _rows(scene, saved, load, y, contacts, ledgers, energy_data, jnp.asarray(False), grown)
+    return _rows(scene, y0, saved, y, contacts, ledgers, energy_data)
 
 
-def _rows(scene: Scene, saved, load, y, contacts, ledgers, energy_data, ended, grown) -> dict:
-    """The rows of a run that may have `ended` before, and whose states have `grown` too large in some of them."""
+def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, highest=0.0, ended=False) -> dict:
+    """The rows of a run; `highest` is the largest load (N) before them, and it may have `ended` before."""
     mechanics = Mechanics(scene)
+    load = jax.vmap(scene.load)(saved)
     # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
-    finite = ~ended & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
-    grown = finite & (jnp.cumsum(grown) > 0)
+    finite = jnp.logical_not(ended) & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
+    highest = jnp.maximum(highest, jnp.max(jnp.abs(load)))
+    grown = finite & (jnp.cumsum(_grown(scene, start, saved, highest, y)) > 0)
     kept = finite & ~grown
 
     def known(rows):
