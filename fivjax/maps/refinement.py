@@ -79,9 +79,10 @@ def _halved(
     """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
     their `source`.
     """
-    corners, new = _every(2 * step, shape, source.dtype), _every(step, shape, source.dtype)
+    new, old = _every(step, shape, source.dtype), tuple(slice(None, None, 2) for _ in shape)
+    corners = new[old]
     wanted = _near_differences(_differ(verdicts, source[corners]), new.shape)
-    rest, old = ~wanted, tuple(slice(None, None, 2) for _ in shape)
+    rest = ~wanted
     wanted[old] = rest[old] = False
     before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
     source[new[rest]] = source[before[rest]]
