@@ -47,3 +47,16 @@ _FOLDER = pytest.StashKey[str]()
 def paper_scene() -> fj.Scene:
     """Section 4 of the paper: μ = 0.227, 3 m/s, a kick of 1.2."""
     return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=3.0, load=fj.Pulse(force=100.0, p=1.2))
+
+
+@pytest.fixture
+def compilations() -> list[str]:
+    """Has an entry for each program that is compiled from now on. JAX's listeners stay for as long as the process lives."""
+    # Not above: JAX reads where to keep what is compiled when it is imported.
+    import jax
+
+    found: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **about: found.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    return found
