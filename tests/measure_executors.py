@@ -76,8 +76,10 @@ def _dask():
     import dask
     from distributed import Client, LocalCluster
 
-    # Dask has its workers give freed memory back at once, and a map frees and takes blocks all the time.
-    dask.config.set({"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 2**30})
+    # Dask has its workers give freed memory back at once, and a map frees and takes blocks all the time. With the first number
+    # alone glibc no longer adapts the second, and every larger array is fetched from the system anew.
+    keep = {"MALLOC_TRIM_THRESHOLD_": 2**30, "MALLOC_MMAP_THRESHOLD_": 2**25}
+    dask.config.set({"distributed.nanny.pre-spawn-environ": keep})
     with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         yield client
 
