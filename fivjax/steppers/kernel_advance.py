@@ -48,10 +48,10 @@ def stepping(form: Form) -> Stepping:
     brackets, fastest_sample = law.brackets, law.fastest_sample
     of = arithmetic(n, t)
     block, sample, hull, guard_series, series = of.block, of.sample, of.hull, of.guard_series, of.series
-    value_at, state_at = of.value_at, of.state_at
+    scan, speed_and_bend, value_at, state_at = of.scan, of.speed_and_bend, of.value_at, of.state_at
     lowest_of, root_of, rise_of, highest_of = roots(t, of)
     state, row, eight, pair, start_of_guards = t.state, t.row, t.block, t.pair, t.start
-    mode_of, polynomial, ending, speeds_of, one_number = t.mode, t.polynomial, t.ending, t.samples, t.one
+    mode_of, polynomial, ending, scan_of, one_number = t.mode, t.polynomial, t.ending, t.scan, t.one
     intervals, hulls, samples, guards, displacements, bounds, _ = blocks_of(n)
     of_sample, of_row = padded(2 * n) // BLOCK, wp.types.vector(2 * n + 2, int)(*places_of(n, like.normal))
     speed_at = places_of(n, like.normal).index(velocity)
@@ -66,7 +66,7 @@ def stepping(form: Form) -> Stepping:
     @wp.struct
     class Step:
         """An advance: the state and mode after it, the state before what happened at its end, its duration (s), whether the
-        section was crossed, whether the mode has ended, and samples of the tangential velocity, up to one behind the end.
+        section was crossed, whether the mode has ended, and the scan of the window before it.
         """
 
         y: state
@@ -75,14 +75,7 @@ def stepping(form: Form) -> Stepping:
         h: real
         crossed: int
         ended: int
-        speeds: speeds_of
-
-    @wp.struct
-    class Scan:
-        """The first interval of a window that has to be looked at, and samples of the tangential velocity up to its end."""
-
-        interval: int
-        speeds: speeds_of
+        scan: scan_of
 
     @wp.func
     def matrix_of(g: int, mode: mode_of) -> int:
@@ -143,38 +136,21 @@ def stepping(form: Form) -> Stepping:
         return found
 
     @wp.func
-    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> Scan:
-        """The first interval that may have an event, in which the section is crossed, or in which the time ends."""
+    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> scan_of:
+        """The scan up to the first interval that may have an event, in which the section is crossed, or in which the time
+        ends. Where the time ends, too, it has the sample behind the end, which tells peaks apart.
+        """
         sizes = sizes_of(m, w, here)
         whole = int(wp.floor(steps))
-        found = Scan()
-        before = here[speed_at]
-        found.speeds[0] = before
-        i = int(0)
-        searching = int(1)
-        while searching == 1 and i < whole:
-            c = block(m, w, intervals + i, here)
-            found.speeds[i + 1] = c[6]
-            begins = zero
-            start = eight()
-            if i == 0:
-                start = block(m, w, guards, here)
-                begins = has_begun(mode, start, sizes)[0]
-            if before < zero and c[6] >= zero:
-                searching = 0
-            elif begins > zero:
-                if is_safe(mode, start, hull(m, w, hulls, here), sizes)[0] == zero:
-                    searching = 0
-            elif not (wp.min(wp.min(c[0], c[2]), c[4]) > sizes[6] and wp.min(wp.min(c[1], c[3]), c[5]) > sizes[7]):
-                searching = 0
-            if searching == 1:
-                before = c[6]
-                i += 1
-        # Where the time ends, too, the sample behind the end is needed to tell peaks apart.
-        if searching == 1 and i < INTERVALS:
-            found.speeds[i + 1] = block(m, w, intervals + i, here)[6]
-        found.interval = i
-        return found
+        proved = int(0)
+        start = block(m, w, guards, here)
+        if has_begun(mode, start, sizes)[0] > zero:
+            # A guard that begins at zero is not above its limits: that it rises is told by its series.
+            if is_safe(mode, start, hull(m, w, hulls, here), sizes)[0] > zero:
+                proved = 1
+            else:
+                whole = 0
+        return scan(m, w, here, speed_at, sizes, proved, whole)
 
     @wp.func
     def advance(
@@ -190,8 +166,8 @@ def stepping(form: Form) -> Stepping:
         w = matrix_of(g, mode)
         steps = wp.min(h / interval, most)
         here = stacked(y, load)
-        scan = first_interval(m, w, mode, here, steps)
-        i = scan.interval
+        seen = first_interval(m, w, mode, here, steps)
+        i = int(seen[INTERVALS + 1])
         began = y
         if i > 0:
             began = sample_of(m, w, here, i)
@@ -257,7 +233,7 @@ def stepping(form: Form) -> Stepping:
                     fires_1 = 0
         result = Step()
         result.end = reached
-        result.speeds = scan.speeds
+        result.scan = seen
         result.ended = wp.max(fires_0, fires_1)
         if result.ended > 0:
             how = ending(load, real(fires_0), real(fires_1), resting * interval)
@@ -289,8 +265,13 @@ def stepping(form: Form) -> Stepping:
         here = stacked(y, load)
         steps = after.h / interval
         highest = wp.max(before, wp.abs(after.end[velocity]))
-        speeds = after.speeds
+        speeds = after.scan
         turned = -speeds
+        # A parabola through three samples rises by less than half of their second difference above the highest of them. So
+        # most advances have no higher peak than those before.
+        rough = speed_and_bend(speeds, wp.min(int(steps) + 1, INTERVALS))
+        if rough[0] + half * rough[1] <= highest:
+            return highest
         for k in range(wp.min(int(steps), INTERVALS) + 1):
             highest = wp.max(highest, wp.abs(speeds[k]))
         # Parabolas through three samples tell peaks apart.

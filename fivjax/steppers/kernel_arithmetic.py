@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from ..foundation.warp_library import warp
 from .kernel_matrices import BLOCK, blocks_of, padded
 from .kernel_types import Types
-from .propagation import ORDER
+from .propagation import INTERVALS, ORDER
 from .window_roots import ROOT_STEPS
 
 
@@ -20,6 +20,8 @@ class Arithmetic(NamedTuple):
     hull: Any
     guard_series: Any
     series: Any
+    scan: Any  # the intervals of a window up to the first that has to be looked at
+    speed_and_bend: Any  # the largest speed in a scan, and the largest second difference
     value_at: Any  # value and slope of a polynomial
     value_of_few: Any  # the same of its first terms
     bent_at: Any  # value, slope and second derivative
@@ -47,14 +49,60 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
             }}
             return found;"""
 
-    def horner(terms):
+    def scan_of(used):
         return f"""
-            wp::float64 value = c[{terms - 1}], slope = 0.0;
-            for (int k = {terms - 2}; k >= 0; --k) {{
-                slope = slope * x + value;
-                value = value * x + c[k];
+            for (; i < whole; ++i) {{
+                wp::float64 sums[{BLOCK}];
+                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * here[0];
+                for (int k = 1; k < {used}; ++k)
+                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * here[k];
+                int clear = 0;
+                for (int r = 0; r < {BLOCK}; ++r) clear += sums[r] > limits[r];
+                found[i + 1] = sums[6];
+                if ((i >= proved && clear < {BLOCK}) || (found[i] < 0.0 && sums[6] >= 0.0)) break;
+                column += {BLOCK * columns};
+            }}"""
+
+    # Numbers of columns that compilers know make this loop, in which trajectories spend most of their time, faster.
+    scan_source = f"""
+        wp::vec_t<{t.scan._length_}, wp::float64> found;
+        wp::float64 limits[{BLOCK}];
+        for (int r = 0; r < {BLOCK}; ++r) limits[r] = r < 6 ? sizes[6 + r % 2] : -INFINITY;
+        const wp::float64* column = m.data + {BLOCK * columns * blocks_of(n).total} * matrix;
+        int i = 0;
+        found[0] = here[speed_at];
+        if (matrix % 4 == 3) {{ {scan_of(columns)} }} else {{ {scan_of(columns - 2)} }}
+        if (i == whole && i < {INTERVALS}) {{
+            wp::float64 behind = 0.0;
+            for (int k = 0; k < {columns}; ++k) behind += column[{BLOCK} * k + 6] * here[k];
+            found[i + 1] = behind;
+        }}
+        found[{INTERVALS + 1}] = i;
+        return found;"""
+
+    of_speeds = """
+        wp::float64 speed = wp::max(wp::abs(scan[0]), wp::abs(scan[last])), bend = 0.0;
+        for (int k = 1; k < last; ++k) {
+            speed = wp::max(speed, wp::abs(scan[k]));
+            bend = wp::max(bend, wp::abs(scan[k + 1] - 2.0 * scan[k] + scan[k - 1]));
+        }
+        return wp::vec_t<2, wp::float64>(speed, bend);"""
+
+    def value_and_slope(terms):
+        # Even and odd powers apart: two short chains of operations that wait for each other instead of a long one.
+        even, odd = (terms - 1) // 2, terms // 2 - 1
+        return f"""
+            const wp::float64 u = x * x;
+            wp::float64 even = c[{2 * even}], even_slope = 0.0, odd = c[{2 * odd + 1}], odd_slope = 0.0;
+            for (int k = {even - 1}; k >= 0; --k) {{
+                even_slope = even_slope * u + even;
+                even = even * u + c[2 * k];
             }}
-            return wp::vec_t<2, wp::float64>(value, slope);"""
+            for (int k = {odd - 1}; k >= 0; --k) {{
+                odd_slope = odd_slope * u + odd;
+                odd = odd * u + c[2 * k + 1];
+            }}
+            return wp::vec_t<2, wp::float64>(even + x * odd, odd + 2.0 * (x * even_slope + u * odd_slope));"""
 
     bent = f"""
         wp::float64 value = c[{ORDER}], slope = 0.0, bend = 0.0;
@@ -93,10 +141,18 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
     @wp.func_native(product(padded(n * (ORDER + 2))))
     def series(m: t.matrices, matrix: int, first: int, here: t.row) -> t.series: ...
 
-    @wp.func_native(horner(ORDER + 1))
+    @wp.func_native(scan_source)
+    def scan(
+        m: t.matrices, matrix: int, here: t.row, speed_at: int, sizes: t.block, proved: int, whole: int
+    ) -> t.scan: ...
+
+    @wp.func_native(of_speeds)
+    def speed_and_bend(scan: t.scan, last: int) -> t.pair: ...
+
+    @wp.func_native(value_and_slope(ORDER + 1))
     def value_at(c: t.polynomial, x: wp.float64) -> t.pair: ...
 
-    @wp.func_native(horner(ROOT_STEPS[0] + 1))
+    @wp.func_native(value_and_slope(ROOT_STEPS[0] + 1))
     def value_of_few(c: t.polynomial, x: wp.float64) -> t.pair: ...
 
     @wp.func_native(bent)
@@ -105,4 +161,5 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
     @wp.func_native(of_state)
     def state_at(c: t.series, x: wp.float64, interval: wp.float64) -> t.state: ...
 
-    return Arithmetic(block, sample, hull, guard_series, series, value_at, value_of_few, bent_at, state_at)
+    products = block, sample, hull, guard_series, series
+    return Arithmetic(*products, scan, speed_and_bend, value_at, value_of_few, bent_at, state_at)

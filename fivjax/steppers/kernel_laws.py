@@ -98,8 +98,8 @@ def laws(form: Form) -> Laws:
         found = bracketed(start, end, limits_of(sizes), exact_of(mode), inside)
         return jnp.concatenate([jnp.ravel(part).astype(start.dtype) for part in jax.tree.leaves(found)])
 
-    def peaking(speeds, steps):
-        return fastest(speeds[:, None], steps)
+    def peaking(scan, steps):
+        return fastest(scan[:-1, None], steps)
 
     def body(function, **arguments):
         source, size = scalar_source(function, **{name: kind._length_ for name, kind in arguments.items()})
@@ -121,7 +121,7 @@ def laws(form: Form) -> Laws:
     @wp.func_native(body(bracketing, mode=t.mode, start=t.start, end=t.pair, sizes=t.block))
     def brackets(mode: t.mode, start: t.start, end: t.pair, sizes: t.block) -> t.bracket: ...
 
-    @wp.func_native(body(peaking, speeds=t.samples, steps=t.one))
-    def fastest_sample(speeds: t.samples, steps: t.one) -> t.one: ...
+    @wp.func_native(body(peaking, scan=t.scan, steps=t.one))
+    def fastest_sample(scan: t.scan, steps: t.one) -> t.one: ...
 
     return Laws(digest.hexdigest()[:16], t, like, held, next_mode, has_begun, is_safe, brackets, fastest_sample)

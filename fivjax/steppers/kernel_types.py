@@ -24,7 +24,7 @@ class Types(NamedTuple):
     guards: Any
     series: Any
     polynomial: Any
-    samples: Any  # one number for each sample of a window
+    scan: Any  # the tangential velocity at each sample of a window, and the interval to be looked at
     start: Any  # the first five coefficients of both guards
     bracket: Any  # `window.Bracket`
     ending: Any  # what `contact.transition` is told
@@ -52,7 +52,7 @@ def types(n: int, mechanics: int) -> Types:
         guards=vector(padded(2 * (ORDER + 2))),
         series=vector(padded(n * (ORDER + 2))),
         polynomial=vector(ORDER + 1),
-        samples=vector(INTERVALS + 1),
+        scan=vector(INTERVALS + 2),
         start=vector(10),
         bracket=vector(12),
         ending=vector(4),
