@@ -1,5 +1,6 @@
 """The command line beside its refusals: start, version, what it says while it works and at its end."""
 
+import os
 import subprocess
 import sys
 import time
@@ -31,6 +32,16 @@ def test_what_a_question_loads(option):
     said, _, loaded = ran.stdout.rpartition("loaded ")
     assert (fj.__version__ if option == "--version" else "simulate") in said
     assert not {"jax", "matplotlib", "xarray", "scipy", "h5py", "diffrax"} & set(loaded.split())
+
+
+def test_the_program_ends_at_once_with_its_code_and_all_it_has_said():
+    command = [sys.executable, "-m", "fivjax.cli"]
+    ran = subprocess.run([*command, "cea", "--mu", "-1"], capture_output=True, text=True)
+    assert ran.returncode == 2 and ran.stderr.startswith("fivjax: ") and "mu" in ran.stderr
+    reading, writing = os.pipe()
+    os.close(reading)
+    assert subprocess.run([*command, "--version"], stdout=writing, stderr=subprocess.DEVNULL).returncode != 0, "nobody reads"
+    os.close(writing)
 
 
 def test_the_module_is_the_program():

@@ -1,5 +1,7 @@
 """What was traced is found by a later process, made anew where it is damaged or out of date, and never trusted by name alone."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 import fivjax as fj
 from fivjax.contact import Contact
 from fivjax.foundation import kept_programs
-from fivjax.foundation.kept_programs import kept
+from fivjax.foundation.kept_programs import kept, kept_value
 from fivjax.maps.flattened import flatten
 
 
@@ -125,3 +127,29 @@ def test_under_a_transformation_it_is_part_of_what_the_caller_compiles(folder):
     slope = jax.jacfwd(lambda y: function.in_a_new_process()(1.0, y, jnp.asarray(2.0)).tree[1]["times"])(jnp.ones(2))
     np.testing.assert_array_equal(slope, 2 * np.eye(2))
     assert not folder.exists()
+
+
+def test_a_value_is_made_once_and_anew_where_its_file_is_damaged(folder):
+    made = []
+
+    def squares(numbers):
+        made.append(numbers)
+        return {number: number**2 for number in numbers}
+
+    for _ in range(2):
+        assert kept_value(squares, (2, 3)) == {2: 4, 3: 9}
+    assert made == [(2, 3)]
+    assert kept_value(squares, (4,)) == {4: 16} and len(made) == 2
+    for path in folder.iterdir():
+        path.write_bytes(b"damaged")
+    assert kept_value(squares, (2, 3)) == {2: 4, 3: 9} and len(made) == 3
+
+
+def test_a_value_of_what_a_user_wrote_is_made_each_time(folder):
+    class Own(NamedTuple):
+        strength: float
+
+    made = []
+    for _ in range(2):
+        assert kept_value(lambda law: made.append(law) or law.strength, Own(0.3)) == 0.3
+    assert len(made) == 2 and not folder.exists()

@@ -4,3 +4,4 @@ Heavy packages are imported only when a command runs, so that `--help`, `--versi
 """
 
 from .command_line import main as main
+from .command_line import program as program

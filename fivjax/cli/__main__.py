@@ -1,7 +1,5 @@
 """`python -m fivjax.cli` is `fivjax`."""
 
-import sys
+from .command_line import program
 
-from .command_line import main
-
-sys.exit(main())
+program()

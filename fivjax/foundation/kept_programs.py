@@ -1,7 +1,7 @@
 """Traced programs, kept for later processes in a folder of JAX's compilation cache.
 
 That cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large ones. So
-the traced program is kept, too (`jax.export`). Its file name is a digest of all that it depends on: fivjax's own source, the
+the traced program is kept, too (`jax.export`), as are other values that take long to make. Their file name is a digest of all that it depends on: fivjax's own source, the
 versions of Python, JAX, equinox and NumPy, the device, the function, shapes and types of its arrays, and its other arguments.
 
 A damaged file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its
@@ -65,6 +65,19 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
     return call
 
 
+def kept_value(make: Callable[..., R], *args) -> R:
+    """What a function makes of its arguments, which can be pickled and takes long to make; kept like traced programs."""
+    folder = _folder()
+    path = None if folder is None else _place(make, Path(folder), None, args)
+    if path is None:
+        return make(*args)
+    found = _found(path, pickle.loads)
+    if found is None:
+        found = make(*args)
+        _write(path, pickle.dumps(found))
+    return found
+
+
 class _Array(NamedTuple):
     """An argument that is an array."""
 
@@ -85,11 +98,9 @@ def _program(
     function: Callable, folder: Path, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool
 ) -> Callable | None:
     """A function of the arrays, read from the folder or made and written there; none where it cannot be named."""
-    try:
-        name = _digest(function, structure, rest)
-    except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
+    path = _place(function, folder, structure, rest)
+    if path is None:
         return None
-    path = folder / f"{function.__name__}-{name}"
     options = less_thought() if quickly_compiled else {}
 
     def ready(text: bytes) -> Callable:
@@ -101,6 +112,27 @@ def _program(
         result = jax.tree.structure(form)
         return lambda arrays: jax.tree.unflatten(result, run(*arrays))
 
+    found = _found(path, ready)
+    if found is not None:
+        return found
+    try:
+        text = _traced(function, structure, rest, arrays)
+    except (_Foreign, pickle.PicklingError, AttributeError, NotImplementedError):
+        return None
+    _write(path, text)
+    return ready(text)
+
+
+def _place(function: Callable, folder: Path, structure, rest: tuple) -> Path | None:
+    """The file for what a function makes of such arguments; none where these cannot be named."""
+    try:
+        return folder / f"{function.__name__}-{_digest(function, structure, rest)}"
+    except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
+        return None
+
+
+def _found(path: Path, ready: Callable[[bytes], R]) -> R | None:
+    """What is made ready from a file; none where there is no such file."""
     try:
         found = ready(_read(path))
         os.utime(path)
@@ -109,12 +141,7 @@ def _program(
         pass
     except Exception:  # damaged, or of a kind that this JAX does not read: made anew
         path.unlink(missing_ok=True)
-    try:
-        text = _traced(function, structure, rest, arrays)
-    except (_Foreign, pickle.PicklingError, AttributeError, NotImplementedError):
-        return None
-    _write(path, text)
-    return ready(text)
+    return None
 
 
 def _traced(function: Callable, structure, rest: tuple, arrays: Sequence) -> bytes:

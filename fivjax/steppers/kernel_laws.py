@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import inspect
 import math
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics
+from ..foundation.kept_programs import kept_value
 from ..foundation.scalar_code import scalar_source
 from ..foundation.warp_library import warp
 from .kernel_types import Types, types
@@ -61,10 +63,43 @@ class Laws(NamedTuple):
 @functools.cache
 def laws(form: Form) -> Laws:
     """The laws for scenes of this form."""
-    wp = warp()
-    like = form.mechanics(np.zeros(form.numbers))
-    t = types(like.free_load.shape[0], form.numbers)
-    digest = hashlib.sha256(repr((like.free_load.shape, like.tangential, like.normal)).encode())
+    wp, t = warp(), _types(form)
+    like, written = form.mechanics(np.zeros(form.numbers)), kept_value(_written_out, form)
+    told = repr((like.free_load.shape, like.tangential, like.normal, *written.values()))
+
+    def body(law):
+        source, size = written[law]
+        return f"wp::vec_t<{size}, wp::float64> found;\n{source}\nreturn found;"
+
+    @wp.func_native(body("held"))
+    def held(mechanics: t.mechanics, mode: t.mode, y: t.state) -> t.state: ...
+
+    @wp.func_native(body("next_mode"))
+    def next_mode(mechanics: t.mechanics, mode: t.mode, y: t.state, ending: t.ending) -> t.row: ...
+
+    @wp.func_native(body("has_begun"))
+    def has_begun(mode: t.mode, start: t.block, sizes: t.block) -> t.one: ...
+
+    @wp.func_native(body("is_safe"))
+    def is_safe(mode: t.mode, start: t.block, hull: t.hull, sizes: t.block) -> t.one: ...
+
+    @wp.func_native(body("brackets"))
+    def brackets(mode: t.mode, both: t.start, last: t.pair, sizes: t.block) -> t.bracket: ...
+
+    @wp.func_native(body("fastest_sample"))
+    def fastest_sample(scan: t.scan, steps: t.one) -> t.one: ...
+
+    name = hashlib.sha256(told.encode()).hexdigest()[:16]
+    return Laws(name, t, like, held, next_mode, has_begun, is_safe, brackets, fastest_sample)
+
+
+def _types(form: Form) -> Types:
+    return types(form.mechanics(np.zeros(form.numbers)).free_load.shape[0], form.numbers)
+
+
+def _written_out(form: Form) -> dict[str, tuple[str, int]]:
+    """The laws in C++, by name: what computes their numbers, and how many these are. Traced in half a second."""
+    t = _types(form)
 
     def contact_of(mode):
         return Contact(mode[0].astype(jnp.int32), mode[1])
@@ -75,53 +110,47 @@ def laws(form: Form) -> Laws:
     def limits_of(sizes):
         return sizes[:6].reshape(3, 2, 1)
 
-    def holding(mechanics, mode, y):
+    def held(mechanics, mode, y):
         return physics.on_constraint(form.mechanics(mechanics), contact_of(mode), y)
 
-    def following(mechanics, mode, y, ending):
+    def next_mode(mechanics, mode, y, ending):
         """`ending`: the load, whether either guard has ended the mode, and the time within which a rebound counts as rest."""
         own, contact = form.mechanics(mechanics), contact_of(mode)
         y = physics.on_constraint(own, contact, y)
         contact, y = physics.transition(own, contact, ending[0], y, ending[1:3] != 0, ending[3])
         return jnp.concatenate([y, jnp.stack([contact.status.astype(y.dtype), contact.direction])])
 
-    def beginning(mode, start, sizes):
+    def has_begun(mode, start, sizes):
         zeros, _ = leading(start.reshape(4, 2, 1), limits_of(sizes), exact_of(mode))
         return jnp.any(zeros > 0)[None]
 
-    def safety(mode, start, hull, sizes):
+    def is_safe(mode, start, hull, sizes):
         hull = hull[: 2 * ORDER].reshape(ORDER, 2, 1)
         return first_is_safe(start.reshape(4, 2, 1), hull, limits_of(sizes), exact_of(mode))
 
-    def bracketing(mode, start, end, sizes):
-        start, end, inside = start.reshape(5, 2, 1), end.reshape(2, 1), jnp.ones(1, bool)
+    def brackets(mode, both, last, sizes):
+        start, end, inside = both.reshape(5, 2, 1), last.reshape(2, 1), jnp.ones(1, bool)
         found = bracketed(start, end, limits_of(sizes), exact_of(mode), inside)
         return jnp.concatenate([jnp.ravel(part).astype(start.dtype) for part in jax.tree.leaves(found)])
 
-    def peaking(scan, steps):
+    def fastest_sample(scan, steps):
         return fastest(scan[:-1, None], steps)
 
-    def body(function, **arguments):
-        source, size = scalar_source(function, **{name: kind._length_ for name, kind in arguments.items()})
-        digest.update(source.encode())
-        return f"wp::vec_t<{size}, wp::float64> found;\n{source}\nreturn found;"
-
-    @wp.func_native(body(holding, mechanics=t.mechanics, mode=t.mode, y=t.state))
-    def held(mechanics: t.mechanics, mode: t.mode, y: t.state) -> t.state: ...
-
-    @wp.func_native(body(following, mechanics=t.mechanics, mode=t.mode, y=t.state, ending=t.ending))
-    def next_mode(mechanics: t.mechanics, mode: t.mode, y: t.state, ending: t.ending) -> t.row: ...
-
-    @wp.func_native(body(beginning, mode=t.mode, start=t.block, sizes=t.block))
-    def has_begun(mode: t.mode, start: t.block, sizes: t.block) -> t.one: ...
-
-    @wp.func_native(body(safety, mode=t.mode, start=t.block, hull=t.hull, sizes=t.block))
-    def is_safe(mode: t.mode, start: t.block, hull: t.hull, sizes: t.block) -> t.one: ...
-
-    @wp.func_native(body(bracketing, mode=t.mode, start=t.start, end=t.pair, sizes=t.block))
-    def brackets(mode: t.mode, start: t.start, end: t.pair, sizes: t.block) -> t.bracket: ...
-
-    @wp.func_native(body(peaking, scan=t.scan, steps=t.one))
-    def fastest_sample(scan: t.scan, steps: t.one) -> t.one: ...
-
-    return Laws(digest.hexdigest()[:16], t, like, held, next_mode, has_begun, is_safe, brackets, fastest_sample)
+    kinds = {
+        "mechanics": t.mechanics,
+        "mode": t.mode,
+        "y": t.state,
+        "ending": t.ending,
+        "start": t.block,
+        "hull": t.hull,
+        "sizes": t.block,
+        "both": t.start,
+        "last": t.pair,
+        "scan": t.scan,
+        "steps": t.one,
+    }
+    lengths = {name: kind._length_ for name, kind in kinds.items()}
+    return {
+        law.__name__: scalar_source(law, **{name: lengths[name] for name in inspect.signature(law).parameters})
+        for law in (held, next_mode, has_begun, is_safe, brackets, fastest_sample)
+    }
