@@ -40,7 +40,9 @@ def test_the_program_ends_at_once_with_its_code_and_all_it_has_said():
     assert ran.returncode == 2 and ran.stderr.startswith("fivjax: ") and "mu" in ran.stderr
     reading, writing = os.pipe()
     os.close(reading)
-    assert subprocess.run([*command, "--version"], stdout=writing, stderr=subprocess.DEVNULL).returncode != 0, "nobody reads"
+    assert subprocess.run([*command, "--version"], stdout=writing, stderr=subprocess.DEVNULL).returncode != 0, (
+        "nobody reads"
+    )
     os.close(writing)
 
 

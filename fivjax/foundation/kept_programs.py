@@ -1,8 +1,9 @@
 """Traced programs, kept for later processes in a folder of JAX's compilation cache.
 
 That cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large ones. So
-the traced program is kept, too (`jax.export`), as are other values that take long to make. Their file name is a digest of all that it depends on: fivjax's own source, the
-versions of Python, JAX, equinox and NumPy, the device, the function, shapes and types of its arrays, and its other arguments.
+the traced program is kept, too (`jax.export`), as are other values that take long to make. The file name is a digest of all
+that this depends on: fivjax's own source, the versions of Python, JAX, equinox and NumPy, the device, the function, shapes and
+types of its arrays, and its other arguments.
 
 A damaged file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its
 name does not tell what it does; such programs are traced in each process.

@@ -52,7 +52,8 @@ def stepping(form: Form) -> Stepping:
     lowest_of, root_of, rise_of, highest_of = roots(t, of)
     state, row, eight, pair, start_of_guards = t.state, t.row, t.block, t.pair, t.start
     mode_of, polynomial, ending, scan_of, one_number = t.mode, t.polynomial, t.ending, t.scan, t.one
-    intervals, hulls, samples, guards, displacements, bounds, _ = blocks_of(n)
+    at = blocks_of(n)
+    hulls, samples, guards, displacements, bounds = at.hull, at.samples, at.guards, at.displacements, at.sizes
     of_sample, of_row = padded(2 * n) // BLOCK, wp.types.vector(2 * n + 2, int)(*places_of(n, like.normal))
     speed_at = places_of(n, like.normal).index(velocity)
     # Places of displacements' series, which follow one another, and of what `window.Bracket` has of both guards.
