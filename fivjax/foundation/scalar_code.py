@@ -55,6 +55,17 @@ MOVING: dict[str, Callable] = {
     "concatenate": lambda *parts: np.concatenate(parts[:-1], parts[-1]["dimension"]),
     "stack": lambda *parts: np.stack(parts[:-1], parts[-1]["axis"]),
 }
+# The commonest arithmetic of numbers that are known, such as places in arrays; the rest is left to JAX, which compiles a
+# program for each.
+OF_NUMBERS: dict[str, Callable] = {
+    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
+    "convert_element_type": lambda a, p: a.astype(p["new_dtype"]),
+    "add": lambda a, b, _: a + b,
+    "eq": lambda a, b, _: a == b,
+    "ne": lambda a, b, _: a != b,
+    "lt": lambda a, b, _: a < b,
+    "ge": lambda a, b, _: a >= b,
+}
 # The same, with operands that say where; and how many operands are moved.
 MOVING_TO_PLACES = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2, "scatter": 3}
 # Reductions, by the primitive that they repeat.
@@ -119,11 +130,11 @@ class _Writer:
             found = MOVING[name](*operands, equation.params)
             return list(found) if primitive.multiple_results else [found]
         if all(map(_is_known, operands)):
-            values = [
-                jnp.asarray(np.array(part.tolist(), atom.aval.dtype).reshape(part.shape))
-                for part, atom in zip(operands, equation.invars, strict=True)
-            ]
-            found = primitive.bind(*values, **equation.params)
+            values = [_typed(part, atom) for part, atom in zip(operands, equation.invars, strict=True)]
+            if name in OF_NUMBERS:
+                found = OF_NUMBERS[name](*values, equation.params)
+            else:
+                found = primitive.bind(*map(jnp.asarray, values), **equation.params)
             return [_of_numbers(part) for part in (found if primitive.multiple_results else [found])]
         if name == "select_n" and len(operands) == 3 and _is_known(operands[0]):
             return [np.where(operands[0].astype(bool), operands[2], operands[1])]
@@ -189,10 +200,10 @@ class _Writer:
     def added_at(self, equation, operands: list[np.ndarray]) -> np.ndarray:
         """The first operand with what is to be added at known places."""
         operand, index, updates = operands
-        places = jnp.arange(1, updates.size + 1).reshape(updates.shape)
+        places = np.arange(1, updates.size + 1).reshape(updates.shape)
         put = jax.lax.scatter(
-            jnp.zeros(operand.shape, places.dtype),
-            jnp.asarray(index.astype(np.int32)),
+            np.zeros(operand.shape, places.dtype),
+            index.astype(np.int32),
             places,
             equation.params["dimension_numbers"],
         )
@@ -227,14 +238,14 @@ def _moved_to_places(equation, operands: list[np.ndarray]) -> np.ndarray:
     given, entries = [], []
     for position, (operand, atom) in enumerate(zip(operands, equation.invars, strict=True)):
         if (name == "scatter" and position == 1) or position >= MOVING_TO_PLACES[name]:
-            given.append(jnp.asarray(np.array(operand.tolist(), atom.aval.dtype).reshape(operand.shape)))
+            given.append(_typed(operand, atom))
         else:
-            given.append(jnp.arange(len(entries), len(entries) + operand.size).reshape(operand.shape))
+            given.append(np.arange(len(entries), len(entries) + operand.size).reshape(operand.shape))
             entries += list(operand.ravel())
     params = dict(equation.params)
     if "fill_value" in params:
         params["fill_value"] = None
-    found = equation.primitive.bind(*given, **params)
+    found = equation.primitive.bind(*map(jnp.asarray, given), **params)
     return np.asarray(np.array([*entries, None], object)[np.asarray(found)], object)
 
 
@@ -244,6 +255,11 @@ def _of_numbers(value) -> np.ndarray:
     found = np.empty(value.shape, object)
     found[...] = value.tolist() if value.ndim else value.item()
     return found
+
+
+def _typed(part: np.ndarray, atom) -> np.ndarray:
+    """Known numbers in the type that they have where they are used."""
+    return np.array(part.tolist(), atom.aval.dtype).reshape(part.shape)
 
 
 def _is_known(part: np.ndarray) -> bool:

@@ -2,10 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import xarray as xr
 
 from ..foundation import arguments
 from ..linear.critical import critical_friction
@@ -17,16 +16,15 @@ from .trajectories import Grid
 MOST_TRAJECTORIES = 10**8
 
 
-def add_linear_limit(dataset: xr.Dataset, scene: Scene) -> None:
-    """Note the critical friction of linear theory where friction is an axis and nothing else changes it."""
-    changes_it = set(scene.structure.parameters) & set(dataset.dims)
+def linear_limit(scene: Scene, axes: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The critical friction of linear theory, as an attribute: where friction is an axis and nothing else changes it."""
+    changes_it = set(scene.structure.parameters) & set(axes)
     # Only the sign of the belt speed matters.
-    directions = np.unique(np.sign(dataset["belt_speed"] if "belt_speed" in dataset.dims else scene.belt_speed))
-    if "mu" not in dataset.dims or changes_it or len(directions) != 1 or directions[0] == 0:
-        return
+    directions = np.unique(np.sign(axes.get("belt_speed", scene.belt_speed)))
+    if "mu" not in axes or changes_it or len(directions) != 1 or directions[0] == 0:
+        return {}
     limit = float(critical_friction(scene.structure, direction=int(directions[0])))
-    if np.isfinite(limit):
-        dataset.attrs["mu_crit"] = limit
+    return {"mu_crit": limit} if np.isfinite(limit) else {}
 
 
 def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import check_run, checked_axes, checked_grid
+from .axes import check_run, checked_axes, checked_grid, linear_limit
 from .datasets import map_dataset
 from .engine import run_to_verdict
 from .executors import with_workers
@@ -92,7 +92,7 @@ def basins(
             verdicts=None if keeper is None else keeper.verdicts,
             keeper=keeper,
         )
-    dataset = map_dataset(scene, method, t_max, grid, verdicts)
+    dataset = map_dataset(scene, method, t_max, grid, verdicts, linear_limit(scene, axes))
     for name, place in states.items():
         n = scene.structure.size
         what, unit = ("displacement", "m") if place < n else ("velocity", "m/s")

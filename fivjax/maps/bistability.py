@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .axes import check_run, checked_axes, checked_grid
+from .axes import check_run, checked_axes, checked_grid, linear_limit
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .executors import with_workers
@@ -124,11 +125,13 @@ def bistability_map(
         executor=executor,
         keeper=keeper,
     )
-    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
+    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper), ThreadPoolExecutor(1) as aside:
+        # Compiled and computed while trajectories are followed.
+        limit = aside.submit(linear_limit, scene, axes)
         verdicts = None if keeper is None else keeper.verdicts
         if not refine:
             verdicts = run(label="map", verdicts=verdicts)
-            return map_dataset(scene, method, t_max, grid, verdicts)
+            return map_dataset(scene, method, t_max, grid, verdicts, limit.result())
         verdicts = not_run(grid.total, bool(energy)) if verdicts is None else verdicts
         found: dict = {}  # attractors, which finer levels need not find again
 
@@ -137,6 +140,6 @@ def bistability_map(
 
         source, checked = refined(grid.shape, refine, audit, verdicts, level)
         found.clear()  # of a large map they take as much memory as its results
-    dataset = map_dataset(scene, method, t_max, grid, verdicts, source=source)
+    dataset = map_dataset(scene, method, t_max, grid, verdicts, limit.result(), source)
     dataset.attrs.update(audit_note(checked))
     return dataset

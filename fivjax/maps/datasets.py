@@ -13,7 +13,6 @@ from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
-from .axes import add_linear_limit
 from .crossing import first_crossings
 from .results import CHAOTIC, Verdicts
 from .sharing import kernels_by
@@ -31,9 +30,10 @@ def map_dataset(
     t_max: float | None,
     grid: Grid,
     verdicts: Verdicts,
+    linear: dict[str, float],
     source: Int[np.ndarray, " trajectories"] | None = None,
 ) -> xr.Dataset:
-    """The labelled dataset of a grid of trajectories.
+    """The labelled dataset of a grid of trajectories; `linear` is what linear theory says, see `axes.linear_limit`.
 
     `source`, if not all trajectories were computed: for each one the trajectory whose result it takes, in `verdicts` itself.
     """
@@ -76,7 +76,7 @@ def map_dataset(
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
         meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
     )
-    add_linear_limit(dataset, scene)
+    dataset.attrs.update(linear)
     first = Verdict(int(verdicts.verdict[0]))
     if first in FAILURES and np.all(verdicts.verdict == first):
         dataset.attrs["failure"] = MEANING[first]

@@ -12,8 +12,8 @@ from ..foundation.kept_programs import kept
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .conclusion import conclude, may_be_concluded
 from .flattened import Flattened, flatten
-from .kernels import Kernels
-from .progress import Setting, begin, placed, released, step
+from .kernels import Kernels, for_conclusions
+from .progress import Progress, Setting, begin, placed, released, step
 from .sharing import Batch, Shared, with_values
 
 # Trajectories that kernels have followed and that are asked for a verdict at a time.
@@ -58,16 +58,23 @@ def _follow_by_kernel(
     # While its mode changes again and again, nothing can be proved of a trajectory.
     asks = np.flatnonzero(may_be_concluded(shared, group, before, after.tree[1]))
     trajectories.numbers[:] = after.numbers
-    if not len(asks):
-        return
+    if len(asks):
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree)
+        trajectories.numbers[asks] = _concluded(batch, kernels.for_conclusions, group[asks], *rows, began[asks]).numbers
 
+
+def _concluded(batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray) -> Flattened:
     def function(*block):
         return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
 
-    rows = flatten((*jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree), began[asks]))
     # They are few of each group, and what they share is little.
-    concluded = in_blocks(function, kernels.for_conclusions, group[asks], rows, 1, batch.pool, size=CONCLUDED)
-    trajectories.numbers[asks] = concluded.numbers
+    return in_blocks(function, shared, group, flatten((columns, now, began)), 1, batch.pool, size=CONCLUDED)
+
+
+def compile_conclusions(batch: Batch, shared: Flattened, trajectories: Flattened) -> None:
+    """Compile what concludes where kernels follow trajectories, while these are being built."""
+    columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
+    _concluded(batch, for_conclusions(shared), np.zeros(1, int), columns, now, np.array(now.t))
 
 
 def _block(batch: Batch) -> int | None:

@@ -47,6 +47,12 @@ def _built(form: Form) -> Programs:
     return found
 
 
+def for_conclusions(shared: Flattened) -> Flattened:
+    """What the proofs that are not left to kernels need: not the matrices."""
+    without = eqx.tree_at(lambda shared: shared.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
+    return flatten(jax.tree.map(np.asarray, without))
+
+
 class Kernels:
     """The kernels for a batch, with the data of its groups on each device."""
 
@@ -56,9 +62,7 @@ class Kernels:
         form = Form.of(mechanics, leading=1)
         self.pool, self.wp = pool, wp
         self.types, self.programs = stepping(form).types, _built(form)
-        # The proofs that are not left to kernels do not need the matrices.
-        without = eqx.tree_at(lambda shared: shared.prepared, tree, None, is_leaf=lambda leaf: leaf is None)
-        self.for_conclusions = flatten(jax.tree.map(np.asarray, without))
+        self.for_conclusions = for_conclusions(shared)
         self.longest = np.asarray(tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)

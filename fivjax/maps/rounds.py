@@ -16,7 +16,7 @@ from .attractors import Attractors, add_cycles, add_tori, come_to, has_crossed, 
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct
 from .conclusion import slide_forever
 from .flattened import Flattened
-from .following import begun, follow
+from .following import begun, compile_conclusions, follow
 from .kernels import Kernels, begin_building
 from .parting import followed_on
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
@@ -66,6 +66,8 @@ def follow_all(
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(verdicts.pending(index))
     trajectories = begun(batch, shared, group[pending], columns[pending])
+    if batch.by_kernel and len(pending):
+        compile_conclusions(batch, shared, trajectories)
     kernels = Kernels(shared, batch.pool) if batch.by_kernel else None
     basins = Basins(batch, shared, kernels, of_groups, group)
     known_from = KNOWN_FROM * batch.method.round

@@ -17,7 +17,7 @@ from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
-from .axes import add_linear_limit, check_run, checked_axes
+from .axes import check_run, checked_axes, linear_limit
 from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings, with_ends
 from .datasets import time_limit
@@ -168,7 +168,7 @@ def critical_perturbation(
     if energy:
         for name, values in _energies_of_the_kick(run, method, scene, {**columns, "p": fine.middle}).items():
             dataset[name] = (tuple(axes), values.reshape(shape))
-    add_linear_limit(dataset, scene)
+    dataset.attrs.update(linear_limit(scene, axes))
     dataset.attrs["range"] = json.dumps([float(low), float(high)])
     return labelled(
         dataset, scene, method=describe_method(method), **time_limit(t_max), tolerance=tolerance, p_step=p_step
