@@ -17,17 +17,21 @@ def test_an_axis_is_halved_in_each_of_its_intervals():
 
 def fill(truth, halvings, audit=0.01, interrupt=None):
     """A known picture in place of trajectories: what is computed, what is filled in, what the audit counts."""
-    verdicts, calls = not_run(truth.size, energy=False), []
+    calls = []
 
     def run(places, what):
         calls.append((what, len(places)))
-        places = places[: len(places) // 2] if what == interrupt else places
-        verdicts.verdict[places] = truth.ravel()[places]
-        verdicts.amplitude[places] = truth.ravel()[places]
+        assert np.all(np.diff(places) > 0)
+        verdicts = not_run(len(places), energy=False)
+        done = slice(len(places) // 2 if what == interrupt else len(places))
+        verdicts.verdict[done] = truth.ravel()[places[done]]
+        verdicts.amplitude[done] = truth.ravel()[places[done]]
+        return verdicts
 
-    source, checked = refined(truth.shape, halvings, audit, verdicts, run)
-    computed = (source == np.arange(truth.size)) & ~verdicts.pending()
-    return verdicts.verdict[source].reshape(truth.shape), computed.reshape(truth.shape), checked, calls
+    cells = refined(truth.shape, halvings, audit, run)
+    computed = np.zeros(truth.size, bool)
+    computed[cells.places] = ~cells.verdicts.pending()[:-1]
+    return cells.verdicts.verdict[cells.row].reshape(truth.shape), computed.reshape(truth.shape), cells.audit, calls
 
 
 @pytest.mark.parametrize("count", [(17, 9), (9, 33)])

@@ -89,7 +89,6 @@ def basins(
             label="basins",
             states=states,
             executor=executor,
-            verdicts=None if keeper is None else keeper.verdicts,
             keeper=keeper,
         )
     dataset = map_dataset(scene, method, t_max, grid, verdicts, linear_limit(scene, axes))

@@ -18,7 +18,7 @@ from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .executors import with_workers
 from .refinement import audit_note, finer, refined
-from .results import not_run
+from .results import Verdicts
 from .resuming import keeper_at
 
 
@@ -128,18 +128,15 @@ def bistability_map(
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper), ThreadPoolExecutor(1) as aside:
         # Compiled and computed while trajectories are followed.
         limit = aside.submit(linear_limit, scene, axes)
-        verdicts = None if keeper is None else keeper.verdicts
         if not refine:
-            verdicts = run(label="map", verdicts=verdicts)
-            return map_dataset(scene, method, t_max, grid, verdicts, limit.result())
-        verdicts = not_run(grid.total, bool(energy)) if verdicts is None else verdicts
+            return map_dataset(scene, method, t_max, grid, run(label="map"), limit.result())
         found: dict = {}  # attractors, which finer levels need not find again
 
-        def level(places: np.ndarray, what: str) -> None:
-            run(label=f"map, {what}", verdicts=verdicts, places=places, attractors=found)
+        def level(places: np.ndarray, what: str) -> Verdicts:
+            return run(label=f"map, {what}", places=places, attractors=found)
 
-        source, checked = refined(grid.shape, refine, audit, verdicts, level)
+        cells = refined(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
-    dataset = map_dataset(scene, method, t_max, grid, verdicts, limit.result(), source)
-    dataset.attrs.update(audit_note(checked))
+    dataset = map_dataset(scene, method, t_max, grid, cells.verdicts, limit.result(), cells)
+    dataset.attrs.update(audit_note(cells.audit))
     return dataset

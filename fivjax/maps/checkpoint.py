@@ -11,13 +11,14 @@ import time
 import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import xarray as xr
 
 from ..io.datasets import check_writable, save
 from .attractor_files import from_bytes, to_bytes
 from .attractors import Attractors
-from .results import Verdicts, by_name, worth_keeping
+from .results import Verdicts, by_name, not_run
 from .trajectories import Places
 
 KIND = "fivjax checkpoint"
@@ -28,15 +29,15 @@ KEEP_EVERY = 2.0
 class Checkpoint:
     """The file of a run: reads the results of an earlier run, and writes new ones.
 
-    `run` describes the run in plain Python values (that `json` can hold).
+    `run` describes the run of `total` trajectories in plain Python values (that `json` can hold).
 
     **Raises:** as `recall`.
     """
 
-    def __init__(self, path: str | Path, run: dict):
+    def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
         self.path, self.run = path, run
         self.found: dict[int, dict[bytes, Attractors]] = {}
-        self.verdicts: Verdicts | None = None
+        self.verdicts = not_run(total, energy)
         kept = recall(path, run)
         if kept is not None:
             for place, content in json.loads(kept.pop("found", np.zeros(0, np.uint8)).tobytes() or "{}").items():
@@ -45,24 +46,30 @@ class Checkpoint:
             self.verdicts = Verdicts(**parts, energy=kept)
         self._written, self._new = time.monotonic(), False
 
+    def recalled(self, places: Places | None) -> Verdicts:
+        """The results kept of these trajectories (all, unless given)."""
+        chosen = slice(None) if places is None else places
+        return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
+
     def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
         """Keep the results of a job; they are written if it is time."""
         if found:
             self.found[int(places[0])] = found
+        for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(verdicts), strict=True):
+            whole[places] = own
         self._new = True
         if time.monotonic() - self._written >= KEEP_EVERY:
-            self.flush(verdicts)
+            self.flush()
 
     def close(self) -> None:
         """Nothing to release."""
 
-    def flush(self, verdicts: Verdicts) -> None:
+    def flush(self) -> None:
         """Write results that are not written yet."""
         if not self._new:
             return
         found = json.dumps({place: to_bytes(part).hex() for place, part in self.found.items()}).encode()
-        kept = verdicts._replace(verdict=worth_keeping(verdicts.verdict))
-        results = {**by_name(kept), "found": np.frombuffer(found, np.uint8)}
+        results = {**by_name(self.verdicts), "found": np.frombuffer(found, np.uint8)}
         keep(self.path, self.run, results)
         self._written, self._new = time.monotonic(), False
 

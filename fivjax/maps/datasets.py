@@ -2,10 +2,8 @@
 
 import json
 
-import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Int
 
 from ..io.datasets import labelled
 from ..model.scene import Scene
@@ -14,6 +12,7 @@ from ..steppers.description import describe_method
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
 from .crossing import first_crossings
+from .refinement import Refined
 from .results import CHAOTIC, Verdicts
 from .sharing import kernels_by
 from .trajectories import Grid
@@ -31,37 +30,38 @@ def map_dataset(
     grid: Grid,
     verdicts: Verdicts,
     linear: dict[str, float],
-    source: Int[np.ndarray, " trajectories"] | None = None,
+    cells: Refined | None = None,
 ) -> xr.Dataset:
     """The labelled dataset of a grid of trajectories; `linear` is what linear theory says, see `axes.linear_limit`.
-
-    `source`, if not all trajectories were computed: for each one the trajectory whose result it takes, in `verdicts` itself.
+    If not all trajectories were computed, `verdicts` are those of the `cells`.
     """
     axes, shape = grid.axes, grid.shape
-    place, table = attractor_table(grid.groups, verdicts)
-    computed = {}
-    if source is not None:
-        own = source == np.arange(len(source), dtype=source.dtype)
-        computed["computed"] = (tuple(axes), own.reshape(shape), {"long_name": "whether it was computed", "units": "1"})
-        place = place[source]
-        # One after the other in place: together they take as much memory as all the rest.
-        for leaf in jax.tree.leaves(verdicts):
-            leaf[:] = leaf[source]
+    place, table = attractor_table(
+        grid.groups if cells is None else lambda rows: grid.groups(cells.places[rows]), verdicts
+    )
+
+    def over_axes(values: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
+        return tuple(axes), (values if cells is None else values[cells.row]).reshape(shape)
+
     dataset = xr.Dataset(
         {
-            "verdict": (tuple(axes), verdicts.verdict.reshape(shape)),
-            "amplitude": (tuple(axes), verdicts.amplitude.reshape(shape)),
-            "decided_at": (tuple(axes), verdicts.decided_at.reshape(shape)),
-            "contact_events": (tuple(axes), verdicts.events.reshape(shape)),
-            "last_event": (tuple(axes), verdicts.last_event.reshape(shape)),
-            "attractor": (tuple(axes), place.reshape(shape)),
-            "chaotic": (tuple(axes), (verdicts.attractor_kind == CHAOTIC).reshape(shape)),
-            **computed,
+            "verdict": over_axes(verdicts.verdict),
+            "amplitude": over_axes(verdicts.amplitude),
+            "decided_at": over_axes(verdicts.decided_at),
+            "contact_events": over_axes(verdicts.events),
+            "last_event": over_axes(verdicts.last_event),
+            "attractor": over_axes(place),
+            "chaotic": over_axes(verdicts.attractor_kind == CHAOTIC),
             **{name: ("attractors", column) for name, column in table.items()},
-            **{name: (tuple(axes), line.reshape(shape)) for name, line in verdicts.energy.items()},
+            **{name: over_axes(line) for name, line in verdicts.energy.items()},
         },
         coords=axes,
     )
+    if cells is not None:
+        computed = np.zeros(grid.total, bool)
+        computed[cells.places] = ~verdicts.pending(slice(len(cells.places)))
+        described = {"long_name": "whether it was computed", "units": "1"}
+        dataset["computed"] = (tuple(axes), computed.reshape(shape), described)
     if "p" in axes:
         others = tuple(name for name in axes if name != "p")
         rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(axes["p"]))
@@ -77,10 +77,9 @@ def map_dataset(
         meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
     )
     dataset.attrs.update(linear)
-    first = Verdict(int(verdicts.verdict[0]))
-    if first in FAILURES and np.all(verdicts.verdict == first):
+    every = dataset["verdict"].values
+    first = Verdict(int(every.flat[0]))
+    if first in FAILURES and np.all(every == first):
         dataset.attrs["failure"] = MEANING[first]
-    dataset.attrs["counts"] = json.dumps(
-        {verdict.name.lower(): int(np.sum(verdicts.verdict == verdict)) for verdict in MEANING}
-    )
+    dataset.attrs["counts"] = json.dumps({verdict.name.lower(): int(np.sum(every == verdict)) for verdict in MEANING})
     return dataset

@@ -8,7 +8,7 @@ import contextvars
 import functools
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
@@ -39,12 +39,16 @@ class Keeper(Protocol):
 
     found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
-        """Keep the results of the job with these trajectories; `verdicts` are those of all trajectories."""
+    def recalled(self, places: Places | None) -> Verdicts:
+        """The results of an earlier run of these trajectories (all, unless given), in their order."""
         ...
 
-    def flush(self, verdicts: Verdicts) -> None:
-        """Keep results that are not kept yet."""
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
+        """Keep the results of the job with these trajectories."""
+        ...
+
+    def flush(self) -> None:
+        """Write results that are not written yet."""
         ...
 
 
@@ -63,37 +67,43 @@ def run_to_verdict(
     attractors: dict[bytes, Attractors] | None = None,
     executor: Workers | None = None,
     places: Places | None = None,
-    verdicts: Verdicts | None = None,
     keeper: Keeper | None = None,
 ) -> Verdicts:
-    """Follow one trajectory for each row of `values` (a `Grid`, or equally long columns by name) until its verdict.
+    """Follow one trajectory for each row of `values` (a `Grid`, or equally long columns by name) until its verdict. Returns the
+    results of these trajectories, in their order.
 
     - `energy`: whether to keep the energy ledger of each trajectory.
     - `states`: names in `values` that are initial displacements or velocities instead of parameters, with their indices in the
       state; all other coordinates begin at the sliding equilibrium.
     - `attractors`: those found in an earlier run over the same parameters; new ones are added.
     - `executor`: runs the jobs; unless given, threads of this process do, as many at a time as `memory` (bytes) allows.
-    - `places`: indices of the trajectories to run, all unless given.
-    - `verdicts`: results of an earlier run; missing ones are added. A job with any missing result is run as a whole.
-    - `keeper`: gets the results of each job.
+    - `places`: indices of the trajectories to run, in rising order; all unless given.
+    - `keeper`: gets the results of each job, and has those of an earlier run; missing ones are added. A job with any missing
+      result is run as a whole.
 
     Interrupted by the user, it returns the verdicts known by then (of jobs in other processes, those of finished jobs); all
     other trajectories have `Verdict.NOT_RUN`.
     """
     plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
-    verdicts = not_run(plan.trajectories.total, energy) if verdicts is None else verdicts
     total = plan.trajectories.total if places is None else len(places)
-    asked = slice(None) if places is None else places
+    verdicts = not_run(total, energy) if keeper is None else keeper.recalled(places)
+
+    def rows(number: int) -> Places:
+        own = plan.jobs[number]
+        return own if places is None else np.searchsorted(places, own)
+
     attractors = {} if attractors is None else attractors
     at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
-    with stop_requests() as requested, _Bar(label, total, total - int(verdicts.pending(asked).sum()), progress) as bar:
+    with stop_requests() as requested, _Bar(label, total, total - int(verdicts.pending().sum()), progress) as bar:
         try:
             # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
             needed_later = places is not None or bool(plan.parts[-1])
             for part in plan.parts:
-                _follow(plan, part, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested)
+                _follow(
+                    plan, part, rows, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested
+                )
         except KeyboardInterrupt:
-            left = int(verdicts.pending(asked).sum())
+            left = int(verdicts.pending().sum())
             warnings.warn(
                 f"Interrupted: of {counted(total, 'trajectory')}, {left} without a verdict, "
                 f"labelled {Verdict.NOT_RUN.value}.",
@@ -101,13 +111,14 @@ def run_to_verdict(
             )
         finally:
             if keeper is not None:
-                keeper.flush(verdicts)
+                keeper.flush()
     return verdicts
 
 
 def _follow(
     plan: Plan,
     part: list[int],
+    rows: Callable[[int], Places],
     verdicts: Verdicts,
     attractors: dict[bytes, Attractors],
     workers: Workers | None,
@@ -117,8 +128,10 @@ def _follow(
     bar: "_Bar",
     requested: list[int],
 ) -> None:
-    """Run the jobs of one part of the plan whose results are missing, and add the attractors that they find."""
-    missing = [number for number in part if np.any(verdicts.pending(plan.jobs[number]))]
+    """Run the jobs of one part of the plan whose results are missing in the `rows` of each, and add the attractors that they
+    find.
+    """
+    missing = [number for number in part if np.any(verdicts.pending(rows(number)))]
     found: dict[int, dict[bytes, Attractors]] = {}
     if keeper is not None and keeper.found:
         found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
@@ -130,20 +143,19 @@ def _follow(
 
     def write(number: int, results: Verdicts) -> None:
         for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(results), strict=True):
-            whole[plan.jobs[number]] = own
+            whole[rows(number)] = own
 
     def done(number: int, result: Done) -> None:
-        places = plan.jobs[number]
         write(number, result.verdicts)
         found[number] = result.found
         if keeper is not None:
-            keeper.keep(places, verdicts, result.found if needed_later else {})
+            keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else {})
         if workers is not None:
-            bar.ended(len(places))
+            bar.ended(len(plan.jobs[number]))
 
     def given_up(number: int) -> None:
         # Not kept on disk: with more memory, or on another machine, the job may succeed.
-        verdicts.verdict[plan.jobs[number]] = Verdict.WORKER_LOST
+        verdicts.verdict[rows(number)] = Verdict.WORKER_LOST
         bar.ended(len(plan.jobs[number]))
 
     def stop() -> bool:

@@ -59,11 +59,14 @@ def _follow_by_kernel(
     asks = np.flatnonzero(may_be_concluded(shared, group, before, after.tree[1]))
     trajectories.numbers[:] = after.numbers
     if len(asks):
-        rows = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree)
-        trajectories.numbers[asks] = _concluded(batch, kernels.for_conclusions, group[asks], *rows, began[asks]).numbers
+        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree)
+        concluded = _concluded(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
+        trajectories.numbers[asks] = concluded.numbers
 
 
-def _concluded(batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray) -> Flattened:
+def _concluded(
+    batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray
+) -> Flattened:
     def function(*block):
         return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
 

@@ -5,18 +5,20 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
-from .results import Verdicts
+from .results import Verdicts, not_run
 from .shares import wilson
+from .trajectories import Places
 
 # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors.
 JUMP = 1.1
 
-# A function that runs trajectories, by their indices on the fine grid, and writes their results into those of the whole grid.
-Run = Callable[[Int[np.ndarray, " r"], str], None]
+# A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
+Run = Callable[[Places, str], Verdicts]
 
 
 class Audit(NamedTuple):
@@ -24,6 +26,15 @@ class Audit(NamedTuple):
 
     cells: int
     wrong: int
+
+
+class Refined(NamedTuple):
+    """A grid of which some cells were computed: of a large one few, so that there is no result for each cell."""
+
+    verdicts: Verdicts  # of the computed cells; behind these, a trajectory that was not run
+    places: Places  # the computed cells
+    row: Int[np.ndarray, " cells"]  # the result that each cell takes
+    audit: Audit
 
 
 def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
@@ -34,37 +45,42 @@ def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, "
     return np.append(inside.ravel(), values[-1])
 
 
-def refined(
-    shape: tuple[int, ...], halvings: int, audit: float, verdicts: Verdicts, run: Run
-) -> tuple[Int[np.ndarray, " cells"], Audit]:
-    """Compute some points of a grid of this shape. Returns, for each point, the point whose result it takes; and the audit.
+def refined(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
+    """Compute some points of a grid of this shape.
 
     The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
     cell, or next to one, with corners of different verdict or attractor. Other points take the result of the corner before
     them; a computed point takes its own. Of the points that were never computed, a share `audit` is computed in the end and
-    compared. After an interrupt nothing more is computed, and the finer points take their own (missing) results.
+    compared. After an interrupt nothing more is computed, and the finer points are not run.
     """
-    # Arrays of a map of many millions of points take hundreds of megabytes each.
-    source = np.arange(math.prod(shape), dtype=np.int32 if math.prod(shape) < 2**31 else np.int64)
+    # Arrays of a map of many millions of points take hundreds of megabytes each. No result is the last one.
+    row = np.full(math.prod(shape), -1, np.int32 if math.prod(shape) < 2**31 else np.int64)
+    places = _every(2**halvings, shape, row.dtype).ravel()
+    verdicts = run(places, "coarse grid")
+    row[places] = np.arange(len(places))
 
-    def compute(which: np.ndarray, what: str) -> bool:
-        """Compute these points; whether all were followed to their end, which an interrupt prevents."""
+    def compute(which: Places, what: str) -> np.ndarray:
+        """Compute these points; the rows of their results."""
+        nonlocal places, verdicts
+        rows = np.arange(len(places), len(places) + len(which))
         if which.size:
-            run(which, what)
-        return not np.any(verdicts.pending(which))
+            verdicts = jax.tree.map(lambda *parts: np.concatenate(parts), verdicts, run(which, what))
+            places = np.concatenate([places, which])
+        return rows
 
-    going = compute(_every(2**halvings, shape, source.dtype).ravel(), "coarse grid")
     for level in range(1, halvings + 1):
-        if not going:
-            return source, Audit(0, 0)
-        going = compute(_halved(shape, 2 ** (halvings - level), verdicts, source), f"halving {level} of {halvings}")
-    computed = np.flatnonzero(source == np.arange(len(source), dtype=source.dtype))
-    chosen = _audited(computed, len(source), audit if going else 0.0)
-    compute(chosen, "audit")
-    chosen = chosen[~verdicts.pending(chosen)]
-    wrong = verdicts.verdict[chosen] != verdicts.verdict[source[chosen]]
-    source[chosen] = chosen
-    return source, Audit(len(chosen), int(wrong.sum()))
+        # An interrupt leaves trajectories that were not run.
+        if not np.any(verdicts.pending()):
+            wanted = _halved(shape, 2 ** (halvings - level), verdicts, row)
+            row[wanted] = compute(wanted, f"halving {level} of {halvings}")
+    chosen = _audited(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
+    rows, assumed = compute(chosen, "audit"), row[chosen]
+    row[chosen] = rows
+    known = ~verdicts.pending(rows)
+    wrong = known & (verdicts.verdict[rows] != verdicts.verdict[assumed])
+    checked = Audit(int(known.sum()), int(wrong.sum()))
+    nothing = not_run(1, bool(verdicts.energy))
+    return Refined(jax.tree.map(lambda *parts: np.concatenate(parts), verdicts, nothing), places, row, checked)
 
 
 def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray, "*grid"]:
@@ -73,23 +89,21 @@ def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray,
     return functools.reduce(np.add, np.ix_(*along))
 
 
-def _halved(
-    shape: tuple[int, ...], step: int, verdicts: Verdicts, source: Int[np.ndarray, " cells"]
-) -> Int[np.ndarray, " r"]:
+def _halved(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
     """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
-    their `source`.
+    the `row` of the corner before them.
     """
-    new, old = _every(step, shape, source.dtype), tuple(slice(None, None, 2) for _ in shape)
+    new, old = _every(step, shape, row.dtype), tuple(slice(None, None, 2) for _ in shape)
     corners = new[old]
-    wanted = _near_differences(_differ(verdicts, source[corners]), new.shape)
+    wanted = _near_differences(_differ(verdicts, row[corners]), new.shape)
     rest = ~wanted
     wanted[old] = rest[old] = False
     before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
-    source[new[rest]] = source[before[rest]]
+    row[new[rest]] = row[before[rest]]
     return new[wanted]
 
 
-def _audited(computed: Int[np.ndarray, " k"], total: int, share: float) -> Int[np.ndarray, " r"]:
+def _audited(computed: Places, total: int, share: float) -> Places:
     """A random share of the points that were not `computed`, without a list of them all."""
     left = total - len(computed)
     count = min(left, math.ceil(share * left))

@@ -65,11 +65,6 @@ def by_name(verdicts: Verdicts) -> dict[str, np.ndarray]:
     return {**parts.pop("energy"), **parts}
 
 
-def worth_keeping(verdict: np.ndarray) -> np.ndarray:
-    """The verdicts to keep on disk. Trajectories lost with their worker count as not run: another worker may succeed."""
-    return np.where(verdict == Verdict.WORKER_LOST, Verdict.NOT_RUN, verdict).astype(np.int8)
-
-
 class Ended(NamedTuple):
     """Verdicts of trajectories, and the attractors that have captured them."""
 

@@ -38,7 +38,7 @@ def keeper_at(
         "axes": {name: values.tolist() for name, values in grid.axes.items()},
     }
     if not is_store(path):
-        return Checkpoint(path, run)
+        return Checkpoint(path, run, grid.total, energy)
     of_group = grid.total / grid.group_count
     each = bytes_per_trajectory(scene, of_group)
     tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group))

@@ -10,6 +10,7 @@ A chunk that cannot be read counts as not run.
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -23,7 +24,7 @@ from ..io.files import check_writable
 from .attractor_files import from_bytes, to_bytes
 from .attractors import Attractors
 from .checkpoint import refuse_other_run
-from .results import Verdicts, by_name, not_run, worth_keeping
+from .results import Verdicts, by_name, not_run
 from .trajectories import Grid, Places, Tiles
 
 KIND = "fivjax store"
@@ -47,7 +48,7 @@ class Store:
         zarr = _zarr()
         self.path, self.tiles = Path(path), Tiles(grid.shape, tile)
         self.found: dict[int, dict[bytes, Attractors]] = {}
-        self.verdicts: Verdicts | None = None
+        self.energy = energy
         run = {**run, "chunk": list(tile)}
         fields = by_name(not_run(1, energy))
         with contextlib.suppress(FileExistsError):
@@ -58,7 +59,8 @@ class Store:
         try:
             group = zarr.open_group(self.path, mode="r+", use_consolidated=False)
             self.arrays = {name: group[name] for name in fields}
-            self.verdicts = self._recalled(not_run(grid.total, energy))
+            # Chunks that this run begins have nothing to recall.
+            self._earlier = set(self._begun())
             for file in sorted((self.path / FOUND).glob("*.npz")):
                 with contextlib.suppress(Exception):  # an incomplete file, after a power failure
                     self.found[int(file.stem)] = from_bytes(file.read_bytes())
@@ -66,24 +68,28 @@ class Store:
             self._lock.close()
             raise
 
-    def _recalled(self, verdicts: Verdicts) -> Verdicts:
-        for number in self._begun():
-            at = self.tiles.slices(number)
-            places = self.tiles[number]
+    def _begun(self) -> Iterator[int]:
+        return (number for number in range(len(self.tiles)) if self._chunk("verdict", number).exists())
+
+    def recalled(self, places: Places | None) -> Verdicts:
+        """The results kept by earlier runs of these trajectories (all, unless given)."""
+        verdicts = not_run(self.tiles.total if places is None else len(places), self.energy)
+        for number, inside, rows in self.tiles.among(places):
+            if number not in self._earlier:
+                continue
             try:
-                parts = {name: np.asarray(array[at]).ravel() for name, array in self.arrays.items()}
+                parts = {name: self._values(name, number) for name in self.arrays}
             except Exception:  # a damaged chunk may raise any error in its decoder
+                # Without verdicts, none of its trajectories counts as run.
+                self._chunk("verdict", number).unlink()
+                self._earlier.remove(number)
                 continue
             for name, values in by_name(verdicts).items():
-                values[places] = parts[name]
+                values[rows] = parts[name][inside]
         return verdicts
 
-    def _begun(self) -> Iterator[int]:
-        folder = self.path / "verdict" / "c"
-        for number in range(len(self.tiles)):
-            at = np.unravel_index(number, self.tiles.parts)
-            if folder.joinpath(*map(str, at)).exists():
-                yield number
+    def _values(self, name: str, number: int) -> np.ndarray:
+        return np.array(self.arrays[name][self.tiles.slices(number)]).ravel()
 
     def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
         """Keep the results of the job with these trajectories."""
@@ -92,21 +98,26 @@ class Store:
             folder.mkdir(exist_ok=True)
             _write(folder / f"{int(places[0])}.npz", to_bytes(found))
         fields = by_name(verdicts)
-        numbers = self.tiles.holding(places)
+        parts = list(self.tiles.among(places))
         for name in sorted(fields, key=lambda name: name == "verdict"):  # verdicts last
-            for number in numbers:
-                at, own = self.tiles.slices(int(number)), self.tiles[int(number)]
-                values = worth_keeping(fields[name][own]) if name == "verdict" else fields[name][own]
-                self.arrays[name][at] = values.reshape([part.stop - part.start for part in at])
-                self._on_disk(name, int(number))
+            for number, inside, rows in parts:
+                at = self.tiles.slices(number)
+                shape = [part.stop - part.start for part in at]
+                values = np.full(math.prod(shape), self.arrays[name].fill_value, fields[name].dtype)
+                if len(rows) < len(values) and self._chunk(name, number).exists():
+                    # One that is damaged has no verdicts either, so nothing in it counts.
+                    with contextlib.suppress(Exception):
+                        values = self._values(name, number)
+                values[inside] = fields[name][rows]
+                self.arrays[name][at] = values.reshape(shape)
+                # A chunk that contains only the fill value has no file.
+                if (chunk := self._chunk(name, number)).exists():
+                    _sync(chunk)
 
-    def _on_disk(self, name: str, number: int) -> None:
-        chunk = self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
-        # A chunk that contains only the fill value has no file.
-        if chunk.exists():
-            _sync(chunk)
+    def _chunk(self, name: str, number: int) -> Path:
+        return self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
 
-    def flush(self, verdicts: Verdicts) -> None:
+    def flush(self) -> None:
         """Nothing to do: every job is written at once."""
 
     def close(self) -> None:

@@ -64,10 +64,7 @@ class Grid(Mapping):
         tile = self.tile(most)
         if places is None:
             return Tiles(self.shape, tile)
-        index = np.unravel_index(places, self.shape)
-        parts = [-(-length // part) for length, part in zip(self.shape, tile, strict=True)]
-        own = np.ravel_multi_index([i // part for i, part in zip(index, tile, strict=True)], parts)
-        return cut(own, places, most)
+        return cut(Tiles(self.shape, tile).holding(places), places, most)
 
 
 class Listed:
@@ -97,7 +94,7 @@ class Tiles(Sequence):
     """The equal parts ("tiles") of a grid, each as the indices of its trajectories."""
 
     def __init__(self, shape: tuple[int, ...], tile: tuple[int, ...]):
-        self.shape, self.tile = shape, tile
+        self.shape, self.tile, self.total = shape, tile, math.prod(shape)
         self.parts = tuple(-(-length // part) for length, part in zip(shape, tile, strict=True))
 
     def __len__(self) -> int:
@@ -117,12 +114,24 @@ class Tiles(Sequence):
         along = [np.arange(part.start, part.stop) for part in self.slices(number)]
         return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
 
-    def holding(self, places: Places) -> Int[np.ndarray, " t"]:
-        """The numbers of the parts in which these trajectories lie."""
+    def holding(self, places: Places) -> Int[np.ndarray, " r"]:
+        """The number of the part in which each of these trajectories lies."""
         index = np.unravel_index(places, self.shape)
-        return np.unique(
-            np.ravel_multi_index([i // part for i, part in zip(index, self.tile, strict=True)], self.parts)
-        )
+        return np.ravel_multi_index([i // part for i, part in zip(index, self.tile, strict=True)], self.parts)
+
+    def among(self, places: Places | None) -> Iterator[tuple[int, Int[np.ndarray, " t"], Int[np.ndarray, " t"]]]:
+        """The parts in which these trajectories (all, unless given) lie: of each its number, which entries of it they are, and
+        which of `places`.
+        """
+        if places is None:
+            for number in range(len(self)):
+                yield number, np.arange(len(self[number])), self[number]
+            return
+        numbers = self.holding(places)
+        order = np.argsort(numbers, kind="stable")
+        found, first = np.unique(numbers[order], return_index=True)
+        for number, rows in zip(found.tolist(), np.split(order, first[1:]), strict=True):
+            yield number, np.searchsorted(self[number], places[rows]), rows
 
 
 def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
