@@ -16,10 +16,10 @@ from ..contact.rounding import RESTING
 from ..foundation.warp_library import warp
 from .kernel_arithmetic import arithmetic
 from .kernel_laws import Form, laws
-from .kernel_matrices import BLOCK, blocks_of, padded, places_of
+from .kernel_matrices import BLOCK, blocks_of, padded
 from .kernel_roots import roots
 from .kernel_types import Types
-from .propagation import INTERVALS, ORDER
+from .propagation import INTERVALS
 
 # Structures with more degrees of freedom would make kernels that take long to compile.
 MOST_COORDINATES = 8
@@ -46,18 +46,23 @@ def stepping(form: Form) -> Stepping:
     n, velocity = like.free_load.shape[0], like.free_load.shape[0] + like.tangential
     held, next_mode, has_begun, is_safe = law.held, law.next_mode, law.has_begun, law.is_safe
     brackets, fastest_sample = law.brackets, law.fastest_sample
-    of = arithmetic(n, t)
-    block, sample, hull, guard_series, series = of.block, of.sample, of.hull, of.guard_series, of.series
-    scan, speed_and_bend, value_at, state_at = of.scan, of.speed_and_bend, of.value_at, of.state_at
+    of = arithmetic(n, like.tangential, like.normal, t)
+    row_of, block, sample, hull, sizes = of.row_of, of.block, of.sample, of.hull, of.sizes
+    guard_series, guard, series, speed_series = of.guard_series, of.guard, of.series, of.speed_series
+    scan, speeds_in, speed_and_bend, value_at, state_at = (
+        of.scan,
+        of.speeds,
+        of.speed_and_bend,
+        of.value_at,
+        of.state_at,
+    )
     lowest_of, root_of, rise_of, highest_of = roots(t, of)
-    state, row, eight, pair, start_of_guards = t.state, t.row, t.block, t.pair, t.start
-    mode_of, polynomial, ending, scan_of, one_number = t.mode, t.polynomial, t.ending, t.scan, t.one
+    state, row, pair = t.state, t.row, t.pair
+    mode_of, ending, one_number = t.mode, t.ending, t.one
     at = blocks_of(n)
     hulls, samples, guards, displacements, bounds = at.hull, at.samples, at.guards, at.displacements, at.sizes
-    of_sample, of_row = padded(2 * n) // BLOCK, wp.types.vector(2 * n + 2, int)(*places_of(n, like.normal))
-    speed_at = places_of(n, like.normal).index(velocity)
-    # Places of displacements' series, which follow one another, and of what `window.Bracket` has of both guards.
-    coordinate, tangential = ORDER + 2, like.tangential
+    of_sample = padded(2 * n) // BLOCK
+    # Places of what `window.Bracket` has of both guards.
     ends, zeros, crossing, spent, dips = 4, 2, 6, 8, 10
     # Numbers in double precision: Warp takes Python's for single.
     zero, half, one, most, infinite = (real(x) for x in (0.0, 0.5, 1.0, INTERVALS, math.inf))
@@ -66,17 +71,16 @@ def stepping(form: Form) -> Stepping:
 
     @wp.struct
     class Step:
-        """An advance: the state and mode after it, the state before what happened at its end, its duration (s), whether the
-        section was crossed, whether the mode has ended, and the scan of the window before it.
+        """An advance: the state and mode after it, its duration (s), whether the section was crossed, whether the mode has
+        ended, and the tangential velocity (m/s) before what happened at its end.
         """
 
         y: state
         mode: mode_of
-        end: state
         h: real
         crossed: int
         ended: int
-        scan: scan_of
+        last: real
 
     @wp.func
     def matrix_of(g: int, mode: mode_of) -> int:
@@ -90,68 +94,19 @@ def stepping(form: Form) -> Stepping:
         return 4 * g + 2
 
     @wp.func
-    def stacked(y: state, load: real) -> row:
-        found = row()
-        for k in range(2 * n + 2):
-            place = of_row[k]
-            if place < 2 * n:
-                found[k] = y[place]
-            elif place == 2 * n:
-                found[k] = load
-            else:
-                found[k] = one
-        return found
-
-    @wp.func
-    def sample_of(m: t.matrices, w: int, here: row, i: int) -> state:
-        """The state at the beginning of an interval."""
-        there = sample(m, w, samples + of_sample * i, here)
-        found = state()
-        for k in range(2 * n):
-            found[k] = there[k]
-        return found
-
-    @wp.func
-    def sizes_of(m: t.matrices, w: int, here: row) -> eight:
-        """Bounds on the rounding of the guards' first coefficients, and on their difference from cubics."""
-        size = row()
-        for k in range(2 * n + 2):
-            size[k] = wp.abs(here[k])
-        return block(m, w, bounds, size)
-
-    @wp.func
-    def speed_series(c: t.series) -> polynomial:
-        """The series of the tangential velocity, in m per interval."""
-        found = polynomial()
-        for k in range(ORDER + 1):
-            found[k] = real(k + 1) * c[coordinate * tangential + k + 1]
-        return found
-
-    @wp.func
-    def guard(c: t.guards, which: int, zeros_at_start: real) -> polynomial:
-        """The series of a guard; its first coefficients, which are zero up to rounding, are exactly zero."""
-        found = polynomial()
-        for k in range(ORDER + 1):
-            if real(k) >= zeros_at_start:
-                found[k] = c[2 * k + which]
-        return found
-
-    @wp.func
-    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> scan_of:
-        """The scan up to the first interval that may have an event, in which the section is crossed, or in which the time
-        ends. Where the time ends, too, it has the sample behind the end, which tells peaks apart.
-        """
-        sizes = sizes_of(m, w, here)
+    def first_interval(m: t.matrices, w: int, mode: mode_of, here: row, steps: real) -> int:
+        """The first interval that may have an event, in which the section is crossed, or in which the time ends."""
+        size = sizes(m, w, bounds, here)
         whole = int(wp.floor(steps))
         proved = int(0)
         start = block(m, w, guards, here)
-        if has_begun(mode, start, sizes)[0] > zero:
+        if has_begun(mode, start, size)[0] > zero:
             # A guard that begins at zero is not above its limits: that it rises is told by its series.
-            if is_safe(mode, start, hull(m, w, hulls, here), sizes)[0] > zero:
+            if is_safe(mode, start, hull(m, w, hulls, here), size)[0] > zero:
                 proved = 1
             else:
                 whole = 0
-        return scan(m, w, here, speed_at, sizes, proved, whole)
+        return scan(m, w, here, size, proved, whole)
 
     @wp.func
     def advance(
@@ -166,25 +121,20 @@ def stepping(form: Form) -> Stepping:
     ) -> Step:
         w = matrix_of(g, mode)
         steps = wp.min(h / interval, most)
-        here = stacked(y, load)
-        seen = first_interval(m, w, mode, here, steps)
-        i = int(seen[INTERVALS + 1])
+        here = row_of(y, load)
+        i = first_interval(m, w, mode, here, steps)
         began = y
         if i > 0:
-            began = sample_of(m, w, here, i)
+            began = sample(m, w, samples + of_sample * i, here)
         share = zero
         fires_0 = int(0)
         fires_1 = int(0)
         crossed = int(0)
         reached = began
         if i < INTERVALS:
-            there = stacked(began, load)
+            there = row_of(began, load)
             both = guard_series(m, w, guards, there)
-            start = start_of_guards()
-            for k in range(10):
-                start[k] = both[k]
-            last = pair(both[2 * ORDER + 2], both[2 * ORDER + 3])
-            b = brackets(mode, start, last, sizes_of(m, w, there))
+            b = brackets(mode, both, sizes(m, w, bounds, there))
             share = wp.min(steps - real(i), one)
             root = pair(infinite, infinite)
             slope = pair()
@@ -194,7 +144,7 @@ def stepping(form: Form) -> Stepping:
                 end = b[ends + q]
                 guess = b[q]
                 if crosses > zero or b[dips + q] > zero:
-                    c = guard(both, q, b[zeros + q])
+                    c = guard(both, q, int(b[zeros + q]))
                     if b[dips + q] > zero:
                         low = lowest_of(c, guess)
                         if value_at(c, low)[0] <= zero:
@@ -233,8 +183,7 @@ def stepping(form: Form) -> Stepping:
                     fires_0 = 0
                     fires_1 = 0
         result = Step()
-        result.end = reached
-        result.scan = seen
+        result.last = reached[velocity]
         result.ended = wp.max(fires_0, fires_1)
         if result.ended > 0:
             how = ending(load, real(fires_0), real(fires_1), resting * interval)
@@ -255,7 +204,8 @@ def stepping(form: Form) -> Stepping:
     @wp.func
     def highest_near(m: t.matrices, w: int, here: row, load: real, i: int, steps: real, interval: real) -> real:
         """The largest tangential speed next to a sample of the window."""
-        c = speed_series(series(m, w, displacements, stacked(sample_of(m, w, here, i), load)))
+        about = row_of(sample(m, w, samples + of_sample * i, here), load)
+        c = speed_series(series(m, w, displacements, about))
         return highest_of(c, wp.max(-real(i), -one), wp.min(steps - real(i), one)) / interval
 
     @wp.func
@@ -263,10 +213,10 @@ def stepping(form: Form) -> Stepping:
         m: t.matrices, interval: real, g: int, y: state, mode: mode_of, load: real, after: Step, before: real
     ) -> real:
         w = matrix_of(g, mode)
-        here = stacked(y, load)
+        here = row_of(y, load)
         steps = after.h / interval
-        highest = wp.max(before, wp.abs(after.end[velocity]))
-        speeds = after.scan
+        highest = wp.max(before, wp.abs(after.last))
+        speeds = speeds_in(m, w, here)
         turned = -speeds
         # A parabola through three samples rises by less than half of their second difference above the highest of them. So
         # most advances have no higher peak than those before.

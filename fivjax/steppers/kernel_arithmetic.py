@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from ..foundation.warp_library import warp
-from .kernel_matrices import BLOCK, blocks_of, padded
+from .kernel_matrices import BLOCK, abreast, blocks_of, padded, places_of
 from .kernel_types import Types
 from .propagation import INTERVALS, ORDER
 from .window_roots import ROOT_STEPS
@@ -15,36 +15,45 @@ class Arithmetic(NamedTuple):
     Products are of so many blocks of a matrix, from the block `first` on, and a row.
     """
 
+    row_of: Any  # the row of a state and a load
+    sizes: Any  # what a product gives of the sizes of a row's entries
     block: Any
     sample: Any
     hull: Any
     guard_series: Any
     series: Any
-    scan: Any  # the intervals of a window up to the first that has to be looked at
-    speed_and_bend: Any  # the largest speed in a scan, and the largest second difference
+    scan: Any  # the first interval of a window that has to be looked at
+    speeds: Any  # the tangential velocity at each sample
+    speed_and_bend: Any  # the largest of them, and the largest second difference
+    guard: Any  # the series of a guard; its first coefficients, which are zero up to rounding, are exactly zero
+    speed_series: Any  # the series of the tangential velocity, in m per interval
     value_at: Any  # value and slope of a polynomial
     value_of_few: Any  # the same of its first terms
     bent_at: Any  # value, slope and second derivative
     state_at: Any  # displacements and velocities from their series, at a share of an interval
 
 
-def arithmetic(n: int, t: Types) -> Arithmetic:
-    """The functions for structures with `n` degrees of freedom."""
+def arithmetic(n: int, tangential: int, normal: int, t: Types) -> Arithmetic:
+    """The functions for structures with `n` degrees of freedom and a contact at these coordinates."""
     wp = warp()
-    columns = 2 * n + 2
+    columns, side, places = 2 * n + 2, abreast(n), places_of(n, normal)
+    speed_at = places.index(n + tangential)
+    entries = [f"y[{place}]" if place < 2 * n else ("load", "1.0")[place - 2 * n] for place in places]
+    filled = "".join(f"found[{k}] = {entry};\n" for k, entry in enumerate(entries))
+    row_source = f"wp::vec_t<{columns}, wp::float64> found;\n{filled}return found;"
 
-    def product(size):
+    def product(size, kept=None, of="here[{}]"):
         # Every fourth matrix is that of detachment; in contact the last two columns are zero.
         return f"""
-            wp::vec_t<{size}, wp::float64> found;
+            wp::vec_t<{kept or size}, wp::float64> found;
             const wp::float64* column = m.data + {BLOCK * columns} * ({blocks_of(n).total} * matrix + first);
             const int columns = matrix % 4 == 3 ? {columns} : {columns - 2};
             for (int b = 0; b < {size}; b += {BLOCK}) {{
                 wp::float64 sums[{BLOCK}];
-                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * here[0];
+                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * {of.format(0)};
                 for (int k = 1; k < columns; ++k)
-                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * here[k];
-                for (int r = 0; r < {BLOCK}; ++r) found[b + r] = sums[r];
+                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * {of.format("k")};
+                for (int r = 0; r < {BLOCK} && b + r < {kept or size}; ++r) found[b + r] = sums[r];
                 column += {BLOCK * columns};
             }}
             return found;"""
@@ -58,33 +67,38 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
                     for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * here[k];
                 int clear = 0;
                 for (int r = 0; r < {BLOCK}; ++r) clear += sums[r] > limits[r];
-                found[i + 1] = sums[6];
-                if ((i >= proved && clear < {BLOCK}) || (found[i] < 0.0 && sums[6] >= 0.0)) break;
+                if ((i >= proved && clear < {BLOCK}) || (speed < 0.0 && sums[6] >= 0.0)) break;
+                speed = sums[6];
                 column += {BLOCK * columns};
             }}"""
 
     # Numbers of columns that compilers know make this loop, in which trajectories spend most of their time, faster.
     scan_source = f"""
-        wp::vec_t<{t.scan._length_}, wp::float64> found;
         wp::float64 limits[{BLOCK}];
         for (int r = 0; r < {BLOCK}; ++r) limits[r] = r < 6 ? sizes[6 + r % 2] : -INFINITY;
         const wp::float64* column = m.data + {BLOCK * columns * blocks_of(n).total} * matrix;
+        wp::float64 speed = here[{speed_at}];
         int i = 0;
-        found[0] = here[speed_at];
         if (matrix % 4 == 3) {{ {scan_of(columns)} }} else {{ {scan_of(columns - 2)} }}
-        if (i == whole && i < {INTERVALS}) {{
-            wp::float64 behind = 0.0;
-            for (int k = 0; k < {columns}; ++k) behind += column[{BLOCK} * k + 6] * here[k];
-            found[i + 1] = behind;
+        return i;"""
+
+    speeds_source = f"""
+        wp::vec_t<{INTERVALS + 1}, wp::float64> found;
+        const wp::float64* column = m.data + {BLOCK * columns * blocks_of(n).total} * matrix + 6;
+        found[0] = here[{speed_at}];
+        for (int i = 0; i < {INTERVALS}; ++i) {{
+            wp::float64 sum = 0.0;
+            for (int k = 0; k < {columns}; ++k) sum += column[{BLOCK} * k] * here[k];
+            found[i + 1] = sum;
+            column += {BLOCK * columns};
         }}
-        found[{INTERVALS + 1}] = i;
         return found;"""
 
     of_speeds = """
-        wp::float64 speed = wp::max(wp::abs(scan[0]), wp::abs(scan[last])), bend = 0.0;
+        wp::float64 speed = wp::max(wp::abs(speeds[0]), wp::abs(speeds[last])), bend = 0.0;
         for (int k = 1; k < last; ++k) {
-            speed = wp::max(speed, wp::abs(scan[k]));
-            bend = wp::max(bend, wp::abs(scan[k + 1] - 2.0 * scan[k] + scan[k - 1]));
+            speed = wp::max(speed, wp::abs(speeds[k]));
+            bend = wp::max(bend, wp::abs(speeds[k + 1] - 2.0 * speeds[k] + speeds[k - 1]));
         }
         return wp::vec_t<2, wp::float64>(speed, bend);"""
 
@@ -113,24 +127,52 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
         }}
         return wp::vec_t<3, wp::float64>(value, slope, 2.0 * bend);"""
 
+    # Coordinates side by side, and even and odd powers apart.
     of_state = f"""
+        const wp::float64 u = x * x;
+        wp::float64 even[{side}], even_slope[{side}], odd[{side}], odd_slope[{side}];
+        for (int j = 0; j < {side}; ++j) {{
+            even[j] = c[{side * (ORDER + 1)} + j];
+            odd[j] = c[{side * ORDER} + j];
+            even_slope[j] = odd_slope[j] = 0.0;
+        }}
+        for (int k = {ORDER - 1}; k > 0; k -= 2)
+            for (int j = 0; j < {side}; ++j) {{
+                even_slope[j] = even_slope[j] * u + even[j];
+                even[j] = even[j] * u + c[{side} * k + j];
+                odd_slope[j] = odd_slope[j] * u + odd[j];
+                odd[j] = odd[j] * u + c[{side} * (k - 1) + j];
+            }}
         wp::vec_t<{2 * n}, wp::float64> found;
         for (int j = 0; j < {n}; ++j) {{
-            wp::float64 value = c[{ORDER + 2} * j + {ORDER + 1}], slope = 0.0;
-            for (int k = {ORDER}; k >= 0; --k) {{
-                slope = slope * x + value;
-                value = value * x + c[{ORDER + 2} * j + k];
-            }}
-            found[j] = value;
-            found[{n} + j] = slope / interval;
+            even_slope[j] = even_slope[j] * u + even[j];
+            even[j] = even[j] * u + c[j];
+            found[j] = even[j] + x * odd[j];
+            found[{n} + j] = (odd[j] + 2.0 * (x * even_slope[j] + u * odd_slope[j])) / interval;
         }}
         return found;"""
+
+    guard_source = f"""
+        wp::vec_t<{ORDER + 1}, wp::float64> found;
+        for (int k = 0; k < {ORDER + 1}; ++k) found[k] = k < zeros ? 0.0 : c[2 * k + which];
+        return found;"""
+
+    speed_source = f"""
+        wp::vec_t<{ORDER + 1}, wp::float64> found;
+        for (int k = 0; k < {ORDER + 1}; ++k) found[k] = (k + 1) * c[{side} * (k + 1) + {tangential}];
+        return found;"""
+
+    @wp.func_native(row_source)
+    def row_of(y: t.state, load: wp.float64) -> t.row: ...
+
+    @wp.func_native(product(BLOCK, of="wp::abs(here[{}])"))
+    def sizes(m: t.matrices, matrix: int, first: int, here: t.row) -> t.block: ...
 
     @wp.func_native(product(BLOCK))
     def block(m: t.matrices, matrix: int, first: int, here: t.row) -> t.block: ...
 
-    @wp.func_native(product(padded(2 * n)))
-    def sample(m: t.matrices, matrix: int, first: int, here: t.row) -> t.sample: ...
+    @wp.func_native(product(padded(2 * n), 2 * n))
+    def sample(m: t.matrices, matrix: int, first: int, here: t.row) -> t.state: ...
 
     @wp.func_native(product(padded(2 * ORDER)))
     def hull(m: t.matrices, matrix: int, first: int, here: t.row) -> t.hull: ...
@@ -138,16 +180,23 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
     @wp.func_native(product(padded(2 * (ORDER + 2))))
     def guard_series(m: t.matrices, matrix: int, first: int, here: t.row) -> t.guards: ...
 
-    @wp.func_native(product(padded(n * (ORDER + 2))))
+    @wp.func_native(product(padded(side * (ORDER + 2))))
     def series(m: t.matrices, matrix: int, first: int, here: t.row) -> t.series: ...
 
     @wp.func_native(scan_source)
-    def scan(
-        m: t.matrices, matrix: int, here: t.row, speed_at: int, sizes: t.block, proved: int, whole: int
-    ) -> t.scan: ...
+    def scan(m: t.matrices, matrix: int, here: t.row, sizes: t.block, proved: int, whole: int) -> int: ...
+
+    @wp.func_native(speeds_source)
+    def speeds(m: t.matrices, matrix: int, here: t.row) -> t.speeds: ...
 
     @wp.func_native(of_speeds)
-    def speed_and_bend(scan: t.scan, last: int) -> t.pair: ...
+    def speed_and_bend(speeds: t.speeds, last: int) -> t.pair: ...
+
+    @wp.func_native(guard_source)
+    def guard(c: t.guards, which: int, zeros: int) -> t.polynomial: ...
+
+    @wp.func_native(speed_source)
+    def speed_series(c: t.series) -> t.polynomial: ...
 
     @wp.func_native(value_and_slope(ORDER + 1))
     def value_at(c: t.polynomial, x: wp.float64) -> t.pair: ...
@@ -161,5 +210,6 @@ def arithmetic(n: int, t: Types) -> Arithmetic:
     @wp.func_native(of_state)
     def state_at(c: t.series, x: wp.float64, interval: wp.float64) -> t.state: ...
 
-    products = block, sample, hull, guard_series, series
-    return Arithmetic(*products, scan, speed_and_bend, value_at, value_of_few, bent_at, state_at)
+    products = row_of, sizes, block, sample, hull, guard_series, series
+    series_of_one = guard, speed_series, value_at, value_of_few, bent_at
+    return Arithmetic(*products, scan, speeds, speed_and_bend, *series_of_one, state_at)

@@ -84,10 +84,10 @@ def laws(form: Form) -> Laws:
     def is_safe(mode: t.mode, start: t.block, hull: t.hull, sizes: t.block) -> t.one: ...
 
     @wp.func_native(body("brackets"))
-    def brackets(mode: t.mode, both: t.start, last: t.pair, sizes: t.block) -> t.bracket: ...
+    def brackets(mode: t.mode, guards: t.guards, sizes: t.block) -> t.bracket: ...
 
     @wp.func_native(body("fastest_sample"))
-    def fastest_sample(scan: t.scan, steps: t.one) -> t.one: ...
+    def fastest_sample(speeds: t.speeds, steps: t.one) -> t.one: ...
 
     name = hashlib.sha256(told.encode()).hexdigest()[:16]
     return Laws(name, t, like, held, next_mode, has_begun, is_safe, brackets, fastest_sample)
@@ -128,13 +128,17 @@ def _written_out(form: Form) -> dict[str, tuple[str, int]]:
         hull = hull[: 2 * ORDER].reshape(ORDER, 2, 1)
         return first_is_safe(start.reshape(4, 2, 1), hull, limits_of(sizes), exact_of(mode))
 
-    def brackets(mode, both, last, sizes):
-        start, end, inside = both.reshape(5, 2, 1), last.reshape(2, 1), jnp.ones(1, bool)
+    def brackets(mode, guards, sizes):
+        start, end, inside = (
+            guards[:10].reshape(5, 2, 1),
+            guards[2 * ORDER + 2 : 2 * ORDER + 4, None],
+            jnp.ones(1, bool),
+        )
         found = bracketed(start, end, limits_of(sizes), exact_of(mode), inside)
         return jnp.concatenate([jnp.ravel(part).astype(start.dtype) for part in jax.tree.leaves(found)])
 
-    def fastest_sample(scan, steps):
-        return fastest(scan[:-1, None], steps)
+    def fastest_sample(speeds, steps):
+        return fastest(speeds[:, None], steps)
 
     kinds = {
         "mechanics": t.mechanics,
@@ -144,9 +148,8 @@ def _written_out(form: Form) -> dict[str, tuple[str, int]]:
         "start": t.block,
         "hull": t.hull,
         "sizes": t.block,
-        "both": t.start,
-        "last": t.pair,
-        "scan": t.scan,
+        "guards": t.guards,
+        "speeds": t.speeds,
         "steps": t.one,
     }
     lengths = {name: kind._length_ for name, kind in kinds.items()}

@@ -18,19 +18,24 @@ class Blocks(NamedTuple):
     hull: int  # control points of the guards' series in the first interval
     samples: int
     guards: int  # their series, and their values at the end of the interval
-    displacements: int  # their series, coordinate by coordinate
+    displacements: int  # their series, power by power
     sizes: int
     total: int
 
 
 def blocks_of(n: int) -> Blocks:
-    lengths = 2 * ORDER, (INTERVALS + 1) * padded(2 * n), 2 * (ORDER + 2), n * (ORDER + 2), BLOCK
+    lengths = 2 * ORDER, (INTERVALS + 1) * padded(2 * n), 2 * (ORDER + 2), abreast(n) * (ORDER + 2), BLOCK
     return Blocks(0, *np.cumsum([INTERVALS, *(padded(length) // BLOCK for length in lengths)]).tolist())
 
 
 def padded(rows: int) -> int:
     """The next multiple of a block's length."""
     return -(-rows // BLOCK) * BLOCK
+
+
+def abreast(n: int) -> int:
+    """How many numbers there are for each power in the series of displacements: whole vectors of a processor."""
+    return -(-n // 4) * 4
 
 
 def places_of(n: int, normal: int) -> list[int]:
@@ -47,7 +52,9 @@ def matrices(prepared: Propagators, n: int, tangential: int, normal: int) -> Flo
     guards, displacements = np.split(series, [2 * (ORDER + 2)], axis=1)
     control = control.reshape(count, 3, INTERVALS, 2, -1).transpose(0, 2, 1, 3, 4).reshape(count, INTERVALS, 6, -1)
     samples = samples.reshape(count, INTERVALS + 1, 2 * n, -1)
-    displacements = displacements.reshape(count, ORDER + 2, n, -1).swapaxes(1, 2).reshape(count, n * (ORDER + 2), -1)
+    displacements = displacements.reshape(count, ORDER + 2, n, -1)
+    displacements = np.pad(displacements, [(0, 0), (0, 0), (0, abreast(n) - n), (0, 0)])
+    displacements = displacements.reshape(count, abreast(n) * (ORDER + 2), -1)
     intervals = np.concatenate([control, samples[:, 1:, n + tangential, None]], axis=2)
     parts = [_in_blocks(part) for part in (intervals, hull, samples, guards, displacements, sizes)]
     rows = np.concatenate([part.reshape(count, -1, BLOCK, part.shape[-1]) for part in parts], axis=1)

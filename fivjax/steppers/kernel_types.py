@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 from ..foundation.warp_library import warp
-from .kernel_matrices import BLOCK, padded
+from .kernel_matrices import BLOCK, abreast, padded
 from .propagation import INTERVALS, ORDER
 
 
@@ -20,12 +20,10 @@ class Types(NamedTuple):
     triple: Any
     block: Any  # what a block of a matrix gives
     hull: Any
-    sample: Any
     guards: Any
     series: Any
     polynomial: Any
-    scan: Any  # the tangential velocity at each sample of a window, and the interval to be looked at
-    start: Any  # the first five coefficients of both guards
+    speeds: Any  # the tangential velocity at each sample of a window
     bracket: Any  # `window.Bracket`
     ending: Any  # what `contact.transition` is told
 
@@ -48,12 +46,10 @@ def types(n: int, mechanics: int) -> Types:
         triple=vector(3),
         block=vector(BLOCK),
         hull=vector(padded(2 * ORDER)),
-        sample=vector(padded(2 * n)),
         guards=vector(padded(2 * (ORDER + 2))),
-        series=vector(padded(n * (ORDER + 2))),
+        series=vector(padded(abreast(n) * (ORDER + 2))),
         polynomial=vector(ORDER + 1),
-        scan=vector(INTERVALS + 2),
-        start=vector(10),
+        speeds=vector(INTERVALS + 1),
         bracket=vector(12),
         ending=vector(4),
     )
