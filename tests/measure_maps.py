@@ -295,11 +295,11 @@ def kernel_step() -> float:
         shared = shared_by(batch, mu[:, None])
         trajectories = begun(batch, shared, group, np.full((len(group), 1), 1.3))
         kernels = Kernels(shared, pool)
-        moving = kernels.follow(group, trajectories, steps)
+        kernels.follow(group, trajectories, steps)
         found = []
         for _ in range(5):
             start = time.perf_counter()
-            kernels.follow(group, moving, steps)
+            kernels.follow(group, trajectories, steps)
             found.append(time.perf_counter() - start)
     return min(found) / (steps * len(group))
 

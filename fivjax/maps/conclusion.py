@@ -22,14 +22,17 @@ from .section import BLOCK, Section, of_block
 GROWTH = 1e9
 
 
-def may_be_concluded(shared: Flattened, group: Int[np.ndarray, " m"], before: Progress, now: Progress) -> np.ndarray:
+def may_be_concluded(
+    shared: Flattened, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
+) -> np.ndarray:
     """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
     steps: those whose mode has not changed in it, and those that have not moved, are too large or are not finite. Cheap.
+    `began` and `events` are the time (s) and the number of events before the round.
     """
     tree = shared.tree
     yardstick = np.max(np.abs(tree.weights * tree.modes.linear.equilibrium), axis=1)
     largest = np.max(np.abs(tree.weights[group] * now.y), axis=1)
-    return (now.events == before.events) | (now.t <= before.t) | ~(largest <= GROWTH * yardstick[group])
+    return (now.events == events) | (now.t <= began) | ~(largest <= GROWTH * yardstick[group])
 
 
 def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progress:

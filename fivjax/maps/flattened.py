@@ -37,6 +37,12 @@ class Flattened(eqx.Module):
 
         return jax.tree.unflatten(structure, [leaf(place) for place in _places(shapes, types)])
 
+    @property
+    def starts(self) -> PyTree:
+        """Where each leaf of the tree begins among the numbers of a row."""
+        structure, shapes, types = self.form
+        return jax.tree.unflatten(structure, [place.numbers.start for place in _places(shapes, types)])
+
     def compacted(self, rows: Int[np.ndarray, " r"]) -> "Flattened":
         """Only these rows, in rising order, moved in place to the beginning of the array, without a second array."""
         if len(rows) == len(self.numbers):

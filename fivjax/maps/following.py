@@ -52,14 +52,13 @@ def follow(
 def _follow_by_kernel(
     batch: Batch, kernels: Kernels, shared: Flattened, group: np.ndarray, trajectories: Flattened, steps: int
 ) -> None:
-    after = kernels.follow(group, trajectories, steps)
-    before = trajectories.tree[1]
-    began = np.array(before.t)
+    now = trajectories.tree[1]
+    began, events = now.t.copy(), now.events
+    kernels.follow(group, trajectories, steps)
     # While its mode changes again and again, nothing can be proved of a trajectory.
-    asks = np.flatnonzero(may_be_concluded(shared, group, before, after.tree[1]))
-    trajectories.numbers[:] = after.numbers
+    asks = np.flatnonzero(may_be_concluded(shared, group, began, events, trajectories.tree[1]))
     if len(asks):
-        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], after.tree)
+        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], trajectories.tree)
         concluded = _concluded(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
         trajectories.numbers[asks] = concluded.numbers
 

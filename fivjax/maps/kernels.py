@@ -6,7 +6,6 @@ laws. No trajectory waits for the slowest of a block, and nothing is padded.
 
 from concurrent.futures import Executor
 from itertools import pairwise
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +19,19 @@ from ..steppers.kernel_laws import Form
 from ..steppers.kernel_matrices import matrices
 from .blocks import workers
 from .flattened import Flattened, flatten
-from .kernel_programs import Programs, programs
+from .kernel_programs import (
+    CROSSED,
+    CROSSINGS,
+    DIRECTION,
+    EVENTS,
+    LONGEST,
+    PEAK,
+    STATE,
+    STATUS,
+    TIME,
+    Programs,
+    programs,
+)
 from .sharing import Batch, with_values
 
 # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
@@ -79,54 +90,42 @@ class Kernels:
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
         """What `moved_in_windows` gives, for motions from these states of the section; with the last `kept` crossings."""
         count, size = y.shape
-        wp, state = self.wp, self.types.state
-        crossings = np.array(np.broadcast_to(crossings, count), np.int32)
-        mode, y = np.stack([status, direction], axis=1).astype(float), np.array(y, float)
-        (events, crossed), (time, peak) = np.zeros((2, count), np.int32), np.zeros((2, count))
-        path, longest = np.full((count, kept, size), np.nan), self.longest[group] * crossings
-        given = [(group.astype(np.int32), wp.int32), (crossings, wp.int32), (longest, wp.float64)]
-        moved = [(y, state), (mode, self.types.mode), (events, wp.int32), (crossed, wp.int32), (time, wp.float64)]
-        each = int(STEPS_TO_CROSSING * np.mean(crossings)) if count else 0
-        self._launch(self.programs.returned, [*given, *moved, (path, state), (peak, wp.float64)], each, [int(peaks)])
-        arrived = (crossed >= crossings) & np.all(np.isfinite(y), axis=1)
-        y[~arrived], peak[~arrived] = np.nan, np.nan
+        rows = np.empty((count, STATE + size))
+        rows[:, CROSSINGS], rows[:, STATUS], rows[:, DIRECTION], rows[:, STATE:] = crossings, status, direction, y
+        rows[:, LONGEST] = self.longest[group] * rows[:, CROSSINGS]
+        path = np.full((count, kept * size), np.nan)
+        each = int(STEPS_TO_CROSSING * np.mean(rows[:, CROSSINGS])) if count else 0
+        self._launch(self.programs.returned, group, [rows, path], each, [kept, int(peaks)])
+        path, y, crossed = path.reshape(count, kept, size), rows[:, STATE:], rows[:, CROSSED].astype(int)
+        lost = (crossed < rows[:, CROSSINGS]) | ~np.all(np.isfinite(y), axis=1)
+        rows[lost, PEAK], rows[lost, STATE:] = np.nan, np.nan
         # The states were kept in a ring; the newest comes last.
         turned = np.flatnonzero(crossed % kept)
-        places = (crossed[turned, None] + np.arange(kept)) % kept
-        path[turned] = path[turned[:, None], places]
-        return y, mode[:, 0].astype(np.int32), mode[:, 1], events, time, path, peak
+        if len(turned):
+            places = (crossed[turned, None] + np.arange(kept)) % kept
+            path[turned] = path[turned[:, None], places]
+        events = rows[:, EVENTS].astype(np.int32)
+        return y, rows[:, STATUS].astype(np.int32), rows[:, DIRECTION], events, rows[:, TIME], path, rows[:, PEAK]
 
-    def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> Flattened:
-        """Trajectories so many steps further."""
-        wp, state = self.wp, self.types.state
-        columns, now = trajectories.tree
-        mode = np.stack([now.contact.status, now.contact.direction], axis=1).astype(float)
-        t, y, crossing, last = (np.array(part, float) for part in (now.t, now.y, now.crossing, now.last_event))
-        events = np.array(now.events, np.int32)
-        rows = [
-            (group.astype(np.int32), wp.int32),
-            (np.ascontiguousarray(now.steps.jumps), wp.float64),
-            (np.ascontiguousarray(now.steps.loads), wp.float64),
-            *((t, wp.float64), (y, state), (mode, self.types.mode), (crossing, state)),
-            *((events, wp.int32), (last, wp.float64)),
-        ]
-        self._launch(self.programs.followed, rows, steps, [steps])
-        after = eqx.tree_at(
-            lambda now: (
-                *(now.t, now.y, now.contact.status, now.contact.direction),
-                *(now.crossing, now.events, now.last_event),
-            ),
-            now,
-            (t, y, mode[:, 0].astype(now.contact.status.dtype), mode[:, 1], crossing, events, last),
+    def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
+        """Trajectories so many steps further, in place."""
+        _, at = trajectories.starts
+        columns = self.programs.columns(
+            *(at.t, at.y, at.contact.status, at.contact.direction, at.crossing, at.events, at.last_event),
+            *(at.steps.jumps, at.steps.loads),
         )
-        return flatten((columns, after))
+        jumps = trajectories.tree[1].steps.jumps.shape[-1]
+        self._launch(self.programs.followed, group, [trajectories.numbers], steps, [columns, jumps, steps])
 
-    def _launch(self, kernel, rows: list[tuple[np.ndarray, Any]], steps: int, values: list) -> None:
+    def _launch(self, kernel, group: Int[np.ndarray, " m"], rows: list[np.ndarray], steps: int, values: list) -> None:
         """Run a kernel for each row of these arrays, which are changed in place. A row takes some `steps` steps."""
-        count, wp = len(rows[0][0]), self.wp
+        count, wp, group = len(group), self.wp, group.astype(np.int32)
         if self.devices == ["cpu"]:
-            arrays = [wp.array(part, dtype=kind, device="cpu", copy=False) for part, kind in rows]
-            given = [*self.of_groups["cpu"], *arrays, *values]
+            given = [
+                *self.of_groups["cpu"],
+                *(wp.array(part, device="cpu", copy=False) for part in (group, *rows)),
+                *values,
+            ]
             parts = max(1, min(count, AT_A_TIME * workers(), count * steps // LEAST_STEPS))
             ends = np.linspace(0, count, parts + 1).astype(int).tolist()
 
@@ -138,10 +137,10 @@ class Kernels:
             def run(part: tuple[int, int]) -> None:
                 device = self.devices[ends.index(part[0])]
                 own = slice(*part)
-                arrays = [wp.array(whole[own], dtype=kind, device=device) for whole, kind in rows]
-                given = [*self.of_groups[device], *arrays, *values, 0]
+                moved = [wp.array(whole[own], device=device) for whole in (group, *rows)]
+                given = [*self.of_groups[device], *moved, *values, 0]
                 wp.launch(kernel, dim=part[1] - part[0], inputs=given, device=device)
-                for (whole, _), array in zip(rows, arrays, strict=True):
+                for whole, array in zip(rows, moved[1:], strict=True):
                     whole[own] = array.numpy()
 
         parts = [part for part in pairwise(ends) if part[0] < part[1]]
