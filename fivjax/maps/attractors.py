@@ -1,7 +1,6 @@
-"""The attractors of a group: computed from where an ensemble of released trajectories nominates them.
+"""The attractors of groups: what is known of each, attractors added from where motions are, and who has come to which.
 
-What is found depends on the group alone: on no trajectory of the map, nor on their number. Cycles are computed
-(`captures`); what members trace that no cycle captures is tried as a torus (`tori`).
+Cycles are computed (`captures`); what motions trace that no cycle captures is tried as a torus (`tori`).
 """
 
 from typing import NamedTuple
@@ -9,20 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..verdicts.verdict import Verdict
 from .captures import CROSSINGS, NEARLY, Cycle, captured, distinct, is_new, stable_cycles
-from .flattened import Flattened
-from .following import begun, follow
-from .kernels import Kernels
 from .section import ReturnMaps, Section
-from .sharing import Batch
 from .tori import TUBES, Torus, reached, tori_from
 
-# Loads that the ensemble is released from, in final loads: its members have different energies. Where they come to may be an
-# attractor, and never is an unstable cycle, which is met by nobody.
-RELEASES = np.linspace(1.5, 6.0, 8)
-# Steps of an ensemble after which cycles are computed from where its members are, and how nearly they have to have come back.
-NEWTON_AT = {192: 0.1, 512: 0.03, 1024: 0.01}
 # Members of each group that are tried for a torus, one after the other.
 TRIED = 2
 
@@ -42,64 +31,6 @@ class Attractors(NamedTuple):
 
     def copy(self) -> "Attractors":
         return Attractors(list(self.cycles), list(self.tori))
-
-
-def search(
-    batch: Batch,
-    kernels: Kernels | None,
-    shared: Flattened,
-    maps: ReturnMaps,
-    groups: Int[np.ndarray, " g"],
-    columns: Float[np.ndarray, "g h"],
-    report,
-) -> list[Attractors]:
-    """The attractors of these groups. `columns` are the load's histories of any trajectory of each."""
-    members = len(RELEASES)
-    own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
-    # The ensemble's own states, not those of a trajectory.
-    each[:, len(batch.history) :] = np.nan
-    of_group = {int(g): Attractors([], []) for g in groups}
-    running, done = own, 0
-    trajectories = begun(batch, shared, own, each, np.tile(RELEASES, len(groups)))
-    for stop, nearly in NEWTON_AT.items():
-        if not len(running):
-            break
-        report(0)
-        follow(batch, kernels, shared, running, trajectories, stop - done)
-        done = stop
-        left = _left_by_cycles(maps, running, trajectories.tree[1], of_group, nearly)
-        running, trajectories = running[left], trajectories.compacted(left)
-    if len(running):
-        _add_tori(maps, running, trajectories.tree[1], of_group, report)
-    return list(of_group.values())
-
-
-def _left_by_cycles(
-    maps: ReturnMaps, group, now, of_group: dict[int, Attractors], nearly: float
-) -> Int[np.ndarray, " r"]:
-    """The members that are still in motion where no cycle captures them; adds cycles where members are by now."""
-    moving, latest, at = now.verdict == Verdict.UNDECIDED, np.array(now.crossing), section_of(now)
-    usable = moving & has_crossed(now)
-    captured_by = come_to(maps, group, at, latest, usable, of_group)
-    usable[list(captured_by)] = moving[list(captured_by)] = False
-    picked = distinct(maps.weights * latest, group, usable)
-    if len(picked) and np.any(add_cycles(maps, group[picked], at.rows(picked), of_group, nearly=nearly)):
-        moving[list(come_to(maps, group, at, latest, usable, of_group))] = False
-    return np.flatnonzero(moving)
-
-
-def _add_tori(maps: ReturnMaps, group, now, of_group: dict[int, Attractors], report) -> None:
-    """Adds the tori that members are on, and the cycles of those that are locked."""
-    latest, at, usable = np.array(now.crossing), section_of(now), has_crossed(now)
-    for _ in range(TRIED):
-        picked = distinct(maps.weights * latest, group, usable, most=1)
-        if not len(picked):
-            break
-        report(0)
-        add_tori(maps, group[picked], at.rows(picked), of_group, report)
-        usable[picked] = False
-        usable &= ~np.isin(group, [g for g, one in of_group.items() if one.locked])
-        usable[list(come_to(maps, group, at, latest, usable, of_group))] = False
 
 
 def add_cycles(
@@ -136,6 +67,30 @@ def add_tori(
         known[row].tori.append(torus)
     for row, cycle in locked:
         _add_cycle(maps, known[row], cycle)
+
+
+def add_tori_by_turns(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    latest: Float[np.ndarray, "m 2n"],
+    usable: Bool[np.ndarray, " m"],
+    of_group: dict[int, Attractors],
+    report,
+) -> None:
+    """The same from where the usable motions are, one of each group after the other, while there are some that none of the
+    known attractors captures. `latest` are their last crossings.
+    """
+    usable = usable.copy()
+    for _ in range(TRIED):
+        picked = distinct(maps.weights * latest, group, usable, most=1)
+        if not len(picked):
+            break
+        report(0)
+        add_tori(maps, group[picked], at.rows(picked), of_group, report)
+        usable[picked] = False
+        usable &= ~np.isin(group, [g for g, one in of_group.items() if one.locked])
+        usable[list(come_to(maps, group, at, latest, usable, of_group))] = False
 
 
 def _add_cycle(maps: ReturnMaps, known: Attractors, cycle: Cycle) -> None:

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from ..verdicts.verdict import Verdict
-from . import attractors
 from .at_last import fates
+from .attractor_search import ENSEMBLES, search
 from .attractors import Attractors, add_cycles, add_tori, come_to, has_crossed, section_of
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct
 from .conclusion import slide_forever
@@ -30,8 +30,6 @@ KNOWN_FROM = 4
 OWN_FROM, OWN_AGAIN = 16, 2
 # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long anyway.
 MORE_FROM = 64
-# Ensembles that are followed at once: the paths of motions that may be on tori take memory, some 0.2 MB each.
-ENSEMBLES = 256
 # How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
 LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 # Where a cycle is known that attracts slowly: for so many of its time constants, but not for more periods than so many.
@@ -147,13 +145,12 @@ class Basins:
         keys = [row.tobytes() for row in self.of_groups]
         _, first = np.unique(self.group, return_index=True)
         unknown = np.array([g for g in groups if keys[g] not in known], int)
-        for start in range(0, len(unknown), ENSEMBLES):
-            part = unknown[start : start + ENSEMBLES]
-            given = columns[first[part]]
-            found = attractors.search(self.batch, self.kernels, self.shared, self.maps, part, given, report)
-            known.update((keys[g], one) for g, one in zip(part, found, strict=True))
+        if len(unknown):
+            given = columns[first[unknown]]
+            found = search(self.batch, self.kernels, self.shared, self.maps, unknown, given, report)
+            known.update((keys[g], one) for g, one in zip(unknown, found, strict=True))
         for g in groups:
-            # What trajectories find by themselves is not of the group alone.
+            # Without what trajectories find by themselves.
             self.known[int(g)] = known[keys[g]].copy()
             self._wait_for_cycles(int(g))
 
