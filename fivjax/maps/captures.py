@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from ..contact import same_mode
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, Neighbourhood, Returned, Trial, neighbourhoods, side_by_side, trial
-from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .section import ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
@@ -78,13 +77,16 @@ def stable_cycles(
     # Of those that are the same, at whichever of its crossings, the first stands for all.
     kept: list[int] = []
     rows_of: list[list[int]] = []
-    for row in periodic:
-        for k, other in enumerate(kept):
-            same = group[near[other]] == group[near[row]] and lag[other] == lag[row]
-            if same and _passes(maps, closed.at.y[row], points_of[other]):
+    alike: dict[tuple[int, int], list[int]] = {}
+    for row, kind in zip(
+        periodic, zip(group[near[periodic]].tolist(), lag[periodic].tolist(), strict=True), strict=True
+    ):
+        for k in alike.setdefault(kind, []):
+            if _passes(maps, closed.at.y[row], points_of[kept[k]]):
                 rows_of[k].append(near[row])
                 break
         else:
+            alike[kind].append(len(kept))
             kept.append(row)
             rows_of.append([near[row]])
     before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
@@ -173,16 +175,8 @@ def _closed(maps: ReturnMaps, group, now: Section, lag) -> _Closed:
 
 
 def _trial(maps: ReturnMaps, closed: _Closed, row: int, crossings: int, many: bool) -> Trial | None:
-    structure = maps.structure
-    y, status, direction = closed.at.y[row], closed.at.status[row], closed.at.direction[row]
-    if len(structure.contacts) > 1:
-        places = np.asarray(maps.tangential), np.asarray(maps.normal)
-        basis = directions_of_several(maps.weights, maps.section, *places, status)
-    else:
-        status, direction = int(status), float(direction)
-        free = free_coordinates(structure.size, structure.tangential, structure.normal, status)
-        basis = np.eye(len(y))[:, free]
-    found = trial(y, status, direction, closed.jacobian[row], maps.weights, basis)
+    y, status, direction = closed.at.rows(row)
+    found = trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status))
     if found is not None and many:
         found = found._replace(smallest=SMALLEST_OF_MANY / LARGEST * found.largest)
     if found is not None and crossings > CROSSINGS:

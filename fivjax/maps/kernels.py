@@ -82,7 +82,7 @@ class Kernels:
             (numbers, self.types.mechanics),
             (np.array(prepared.interval), wp.float64),
         ]
-        self.devices = devices()
+        self.devices, self.threads = devices(), workers()
         self.of_groups = {
             device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups] for device in self.devices
         }
@@ -126,7 +126,7 @@ class Kernels:
                 *(wp.array(part, device="cpu", copy=False) for part in (group, *rows)),
                 *values,
             ]
-            parts = max(1, min(count, AT_A_TIME * workers(), count * steps // LEAST_STEPS))
+            parts = max(1, min(count, AT_A_TIME * self.threads, count * steps // LEAST_STEPS))
             ends = np.linspace(0, count, parts + 1).astype(int).tolist()
 
             def run(part: tuple[int, int]) -> None:

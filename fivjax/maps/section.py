@@ -5,12 +5,13 @@ trajectories of a map are followed by `Windowed`, so are these motions; derivati
 differences.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..contact import Contact, Status
 from ..cycles.around import peak_speed_along
@@ -21,7 +22,7 @@ from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import section_weights
 from ..steppers.windowed import Windowed
-from ..verdicts.free_directions import free_coordinates
+from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
@@ -97,6 +98,22 @@ class ReturnMaps:
         row[np.atleast_1d(self.tangential)] = section_weights(len(self.structure.contacts))
         return row
 
+    def free_directions(self, status: int | Int[np.ndarray, " c"]) -> Float[np.ndarray, "2n f"]:
+        """The weighted directions that the section and a contact mode leave free, as columns."""
+        if np.ndim(status):
+            places = np.asarray(self.tangential), np.asarray(self.normal)
+            return directions_of_several(self.weights, self.section, *places, status)
+        return np.eye(len(self.weights))[:, self.free[int(status)]]
+
+    @cached_property
+    def free(self) -> Bool[np.ndarray, "modes 2n"]:
+        """With one contact: which coordinates of a state on the section each contact mode leaves free."""
+        size = len(self.weights)
+        found = np.zeros((len(Status), size), bool)
+        for status in Status:
+            found[status, free_coordinates(size // 2, self.tangential, self.normal, status)] = True
+        return found
+
     def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:
         """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
         `peaks` are asked for. More than `KEPT` states are kept only if they are all of them.
@@ -167,11 +184,8 @@ class ReturnMaps:
     def _differences_of_few(self, group, at: Section, crossings):
         """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
         count, size = at.y.shape
-        free = np.zeros((len(Status), size), bool)
-        for status in Status:
-            free[status, free_coordinates(self.structure.size, self.tangential, self.normal, status)] = True
         lengths = np.linalg.norm(self.weights * at.y, axis=1)
-        row, place = np.nonzero(free[at.status])
+        row, place = np.nonzero(self.free[at.status])
         base = self.returns(group, at, crossings)
         derivatives = np.zeros((count, size, size))
         for step in STEPS:

@@ -46,6 +46,8 @@ from ..contact import same_mode
 
 # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
 MARGIN = 1e-6
+# Enough for the slowest decay within that margin: (1 - MARGIN / 2) to the power 2^DOUBLINGS is nothing.
+DOUBLINGS = 32
 # The largest and the smallest radius tried, relative to the cycle's size.
 LARGEST, SMALLEST = 0.5, 1e-8
 # Sizes of the ellipsoids on which the return map is checked, relative to the radius; and the number of directions on each.
@@ -94,16 +96,18 @@ ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], Re
 
 def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
     """A square root of $H$ (see the module's docstring) and the rate γ; None if the largest multiplier is too close to 1."""
-    from scipy.linalg import solve_discrete_lyapunov
-
     if not np.all(np.isfinite(derivative)):
         return None
     largest = np.max(np.abs(np.linalg.eigvals(derivative)), initial=0.0)
     if largest >= 1 - MARGIN:
         return None
     rate = 0.5 * (1 + largest)
-    scaled = derivative / rate
-    matrix = solve_discrete_lyapunov(scaled.T, np.eye(len(derivative)))
+    # The solution is a sum over all powers of the scaled derivative, whose number is doubled again and again.
+    power, matrix = derivative / rate, np.eye(len(derivative))
+    for _ in range(DOUBLINGS):
+        matrix, power = matrix + power.T @ matrix @ power, power @ power
+        if np.max(np.abs(power), initial=0.0) < np.finfo(float).eps:
+            break
     try:
         # NumPy gives the lower Cholesky factor; its transpose is the root that acts on columns.
         return np.linalg.cholesky(0.5 * (matrix + matrix.T)).T, rate
