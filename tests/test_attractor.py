@@ -192,7 +192,7 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
 def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
     """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
-    for place in ("attractors._add_tori", "rounds.add_tori"):
+    for place in ("attractors.add_tori", "rounds.add_tori"):
         monkeypatch.setattr(f"fivjax.maps.{place}", lambda *_: None)
     monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
     monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)

@@ -1,10 +1,12 @@
 """The search for the attractors of groups: from an ensemble of released trajectories, or from attractors of groups nearby.
 
-Groups of a map lie close together. So a few of them are searched from ensembles, and their attractors are continued to the
-others: a cycle by Newton's method, a torus by a motion that begins on it. Each is proved anew. Where nothing can be continued,
-there is an ensemble, too. What else a group may have is found by trajectories that nothing captures.
+Groups of a map lie close together. So a few of them are searched from ensembles, and their attractors seed the search in the
+others (`Grid.seeding`): a cycle is continued by Newton's method, a torus by a motion that begins on it. Each is proved anew.
+Where nothing can be continued, there is an ensemble, too. What else a group may have is found by trajectories that nothing
+captures.
 
-What is found depends on the groups that are searched together: on no trajectory of the map, nor on their number.
+What is found of a group depends on its parameters and on those of the group that seeds it: on no trajectory of the map, nor on
+their number, nor on who is in the same job.
 """
 
 import numpy as np
@@ -27,8 +29,6 @@ RELEASES = np.linspace(1.5, 6.0, 8)
 NEWTON_AT = {192: 0.1, 512: 0.03, 1024: 0.01}
 # Groups whose ensembles are followed at once: the paths of motions that may be on tori take memory, some 0.2 MB each.
 ENSEMBLES = 256
-# One in so many values of each parameter has ensembles, and attractors are continued over so many values at most.
-ONE_IN, REACH = 4, 8
 # Returns after which a motion from a cycle, or from a torus, nearby has come near to the one of its own group.
 NEAR_CYCLE, NEAR_TORUS = 32, 256
 
@@ -38,42 +38,29 @@ def search(
     kernels: Kernels | None,
     shared: Flattened,
     maps: ReturnMaps,
-    groups: Int[np.ndarray, " g"],
-    columns: Float[np.ndarray, "g h"],
+    seeds: dict[int, int],
+    columns: Float[np.ndarray, " h"],
+    found: dict[int, Attractors],
     report,
-) -> list[Attractors]:
-    """The attractors of these groups. `columns` are the load's histories of any trajectory of each."""
-    found = {int(g): Attractors([], []) for g in groups}
-
-    def by_ensembles(places: Int[np.ndarray, " r"]) -> None:
-        for start in range(0, len(places), ENSEMBLES):
-            part = places[start : start + ENSEMBLES]
-            _by_ensembles(batch, kernels, shared, maps, groups[part], columns[part], found, report)
-
-    first, nearest = first_of(shared.tree.values[groups])
-    by_ensembles(np.flatnonzero(first))
-    near = np.flatnonzero(~first & (nearest >= 0))
-    for start in range(0, len(near), ENSEMBLES):
-        part = near[start : start + ENSEMBLES]
-        _continued(maps, groups[part], groups[nearest[part]], found, report)
-    nothing = np.array([not (found[int(g)].cycles or found[int(g)].tori) for g in groups])
-    by_ensembles(np.flatnonzero(~first & nothing))
-    return list(found.values())
-
-
-def first_of(values: Float[np.ndarray, "g k"]) -> tuple[np.ndarray, Int[np.ndarray, " g"]]:
-    """Which groups, by their parameters, are searched first: those with every so-many-th value of each; and the nearest of
-    these to each group, or -1 where none is near.
+) -> None:
+    """Adds to those `found` the attractors of the groups in `seeds`, each with the group that seeds it: itself, where it is
+    searched from an ensemble. `columns` are the load's histories of any trajectory.
     """
-    ranks = np.stack([np.unique(column, return_inverse=True)[1] for column in values.T], axis=1, dtype=int)
-    first = np.all(ranks % ONE_IN == 0, axis=1)
-    places, nearest = np.flatnonzero(first), np.full(len(values), -1)
-    if len(places):
-        from scipy.spatial import KDTree
 
-        _, own = KDTree(ranks[places]).query(ranks, distance_upper_bound=REACH)
-        nearest = np.where(own < len(places), places[np.minimum(own, len(places) - 1)], -1)
-    return first, nearest
+    def by_ensembles(groups: list[int]) -> None:
+        for g in groups:
+            found[g] = Attractors([], [])
+        for start in range(0, len(groups), ENSEMBLES):
+            part = np.array(groups[start : start + ENSEMBLES])
+            _by_ensembles(batch, kernels, shared, maps, part, columns, found, report)
+
+    by_ensembles(sorted({seed for seed in seeds.values() if seed not in found}))
+    seeded = sorted(g for g in seeds if g not in found)
+    found |= {g: Attractors([], []) for g in seeded}
+    for start in range(0, len(seeded), ENSEMBLES):
+        part = seeded[start : start + ENSEMBLES]
+        _continued(maps, {g: seeds[g] for g in part}, found, report)
+    by_ensembles([g for g in seeded if not (found[g].cycles or found[g].tori)])
 
 
 def _by_ensembles(
@@ -82,13 +69,14 @@ def _by_ensembles(
     shared: Flattened,
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
-    columns: Float[np.ndarray, "g h"],
+    columns: Float[np.ndarray, " h"],
     found: dict[int, Attractors],
     report,
 ) -> None:
     """Adds the attractors to which trajectories come that are released at different energies."""
     members = len(RELEASES)
-    own, each = np.repeat(groups, members), np.repeat(columns, members, axis=0)
+    own = np.repeat(groups, members)
+    each = np.tile(columns, (len(own), 1))
     # The ensemble's own states, not those of a trajectory.
     each[:, len(batch.history) :] = np.nan
     of_group = {int(g): found[int(g)] for g in groups}
@@ -121,21 +109,15 @@ def _left_by_cycles(
     return np.flatnonzero(moving)
 
 
-def _continued(
-    maps: ReturnMaps,
-    groups: Int[np.ndarray, " g"],
-    neighbours: Int[np.ndarray, " g"],
-    found: dict[int, Attractors],
-    report,
-) -> None:
-    """Adds the attractors of these groups to which motions come that begin on those of a neighbour of each."""
+def _continued(maps: ReturnMaps, seeds: dict[int, int], found: dict[int, Attractors], report) -> None:
+    """Adds the attractors of these groups to which motions come that begin on those of the group that seeds each."""
     on_cycles, on_tori = [], []
-    for g, neighbour in zip(groups.tolist(), neighbours.tolist(), strict=True):
-        for cycle in found[neighbour].cycles:
+    for g, seed in seeds.items():
+        for cycle in found[seed].cycles:
             # Those of many crossings lie on tori.
             (on_cycles if len(cycle.points) <= CROSSINGS else on_tori).append((g, cycle.points[0]))
-        on_tori += [(g, torus.tube.states[-1] / maps.weights) for torus in found[neighbour].tori]
-    of_group = {int(g): found[int(g)] for g in groups}
+        on_tori += [(g, torus.tube.states[-1] / maps.weights) for torus in found[seed].tori]
+    of_group = {g: found[g] for g in seeds}
     report(0)
     group, at = _moved(maps, on_cycles, NEAR_CYCLE)
     near = add_cycles(maps, group, at, of_group, nearly=NEARLY) if len(group) else np.zeros(0, bool)

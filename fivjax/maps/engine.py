@@ -137,9 +137,10 @@ def _follow(
         found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
 
     def job(number: int) -> Job:
-        values = plan.trajectories.columns(plan.jobs[number])
-        keys = [row.tobytes() for row in grouped(values, tuple(plan.task.states))[0]] if attractors else []
-        return Job(plan.task, values, {key: attractors[key] for key in keys if key in attractors})
+        values, seeding = (part(plan.jobs[number]) for part in (plan.trajectories.columns, plan.trajectories.seeding))
+        own = grouped(values, tuple(plan.task.states))[0] if attractors else np.zeros((0, seeding.shape[1]))
+        keys = {row.tobytes() for row in (*own, *np.unique(seeding, axis=0))}
+        return Job(plan.task, values, seeding, {key: attractors[key] for key in keys & attractors.keys()})
 
     def write(number: int, results: Verdicts) -> None:
         for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(results), strict=True):

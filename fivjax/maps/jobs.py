@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
@@ -38,10 +39,11 @@ class Task(NamedTuple):
 
 
 class Job(NamedTuple):
-    """Some trajectories of a run, and the known attractors of their groups."""
+    """Some trajectories of a run, and the known attractors of their groups and of those that seed these."""
 
     task: Task
     values: dict[str, np.ndarray]
+    seeding: Float[np.ndarray, "r k"]  # see `Grid.seeding`
     known: dict[bytes, Attractors]
 
 
@@ -86,6 +88,7 @@ def run_job(
         rounds.follow_all(
             batch,
             job.values,
+            job.seeding,
             tuple(task.states),
             known,
             task.t_max,

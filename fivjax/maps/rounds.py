@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..verdicts.verdict import Verdict
 from .at_last import fates
@@ -41,6 +42,7 @@ LOOKS = 8
 def follow_all(
     batch: Batch,
     values: dict[str, np.ndarray],
+    seeding: Float[np.ndarray, "r k"],
     states: tuple[str, ...],
     known: dict[bytes, Attractors],
     t_max: float | None,
@@ -51,12 +53,15 @@ def follow_all(
 ) -> None:
     """Follow trajectories that fit in memory together; writes the results of those not run yet at `index`.
 
+    `seeding` has the parameters of the group whose attractors seed the search in the group of each.
+
     `states` are the names of `values` that are initial displacements and velocities.
 
     `known` has the attractors of groups, by the group's parameters, and gets those that are found; `report` is told how many
     have ended.
     """
     of_groups, group = grouped(values, states)
+    of_groups, seeds = with_seeding(of_groups, seeding[np.unique(group, return_index=True)[1]])
     if batch.by_kernel:
         begin_building(batch)
     shared = shared_by(batch, of_groups)
@@ -67,7 +72,7 @@ def follow_all(
     if batch.by_kernel and len(pending):
         compile_conclusions(batch, shared, trajectories)
     kernels = Kernels(shared, batch.pool) if batch.by_kernel else None
-    basins = Basins(batch, shared, kernels, of_groups, group)
+    basins = Basins(batch, shared, kernels, of_groups, group, seeds)
     known_from = KNOWN_FROM * batch.method.round
     own_from = OWN_FROM * batch.method.round
     limit = np.maximum(LEAST_TIME, LEAST_PERIODS * shared.tree.modes.slowest_period) if t_max is None else t_max
@@ -110,6 +115,20 @@ def follow_all(
         done += steps
 
 
+def with_seeding(
+    of_groups: Float[np.ndarray, "g k"], seeding: Float[np.ndarray, "g k"]
+) -> tuple[Float[np.ndarray, "more k"], Int[np.ndarray, " g"]]:
+    """The parameters of groups, followed by those of other groups that seed some of them; and which one seeds each."""
+    place = {row.tobytes(): g for g, row in enumerate(of_groups)}
+    more: list[np.ndarray] = []
+    for row in seeding:
+        if row.tobytes() not in place:
+            place[row.tobytes()] = len(place)
+            more.append(row)
+    seeds = np.array([place[row.tobytes()] for row in seeding], int)
+    return np.concatenate([of_groups, np.array(more).reshape(-1, of_groups.shape[1])]), seeds
+
+
 def _rows(tree, chosen: np.ndarray):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], tree)
 
@@ -129,9 +148,16 @@ class Basins:
     """The attractors of the groups that are followed together, and which trajectories have entered where they capture."""
 
     def __init__(
-        self, batch: Batch, shared: Flattened, kernels: Kernels | None, of_groups: np.ndarray, group: np.ndarray
+        self,
+        batch: Batch,
+        shared: Flattened,
+        kernels: Kernels | None,
+        of_groups: np.ndarray,
+        group: np.ndarray,
+        seeds: Int[np.ndarray, " g"],
     ):
         self.batch, self.shared, self.kernels, self.of_groups, self.group = batch, shared, kernels, of_groups, group
+        self.seeds = seeds
         self.maps: ReturnMaps | None = None
         self.known: dict[int, Attractors] = {}
         # Those of each group when the time of its trajectories is over.
@@ -143,12 +169,11 @@ class Basins:
         """Finds the attractors of these groups, where they are not `known`."""
         self.maps = ReturnMaps(self.batch, self.shared, self.kernels)
         keys = [row.tobytes() for row in self.of_groups]
-        _, first = np.unique(self.group, return_index=True)
-        unknown = np.array([g for g in groups if keys[g] not in known], int)
-        if len(unknown):
-            given = columns[first[unknown]]
-            found = search(self.batch, self.kernels, self.shared, self.maps, unknown, given, report)
-            known.update((keys[g], one) for g, one in zip(unknown, found, strict=True))
+        seeds = {int(g): int(self.seeds[g]) for g in groups if keys[g] not in known}
+        found = {g: known[keys[g]] for g in {*seeds, *seeds.values()} if keys[g] in known}
+        # Ensembles are released after all kicks, so any of these will do.
+        search(self.batch, self.kernels, self.shared, self.maps, seeds, columns[0], found, report)
+        known.update((keys[g], one) for g, one in found.items())
         for g in groups:
             # Without what trajectories find by themselves.
             self.known[int(g)] = known[keys[g]].copy()

@@ -5,14 +5,18 @@ Trajectories of a group (`sharing`) share data, above all their attractors, so a
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .sharing import HISTORY, grouped
 
 # Indices of trajectories in a run; those of one job, for instance.
 Places = Int[np.ndarray, " r"]
+# Attractors are computed from scratch for one in so many values of each parameter, and continued from there to the values that
+# follow, if these differ by no more than this share (`attractor_search`).
+SEEDING, SEEDED_WITHIN = 4, 0.2
 
 
 class Grid(Mapping):
@@ -39,6 +43,17 @@ class Grid(Mapping):
         """The values of these trajectories, by name."""
         index = np.unravel_index(places, self.shape)
         return {name: values[own] for (name, values), own in zip(self.axes.items(), index, strict=True)}
+
+    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+        """The parameters of the group whose attractors seed the search in the group of each of these trajectories: its own,
+        where that is searched from scratch. It follows from the whole grid, not from `places`.
+        """
+        index = np.unravel_index(places, self.shape)
+        columns = [(list(self.axes.values())[k], index[k]) for k in self.across]
+        if not columns:
+            return np.zeros((len(places), 0))
+        own = np.stack([values[at] for values, at in columns], axis=-1)
+        return _near_enough(own, np.stack([values[at - at % SEEDING] for values, at in columns], axis=-1))
 
     def groups(self, places: Places) -> Int[np.ndarray, " r"]:
         """The group of each of these trajectories."""
@@ -73,12 +88,26 @@ class Listed:
     def __init__(self, values: Mapping[str, np.ndarray], states: Sequence[str] = ()):
         self.values = dict(values)
         self.total = len(next(iter(values.values())))
-        distinct, self._group = grouped(self.values, states)
-        self.group_count = len(distinct)
+        self._distinct, self._group = grouped(self.values, states)
+        self.group_count = len(self._distinct)
 
     def columns(self, places: Places) -> dict[str, np.ndarray]:
         """The values of these trajectories, by name."""
         return {name: column[places] for name, column in self.values.items()}
+
+    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+        """As for a grid; a group for which there is none of the run is searched from scratch."""
+        return self._seeding[self._group[places]]
+
+    @cached_property
+    def _seeding(self) -> Float[np.ndarray, "g k"]:
+        own = self._distinct
+        if not own.shape[1]:
+            return own
+        ranks = np.stack([np.unique(column, return_inverse=True)[1] for column in own.T], axis=-1)
+        place = {tuple(rank): k for k, rank in enumerate(ranks.tolist())}
+        wanted = (ranks - ranks % SEEDING).tolist()
+        return _near_enough(own, own[[place.get(tuple(rank), k) for k, rank in enumerate(wanted)]])
 
     def groups(self, places: Places) -> Int[np.ndarray, " r"]:
         """The group of each of these trajectories."""
@@ -88,6 +117,12 @@ class Listed:
         """These trajectories (all, unless given) divided into jobs, group by group."""
         places = np.arange(self.total) if places is None else places
         return cut(self._group[places], places, most)
+
+
+def _near_enough(own: Float[np.ndarray, "r k"], other: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+    """The other parameters where they differ little from the own ones, else the own ones."""
+    near = np.all(np.abs(other - own) <= SEEDED_WITHIN * np.abs(own), axis=1)
+    return np.where(near[:, None], other, own)
 
 
 class Tiles(Sequence):
