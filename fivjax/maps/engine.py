@@ -137,7 +137,8 @@ def _follow(
         found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
 
     def job(number: int) -> Job:
-        values, seeding = (part(plan.jobs[number]) for part in (plan.trajectories.columns, plan.trajectories.seeding))
+        values = plan.trajectories.columns(plan.jobs[number])
+        seeding = plan.trajectories.seeding(plan.jobs[number])
         own = grouped(values, tuple(plan.task.states))[0] if attractors else np.zeros((0, seeding.shape[1]))
         keys = {row.tobytes() for row in (*own, *np.unique(seeding, axis=0))}
         return Job(plan.task, values, seeding, {key: attractors[key] for key in keys & attractors.keys()})

@@ -126,7 +126,7 @@ def with_seeding(
             place[row.tobytes()] = len(place)
             more.append(row)
     seeds = np.array([place[row.tobytes()] for row in seeding], int)
-    return np.concatenate([of_groups, np.array(more).reshape(-1, of_groups.shape[1])]), seeds
+    return np.concatenate([of_groups, np.array(more).reshape(len(more), of_groups.shape[1])]), seeds
 
 
 def _rows(tree, chosen: np.ndarray):
