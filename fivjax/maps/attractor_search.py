@@ -133,4 +133,5 @@ def _moved(maps: ReturnMaps, starts: list, returns: int) -> tuple[Int[np.ndarray
     """The groups of these starts on the section, and where motions from there are after so many returns."""
     group = np.array([g for g, _ in starts], int)
     y = np.array([y for _, y in starts]).reshape(len(starts), len(maps.weights))
-    return group, maps.returns(group, section_at(y, maps.normal, maps.sliding[group]), returns).at
+    at = section_at(y, maps.normal, maps.sliding[group])
+    return group, maps.returns(group, at, returns).at if starts else at
