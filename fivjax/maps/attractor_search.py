@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from ..verdicts.verdict import Verdict
 from .attractors import Attractors, add_cycles, add_tori_by_turns, come_to, has_crossed, section_of
-from .captures import CROSSINGS, NEARLY, distinct
+from .captures import CROSSINGS, distinct
 from .flattened import Flattened
 from .following import begun, follow
 from .kernels import Kernels
@@ -120,7 +120,7 @@ def _continued(maps: ReturnMaps, seeds: dict[int, int], found: dict[int, Attract
     of_group = {g: found[g] for g in seeds}
     report(0)
     group, at = _moved(maps, on_cycles, NEAR_CYCLE)
-    near = add_cycles(maps, group, at, of_group, nearly=NEARLY) if len(group) else np.zeros(0, bool)
+    near = add_cycles(maps, group, at, of_group) if len(group) else np.zeros(0, bool)
     further, on_torus = _moved(maps, on_tori, NEAR_TORUS)
     group = np.concatenate([group[~near], further])
     at = Section(*(np.concatenate(parts) for parts in zip(at.rows(~near), on_torus, strict=True)))

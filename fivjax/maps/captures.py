@@ -78,9 +78,8 @@ def stable_cycles(
     kept: list[int] = []
     rows_of: list[list[int]] = []
     alike: dict[tuple[int, int], list[int]] = {}
-    for row, kind in zip(
-        periodic, zip(group[near[periodic]].tolist(), lag[periodic].tolist(), strict=True), strict=True
-    ):
+    for row in periodic:
+        kind = int(group[near[row]]), int(lag[row])
         for k in alike.setdefault(kind, []):
             if _passes(maps, closed.at.y[row], points_of[kept[k]]):
                 rows_of[k].append(near[row])

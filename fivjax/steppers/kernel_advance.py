@@ -49,13 +49,8 @@ def stepping(form: Form) -> Stepping:
     of = arithmetic(n, like.tangential, like.normal, t)
     row_of, block, sample, hull, sizes = of.row_of, of.block, of.sample, of.hull, of.sizes
     guard_series, guard, series, speed_series = of.guard_series, of.guard, of.series, of.speed_series
-    scan, speeds_in, speed_and_bend, value_at, state_at = (
-        of.scan,
-        of.speeds,
-        of.speed_and_bend,
-        of.value_at,
-        of.state_at,
-    )
+    scan, speeds_in, speed_and_bend = of.scan, of.speeds, of.speed_and_bend
+    value_at, state_at = of.value_at, of.state_at
     lowest_of, root_of, rise_of, highest_of = roots(t, of)
     state, row, pair = t.state, t.row, t.pair
     mode_of, ending, one_number = t.mode, t.ending, t.one
