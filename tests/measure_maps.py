@@ -147,7 +147,7 @@ def axes() -> None:
 
 
 def without_kernels(points: int):
-    with mock.patch("fivjax.maps.sharing.is_installed", return_value=False):
+    with mock.patch("fivjax.batches.sharing.is_installed", return_value=False):
         return paper_map(points)
 
 
@@ -284,9 +284,9 @@ def kernel_step() -> float:
     """The time (s) of one step of trajectories that stay in motion, by a kernel on one core."""
     import jax
 
-    from fivjax.maps.following import begun
-    from fivjax.maps.kernels import Kernels
-    from fivjax.maps.sharing import Batch, shared_by
+    from fivjax.batches.following import begun
+    from fivjax.batches.kernels import Kernels
+    from fivjax.batches.sharing import Batch, shared_by
     from fivjax.steppers.windowed import Windowed
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600

@@ -5,9 +5,9 @@ import pytest
 import reference
 
 import fivjax as fj
-from fivjax.maps.captures import CROSSINGS, Cycle
-from fivjax.maps.section import Section
-from fivjax.maps.tori import (
+from fivjax.batches.captures import CROSSINGS, Cycle
+from fivjax.batches.section import Section
+from fivjax.batches.tori import (
     LONGER,
     TRACED,
     Torus,
@@ -193,9 +193,9 @@ def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monk
     """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     for place in ("attractors.add_tori", "rounds.add_tori"):
-        monkeypatch.setattr(f"fivjax.maps.{place}", lambda *_: None)
-    monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
-    monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)
+        monkeypatch.setattr(f"fivjax.batches.{place}", lambda *_: None)
+    monkeypatch.setattr("fivjax.batches.rounds.LEAST_TIME", 2.0)
+    monkeypatch.setattr("fivjax.batches.rounds.LEAST_PERIODS", 1.0)
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
     assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0

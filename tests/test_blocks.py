@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from fivjax.foundation.kept_programs import kept
-from fivjax.maps.blocks import in_blocks
-from fivjax.maps.flattened import flatten
+from fivjax.batches.blocks import in_blocks
+from fivjax.batches.flattened import flatten
 
 used = set()
 

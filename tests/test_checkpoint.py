@@ -13,9 +13,10 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.maps import checkpoint, plan, rounds
-from fivjax.maps.kernels import Kernels
-from fivjax.maps.results import Ended, not_run, record
+from fivjax.batches import rounds
+from fivjax.batches.kernels import Kernels
+from fivjax.batches.results import Ended, not_run, record
+from fivjax.maps import checkpoint, plan
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 

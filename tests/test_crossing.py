@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps import bistability, engine, rounds, threshold
+from fivjax.batches import rounds
+from fivjax.batches.results import counted, not_run
+from fivjax.maps import bistability, engine, threshold
 from fivjax.maps.crossing import first_crossings
-from fivjax.maps.results import counted, not_run
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 

@@ -20,9 +20,9 @@ FLOORS = (
     ("simulation",),
     ("cycles",),
     ("verdicts",),
-    ("maps", "calibration"),
-    ("plot", "design"),
-    ("paper", "notebook"),
+    ("batches", "calibration"),
+    ("maps", "plot"),
+    ("design", "paper", "notebook"),
 )
 LONGEST, MEDIAN = 400, 150
 # Modules that are too long and are being divided; the list may only shrink.

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.batches.flattened import flatten
 from fivjax.contact import Contact
 from fivjax.foundation import kept_programs
 from fivjax.foundation.kept_programs import kept, kept_value
-from fivjax.maps.flattened import flatten
 
 
 class Counted:

@@ -8,9 +8,9 @@ import pytest
 from test_simulate import CASES, scene_of
 
 import fivjax as fj
+from fivjax.batches.progress import next_step_end
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
 from fivjax.foundation.compiling import compiled
-from fivjax.maps.progress import next_step_end
 from fivjax.steppers.windowed import Windowed
 
 

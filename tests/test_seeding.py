@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps import attractor_search, trajectories
+from fivjax.batches import attractor_search
+from fivjax.maps import trajectories
 from fivjax.maps.trajectories import Grid, Listed
 
 MUS = np.linspace(0.2, 0.227, 7)

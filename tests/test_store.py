@@ -8,10 +8,10 @@ import stand_in_jobs
 import xarray as xr
 
 import fivjax as fj
+from fivjax.batches.attractors import Attractors, Torus
+from fivjax.batches.captures import Cycle
 from fivjax.maps import engine, plan
 from fivjax.maps.attractor_files import from_bytes, to_bytes
-from fivjax.maps.attractors import Attractors, Torus
-from fivjax.maps.captures import Cycle
 from fivjax.verdicts.capture import Neighbourhood
 from fivjax.verdicts.tube import Tube
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.batches.kernels import Kernels
+from fivjax.batches.section import ReturnMaps, Section
+from fivjax.batches.sharing import Batch, shared_by
+from fivjax.batches.tori import section_at
 from fivjax.contact import Contact
 from fivjax.foundation.compiling import compiled
-from fivjax.maps.kernels import Kernels
-from fivjax.maps.section import ReturnMaps, Section
-from fivjax.maps.sharing import Batch, shared_by
-from fivjax.maps.tori import section_at
 from fivjax.steppers.windowed import Windowed
 
 CROSSINGS = 6

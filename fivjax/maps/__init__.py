@@ -1,1 +1,1 @@
-"""Many trajectories, each followed to its verdict: maps, basins, critical kicks, and the cost of accuracy."""
+"""Maps and basins, critical kicks, the cost of accuracy; and the jobs, executors and stores that run them."""

@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 
+from ..batches.attractors import Attractors, Torus
+from ..batches.captures import Cycle
 from ..verdicts.capture import Neighbourhood
 from ..verdicts.tube import Tube
-from .attractors import Attractors, Torus
-from .captures import Cycle
 
 
 def to_bytes(found: dict[bytes, Attractors]) -> bytes:

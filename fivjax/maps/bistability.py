@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from ..batches.results import Verdicts
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
@@ -18,7 +19,6 @@ from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .executors import with_workers
 from .refinement import audit_note, finer, refined
-from .results import Verdicts
 from .resuming import keeper_at
 
 

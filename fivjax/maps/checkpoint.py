@@ -15,10 +15,10 @@ import jax
 import numpy as np
 import xarray as xr
 
+from ..batches.attractors import Attractors
+from ..batches.results import Verdicts, by_name, not_run
 from ..io.datasets import check_writable, save
 from .attractor_files import from_bytes, to_bytes
-from .attractors import Attractors
-from .results import Verdicts, by_name, not_run
 from .trajectories import Places
 
 KIND = "fivjax checkpoint"

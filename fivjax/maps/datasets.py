@@ -5,6 +5,8 @@ import json
 import numpy as np
 import xarray as xr
 
+from ..batches.results import CHAOTIC, Verdicts
+from ..batches.sharing import kernels_by
 from ..io.datasets import labelled
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -13,8 +15,6 @@ from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
 from .crossing import first_crossings
 from .refinement import Refined
-from .results import CHAOTIC, Verdicts
-from .sharing import kernels_by
 from .trajectories import Grid
 
 

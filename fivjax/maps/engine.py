@@ -16,18 +16,18 @@ import jax
 import numpy as np
 from tqdm.auto import tqdm
 
+from ..batches.attractors import Attractors
+from ..batches.blocks import workers as cores
+from ..batches.results import Verdicts, counted, not_run
+from ..batches.sharing import grouped
 from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
-from .attractors import Attractors
-from .blocks import workers as cores
 from .executors import Workers
 from .handing_out import hand_out
 from .jobs import Done, Job, run_job
 from .plan import Plan, planned
-from .results import Verdicts, counted, not_run
-from .sharing import grouped
 from .trajectories import Places
 
 # The most steps of a trajectory: enough for 10⁵ cycles with their events; a map of such trajectories takes hours.

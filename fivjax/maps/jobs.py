@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..batches import rounds
+from ..batches.attractors import Attractors
+from ..batches.results import Verdicts, not_run
+from ..batches.sharing import Batch
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.windowed import Windowed
-from . import rounds
-from .attractors import Attractors
-from .results import Verdicts, not_run
-from .sharing import Batch
 
 
 class Task(NamedTuple):

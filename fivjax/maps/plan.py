@@ -9,12 +9,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ..batches.blocks import MANY
+from ..batches.sharing import HISTORY, bytes_per_trajectory, in_bulk
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.windowed import Windowed
-from .blocks import MANY
 from .jobs import Task
-from .sharing import HISTORY, bytes_per_trajectory, in_bulk
 from .trajectories import Grid, Listed, Places
 
 # Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.

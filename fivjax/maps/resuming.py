@@ -5,13 +5,13 @@ from pathlib import Path
 
 import jax
 
+from ..batches.sharing import bytes_per_trajectory, in_bulk, kernels_by
 from ..foundation import arguments
 from ..io.datasets import describe
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .plan import in_a_job
-from .sharing import bytes_per_trajectory, in_bulk, kernels_by
 from .store import Store, is_store
 from .trajectories import Grid
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..batches.attractors import Attractors
 from ..cycles.stable_manifold import Saddle, manifold_normal
 from ..model.scene import Scene
-from .attractors import Attractors
 from .crossing import Crossing, first_crossings, with_ends
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .states import verdicts_from

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..batches.attractors import Attractors
 from ..cycles.cycle import under_final_load
 from ..model.scene import Scene
 from ..model.structure import Structure
 from ..steppers.event_exact import EventExact
-from .attractors import Attractors
 from .engine import run_to_verdict
 
 

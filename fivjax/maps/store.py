@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..batches.attractors import Attractors
+from ..batches.results import Verdicts, by_name, not_run
 from ..io.files import check_writable
 from .attractor_files import from_bytes, to_bytes
-from .attractors import Attractors
 from .checkpoint import refuse_other_run
-from .results import Verdicts, by_name, not_run
 from .trajectories import Grid, Places, Tiles
 
 KIND = "fivjax store"

@@ -36,7 +36,7 @@ def programs(form: Form) -> Programs:
     state, mode_type, numbers = of.types.state, of.types.mode, of.types.mechanics
     size, columns_type = state._length_, wp.types.vector(9, int)
     zero, infinite = real(0.0), real(np.inf)
-    module = wp.get_module(f"fivjax.maps.kernels.{of.name}")
+    module = wp.get_module(f"fivjax.batches.kernels.{of.name}")
     # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster.
     flags = f"{wp.config.cpu_compiler_flags or ''} -O3 -ffp-contract=fast".strip()
     module.options.update(max_unroll=1, cpu_compiler_flags=flags)
