@@ -166,7 +166,7 @@ def _with_kills(name: str, executor, computing=_computing) -> None:
     keep = Store.keep
 
     def counting(self, places, verdicts, found):
-        written.update(self.tiles.holding(places).tolist())
+        written.update(set(self.tiles.holding(places).tolist()))
         keep(self, places, verdicts, found)
 
     def kill():

@@ -36,7 +36,7 @@ LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 # Where a cycle is known that attracts slowly: for so many of its time constants, but not for more periods than so many.
 TIME_CONSTANTS, MOST_PERIODS = 12.0, 20000.0
 # Looks at a trajectory's verdict while its time grows e-fold.
-LOOKS = 8
+LOOKS = 5
 
 
 def follow_all(
