@@ -5,16 +5,19 @@ certain to fade, or for ten thousand periods.
     python tests/measure_verdicts.py cases [ghost] [invented] [single] [kick] [growth] [amplitudes]
     python tests/measure_verdicts.py folds [--kicks K]
     python tests/measure_verdicts.py maps [--side N]
+    python tests/measure_verdicts.py tori [--structures N] [--kicks K] [--seed S]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value; a
 disagreement counts unless the reference itself says otherwise of a kick that differs by 1e-14 to 1e-11;
 `folds` tries friction just below that at which the paper's limit cycle ends; `maps` the paper's map at belt speeds 1 and
-0.5; `cases` scenes that once had wrong verdicts. `--threads` is for the reference only.
+0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `cases` scenes that once had
+wrong verdicts. `--threads` is for the reference only.
 """
 
 import argparse
 import dataclasses
 import time
+from collections import Counter
 
 import numpy as np
 import reference
@@ -287,6 +290,22 @@ def folds(kicks, threads):
     print(f"called limit cycle {total.cycles}, wrongly {total.false_cycles}")
 
 
+def tori(structures, kicks, seed, threads):
+    """Oscillators about the paper's, on belts so fast that many limit cycles are tori: small maps over friction and kick."""
+    rng = np.random.default_rng(seed)
+    tally, kinds = Tally(), Counter()
+    for i in range(structures):
+        parts = {"m1": 0.53, "m2": 0.045, "c1": 1.0, "c2": 1.0, "k1": 100e3, "k2": 101e3}
+        parts = {name: float(value * np.exp(rng.uniform(-0.2, 0.2))) for name, value in parts.items()}
+        mu, v = float(rng.uniform(0.03, 0.2)), float(rng.uniform(2.0, 6.0))
+        axes = {"mu": mu * np.linspace(1.0, 1.05, 3), "p": np.sort(rng.uniform(1.0, 6.0, kicks))}
+        found, _ = compare(tally, paper(mu, v, **parts), False, f"[{i}] v={v!r} {parts}", threads, **axes)
+        captured = found["attractor"].values[found["attractor"].values >= 0]
+        kinds.update(found["attractor_kind"].values[captured].tolist())
+    tally.show()
+    print(f"trajectories by attractor: {dict(kinds)}")
+
+
 def maps(side, threads):
     """The paper's map at two more belt speeds."""
     for v in (1.0, 0.5):
@@ -403,7 +422,7 @@ def cases(names):
 def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["random", "cases", "folds", "maps"])
+    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori"])
     parser.add_argument("names", nargs="*", choices=[[], *CASES], help="which cases")
     parser.add_argument("--structures", type=int, default=500)
     parser.add_argument("--kicks", type=int, default=40)
@@ -413,6 +432,8 @@ def main():
     chosen = parser.parse_args()
     if chosen.study == "random":
         random(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
+    elif chosen.study == "tori":
+        tori(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
     elif chosen.study == "folds":
         folds(chosen.kicks, chosen.threads)
     elif chosen.study == "maps":

@@ -33,7 +33,7 @@ REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
 # slow fade there is a direction in which they come back hardly at all. The first few starts tell most sets that do not attract.
 BACK_WITHIN, BACK_TO, FIRST = 1536, 0.25, 4
 # Starts about a torus that are followed further. In chaos neighbours part by so much per return, and more.
-FURTHER, PARTING = 8, 0.05
+FURTHER, PARTING = 4, 0.05
 # Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
 LOCKED = -0.01
 # On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to

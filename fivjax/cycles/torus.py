@@ -157,7 +157,8 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
 
 def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray, "*m"]:
     """The root mean square distance of points from their mean."""
-    return np.sqrt(np.mean(np.sum((weighted - np.mean(weighted, axis=0)) ** 2, axis=-1), axis=0))
+    away = weighted - np.mean(weighted, axis=0)
+    return np.sqrt(np.einsum("k...j,k...j->...", away, away) / len(away))
 
 
 def drifts(weighted: Float[np.ndarray, "k *m state"], share: float = DRIFT) -> Bool[np.ndarray, "*m"]:

@@ -21,8 +21,8 @@ from .trajectories import Grid, Listed, Places
 SIDE_BY_SIDE = 16
 # The cost of a trajectory in a row of its own, relative to one in a full row.
 COST_OF_STANDING_ALONE = 4
-# The most trajectories of a job, with `Windowed` and with other steppers: a second or two of work, because an interrupt loses as
-# much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
+# The most trajectories of a job, with `Windowed` and with other steppers: a second or two of work, because an interrupt loses
+# as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
 GROUPS_IN_A_JOB = 512
