@@ -6,7 +6,7 @@ import reference
 
 import fivjax as fj
 from fivjax.batches.captures import CROSSINGS, Cycle
-from fivjax.batches.section import Section
+from fivjax.batches.return_maps import Section
 from fivjax.batches.tori import (
     LONGER,
     TRACED,

@@ -9,7 +9,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.batches.kernels import Kernels
-from fivjax.batches.section import ReturnMaps, Section
+from fivjax.batches.return_maps import ReturnMaps, Section
 from fivjax.batches.sharing import Batch, shared_by
 from fivjax.batches.tori import section_at
 from fivjax.contact import Contact

@@ -18,7 +18,7 @@ from .captures import CROSSINGS, distinct
 from .flattened import Flattened
 from .following import begun, follow
 from .kernels import Kernels
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 from .sharing import Batch
 from .tori import section_at
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .captures import CROSSINGS, NEARLY, Cycle, captured, distinct, is_new, stable_cycles
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 from .tori import TUBES, Torus, reached, tori_from
 
 # Members of each group that are tried for a torus, one after the other.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ..contact import same_mode
 from ..cycles.closing import CLOSED, EXACT
 from ..verdicts.capture import LARGEST, Neighbourhood, Returned, Trial, neighbourhoods, side_by_side, trial
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 
 # A motion that comes back to within this share of its size after some crossings may be near a cycle.
 NEARLY = 0.1

@@ -16,7 +16,7 @@ from ..verdicts.verdict import Verdict
 from .blocks import in_blocks
 from .flattened import Flattened, flatten
 from .progress import Progress, Setting
-from .section import BLOCK, Section, of_block
+from .return_maps import BLOCK, Section, of_block
 
 # A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
 GROWTH = 1e9

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 
 # Over so many returns, again and again, it is asked whether neighbours part: the first turn directions to where they grow. On a
 # torus they part no faster than linearly; in chaos exponentially.

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..verdicts.verdict import Verdict
-from .at_last import fates
 from .attractor_search import ENSEMBLES, search
 from .attractors import Attractors, add_cycles, add_tori, come_to, has_crossed, section_of
 from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct
@@ -21,9 +20,10 @@ from .following import begun, compile_conclusions, follow
 from .kernels import Kernels, begin_building
 from .parting import followed_on
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
-from .section import ReturnMaps
+from .return_maps import ReturnMaps
 from .sharing import Batch, grouped, shared_by
 from .tori import TUBES, Torus
+from .uncaptured import fates
 
 # Rounds after which the attractors of the groups of those that are undecided are computed.
 KNOWN_FROM = 4

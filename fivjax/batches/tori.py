@@ -13,7 +13,7 @@ from ..verdicts import tube
 from ..verdicts.tube import Tube, thinned, tree_of
 from .captures import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 
 # Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
 TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))

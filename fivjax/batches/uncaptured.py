@@ -14,7 +14,7 @@ from ..verdicts.tube import HOME
 from .attractors import Attractors, add_cycles, add_tori, come_to
 from .captures import MORE_CROSSINGS, Cycle, distinct
 from .parting import followed_on
-from .section import ReturnMaps, Section
+from .return_maps import ReturnMaps, Section
 from .tori import AT_A_TIME, TUBES, Torus, is_drifting
 
 # Crossings of cycles on which neighbours close in.
