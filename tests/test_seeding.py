@@ -1,7 +1,5 @@
 """Attractors continued from group to group: which groups seed which, and that what is found is what ensembles find."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -59,9 +57,3 @@ def test_where_nothing_can_be_continued_there_is_an_ensemble(paper_scene, monkey
     monkeypatch.setattr(attractor_search, "_continued", lambda *_: None)
     m = fj.bistability_map(paper_scene.replace(belt_speed=1.0), mu=MUS[:2], p=[2.0], progress=False)
     assert m["verdict"].values.tolist() == [[1], [1]] and len(m["attractor_period"]) == 2
-
-
-def test_without_anything_to_continue_no_motion_is_followed():
-    maps = SimpleNamespace(weights=np.ones(6), normal=2, sliding=np.ones(3), returns=None)
-    group, at = attractor_search._moved(maps, [], 5)
-    assert group.shape == (0,) and at.y.shape == (0, 6) and at.status.shape == at.direction.shape == (0,)

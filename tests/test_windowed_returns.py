@@ -64,6 +64,14 @@ def test_crossings_are_the_series_stepper_s(maps, exactly, starts):
     assert np.all(np.isnan(found.path[:, 0]))
 
 
+def test_of_no_states_there_are_no_images(maps, exactly, starts):
+    group, at = starts
+    for one in (maps, exactly):
+        found = one.returns(group[:0], at.rows(slice(0)), CROSSINGS, kept=CROSSINGS)
+        assert found.path.shape == (0, CROSSINGS, 6)
+        assert all(len(part) == 0 for part in (*found.at, found.events, found.time, found.peak))
+
+
 @pytest.mark.slow
 def test_the_peak_on_the_way_is_known_to_rounding(maps, exactly, starts):
     """By the series stepper, which is compiled for it; `test_attractor` compares amplitudes with an independent solver."""

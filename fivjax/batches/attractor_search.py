@@ -120,7 +120,7 @@ def _continued(maps: ReturnMaps, seeds: dict[int, int], found: dict[int, Attract
     of_group = {g: found[g] for g in seeds}
     report(0)
     group, at = _moved(maps, on_cycles, NEAR_CYCLE)
-    near = add_cycles(maps, group, at, of_group) if len(group) else np.zeros(0, bool)
+    near = add_cycles(maps, group, at, of_group)
     further, on_torus = _moved(maps, on_tori, NEAR_TORUS)
     group = np.concatenate([group[~near], further])
     at = Section(*(np.concatenate(parts) for parts in zip(at.rows(~near), on_torus, strict=True)))
@@ -134,4 +134,4 @@ def _moved(maps: ReturnMaps, starts: list, returns: int) -> tuple[Int[np.ndarray
     group = np.array([g for g, _ in starts], int)
     y = np.array([y for _, y in starts]).reshape(len(starts), len(maps.weights))
     at = section_at(y, maps.normal, maps.sliding[group])
-    return group, maps.returns(group, at, returns).at if starts else at
+    return group, maps.returns(group, at, returns).at

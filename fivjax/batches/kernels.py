@@ -94,7 +94,7 @@ class Kernels:
         rows[:, CROSSINGS], rows[:, STATUS], rows[:, DIRECTION], rows[:, STATE:] = crossings, status, direction, y
         rows[:, LONGEST] = self.longest[group] * rows[:, CROSSINGS]
         path = np.full((count, kept * size), np.nan)
-        each = int(STEPS_TO_CROSSING * np.mean(rows[:, CROSSINGS])) if count else 0
+        each = int(STEPS_TO_CROSSING * np.mean(rows[:, CROSSINGS]))
         self._launch(self.programs.returned, group, [rows, path], each, [kept, int(peaks)])
         path, y, crossed = path.reshape(count, kept, size), rows[:, STATE:], rows[:, CROSSED].astype(int)
         lost = (crossed < rows[:, CROSSINGS]) | ~np.all(np.isfinite(y), axis=1)

@@ -118,6 +118,10 @@ class ReturnMaps:
         """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
         `peaks` are asked for. More than `KEPT` states are kept only if they are all of them.
         """
+        if not len(group):
+            # Blocks are never empty.
+            nothing = np.zeros(0)
+            return Images(at, nothing.astype(np.int32), nothing, np.zeros((0, kept, at.y.shape[1])), nothing)
         if self.kernels is not None or kept <= KEPT:
             return self._returns(group, at, crossings, kept, peaks)
         parts: list[Images] = []
