@@ -6,6 +6,7 @@ laws. No trajectory waits for the slowest of a block, and nothing is padded.
 
 from concurrent.futures import Executor
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,15 +41,22 @@ AT_A_TIME, LEAST_STEPS = 4, 4096
 STEPS_TO_CROSSING = 9
 
 
+# Forms of batches, by what all jobs of a run have in common: a trace takes as long as thousands of returns.
+_FORMS: dict[Any, Form] = {}
+
+
 def begin_building(batch: Batch) -> None:
     """Begin to compile a batch's kernels in one of its threads."""
 
     def mechanics(row):
         return mechanics_about_sliding(with_values(batch.scene, batch.names, row))
 
-    # Without values: those of a group may be none that a scene could have.
-    form = Form.of(jax.eval_shape(mechanics, np.zeros(len(batch.names))))
-    batch.pool.submit(_built, form)
+    leaves, structure = jax.tree.flatten(batch.scene)
+    key = structure, tuple(np.shape(leaf) for leaf in leaves), batch.names
+    if key not in _FORMS:
+        # Without values: those of a group may be none that a scene could have.
+        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(batch.names))))
+    batch.pool.submit(_built, _FORMS[key])
 
 
 def _built(form: Form) -> Programs:
