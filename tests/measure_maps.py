@@ -35,7 +35,7 @@ def scene(**changes) -> fj.Scene:
 
 def errors() -> None:
     """State error, relative to each coordinate's size, at 0.5 s (9 events) and 2 s (345 events): μ = 0.227, p = 1.3, 3 m/s."""
-    import oracle
+    import oracle  # not at the top: other studies measure the memory of this process
 
     for t1, kind in ((0.1, "one status"), (0.5, "9 events"), (2.0, "345 events")):
         reference = oracle.simulate(

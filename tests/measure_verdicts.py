@@ -294,9 +294,9 @@ def tori(structures, kicks, seed, threads):
     """Oscillators about the paper's, on belts so fast that many limit cycles are tori: small maps over friction and kick."""
     rng = np.random.default_rng(seed)
     tally, kinds = Tally(), Counter()
+    usual = fj.belt_oscillator().parameters
     for i in range(structures):
-        parts = {"m1": 0.53, "m2": 0.045, "c1": 1.0, "c2": 1.0, "k1": 100e3, "k2": 101e3}
-        parts = {name: float(value * np.exp(rng.uniform(-0.2, 0.2))) for name, value in parts.items()}
+        parts = {name: float(usual[name]) * float(np.exp(rng.uniform(-0.2, 0.2))) for name in usual if name != "theta"}
         mu, v = float(rng.uniform(0.03, 0.2)), float(rng.uniform(2.0, 6.0))
         axes = {"mu": mu * np.linspace(1.0, 1.05, 3), "p": np.sort(rng.uniform(1.0, 6.0, kicks))}
         found, _ = compare(tally, paper(mu, v, **parts), False, f"[{i}] v={v!r} {parts}", threads, **axes)

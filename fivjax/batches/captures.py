@@ -227,10 +227,9 @@ def captured(
             near[own] = np.min(apart, axis=1) <= within[place[own]]
         crossings[own] = count - np.argmin(apart, axis=1)
     row, place, crossings = row[near], place[near], crossings[near]
-    if len(row):
-        image = maps.returns(group[row], at.rows(row), crossings).at
-        inside = Neighbourhood(*(part[place] for part in about)).contains(*image)
-        which[row[inside]] = place[inside]
+    image = maps.returns(group[row], at.rows(row), crossings).at
+    inside = Neighbourhood(*(part[place] for part in about)).contains(*image)
+    which[row[inside]] = place[inside]
     return which
 
 

@@ -94,8 +94,7 @@ def _followed(
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
-    if len(rows):
-        quiet[rows] = maps.returns(group[rows], now.rows(rows), HOME).events == 0
+    quiet[rows] = maps.returns(group[rows], now.rows(rows), HOME).events == 0
     rows = np.flatnonzero(left & further & ~quiet)
     if len(rows):
         chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
