@@ -342,7 +342,9 @@ def test_structure_refuses_one_coordinate_in_both_roles():
 
 def test_default_indices_do_not_fit_two_coordinates():
     """The default gap index 2 is refused for two coordinates, not wrapped round to another coordinate."""
-    with pytest.raises(ValueError, match=r"`normal` must be between 0 and 1, but is 2"):
+    with pytest.raises(
+        ValueError, match=r"`normal` must be the number of a coordinate, 0 to 1 for 2 coordinates, but is 2"
+    ):
         fj.Structure(np.eye(2), np.eye(2), np.eye(2), [0, -1])
 
 

@@ -38,7 +38,8 @@ class FreeParameters(eqx.Module):
         known = scene.parameters
         for name in (*names, *bounds):
             if name not in known:
-                raise ValueError(f"Scene has no parameter `{name}`; it has: {', '.join(sorted(known))}.")
+                near = arguments.did_you_mean(name, known)
+                raise ValueError(f"Scene has no parameter `{name}`; it has: {', '.join(sorted(known))}.{near}")
         if len(set(names)) != len(names):
             raise ValueError(f"Argument `free` names a parameter twice: {', '.join(names)}.")
         for name in bounds:

@@ -132,6 +132,8 @@ class Calibration(eqx.Module):
                 said.append(f"  offset of recording {k}: {offset[0]:.6g} ± {error} s")
         return "\n".join(said)
 
+    __repr__ = __str__
+
     def to_dataset(self) -> xr.Dataset:
         """Parameters with uncertainties, and the data and the fit of recording r over `t_r` and `channel_r`."""
         dataset = xr.Dataset(

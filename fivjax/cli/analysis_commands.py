@@ -50,7 +50,7 @@ class Cea:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
             print(fj.cea.sensitivity(scene.structure, direction=direction))
         else:
-            print(f"  constant friction: {limit.outcome.value}")
+            print(f"  {limit}")
 
     def _of_file(self, path: Path, data: Path, picture: Path) -> None:
         try:

@@ -17,6 +17,7 @@ from .compiled_code import keep_compiled_code
 from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
+from .parsing import numbers
 from .simulate_command import Simulate
 from .study_commands import Reproduce, Tradeoff
 
@@ -41,12 +42,13 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"fivjax {fj.__version__}")
         return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS,
-        prog="fivjax",
-        description="Friction-induced vibration: what a scene does after a kick. `fivjax --version` says which fivjax this is.",
-        args=arguments,
-    )
+    with numbers():
+        command = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="fivjax",
+            description="Friction-induced vibration: what a scene does after a kick. `fivjax --version` says which it is.",
+            args=arguments,
+        )
     keep_compiled_code()
     try:
         with _terminated_like_interrupted():

@@ -1,6 +1,7 @@
 """Options that several commands share: the scene and the method."""
 
 import dataclasses
+import sys
 from typing import TYPE_CHECKING, Literal
 
 import fivjax as fj
@@ -56,6 +57,8 @@ class SceneOptions:
 
     def scene(self) -> "Scene":
         check_angle("Option `--theta`", self.theta)
+        if self.belt_speed < 0:
+            print(f"The belt moves against the tangential coordinate, at {-self.belt_speed:g} m/s.", file=sys.stderr)
         names = ("m1", "m2", "c1", "c2", "k1", "k2", "theta")
         return fj.Scene(
             fj.belt_oscillator(**{name: getattr(self, name) for name in names}),

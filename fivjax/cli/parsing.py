@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import tyro
 
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
@@ -28,6 +29,34 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
         for end in (low, high):
             check_angle(f"Axis `{name}`", end)
     return name, np.linspace(low, high, points)
+
+
+def numbers() -> tyro.constructors.ConstructorRegistry:
+    """How numbers are read from options, so that a word in place of one is answered by a sentence."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+        kind = {float: float, float | None: float, int: int}.get(info.type)
+        if kind is None:
+            return None
+        example, what = ("0.2", "a number") if kind is float else ("8", "a whole number")
+
+        def read(words: list[str]) -> float | int:
+            try:
+                return kind(words[0])
+            except ValueError:
+                raise ValueError(f"it must be {what}, such as {example}, but is {words[0]!r}.") from None
+
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=kind.__name__.upper(),
+            instance_from_str=read,
+            is_instance=lambda value: value is None or isinstance(value, int | float),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
 
 
 def pair(text: str, option: str) -> tuple[str, str]:

@@ -20,6 +20,8 @@ from .section_map import Point, return_with_jacobian, sliding_state
 MARGIN = 1e-9
 
 
+# So many phases of the word are printed.
+PRINTED_PHASES = 12
 # A multiplier of the section's return map this close to 1 counts as 1.
 FAMILY = 1e-7
 
@@ -137,13 +139,28 @@ class LimitCycle(eqx.Module):
         stability = "stable" if self.stable else f"unstable in {self.unstable_directions} direction(s)"
         if self.in_family:
             stability = "one of a family: a second multiplier is 1"
-        modes = " ".join(f"{_named(phase.status)} {1e3 * phase.duration:.4g} ms" for phase in self.word)
+        modes = " ".join(
+            f"{_named(phase.status)} {1e3 * phase.duration:.4g} ms" for phase in self.word[:PRINTED_PHASES]
+        )
+        if len(self.word) > PRINTED_PHASES:
+            modes += f" … and {len(self.word) - PRINTED_PHASES} more"
+        size = f"{self.frequency:.6g} Hz, peak tangential speed {self.amplitude:.6g} m/s"
+        head = f"limit cycle ({self.kind}, {stability}): {size}"
+        if self.kind == "torus":
+            exponents = ", ".join(f"{np.log(abs(value)):.2g}" for value in self.multipliers[:4])
+            rests_on = (
+                f"  stable, because starts in a tube about it come back into half of the tube\n"
+                f"  Lyapunov exponents per return: {exponents} (the first is zero on a torus, up to the error of the mean)\n"
+                f"  its points lie on one closed curve up to {self.residual:.1e} of its size"
+            )
+            return f"{head}\n  word, from a point of the section: {modes}\n{rests_on}"
         largest = ", ".join(f"{abs(value):.6g}" for value in self.multipliers[:4])
         return (
-            f"limit cycle ({self.kind}, {stability}): {self.frequency:.6g} Hz, peak tangential speed "
-            f"{self.amplitude:.6g} m/s\n  word: {modes}\n  sizes of the multipliers: {largest}\n"
+            f"{head}\n  word: {modes}\n  sizes of the multipliers: {largest}\n"
             f"  closes to {self.residual:.1e} of its size"
         )
+
+    __repr__ = __str__
 
 
 def _named(status: Status | tuple[Status, ...]) -> str:

@@ -31,6 +31,11 @@ class CycleDerivatives(eqx.Module):
     state: dict[str, Float[np.ndarray, "..."]]  # m and m/s, of the state on the section
     multipliers: dict[str, Complex[np.ndarray, "..."]]  # of `section_multipliers`, in its order; empty unless asked for
 
+    def __repr__(self) -> str:
+        rows = [f"  {name:<16}{self.period[name]:>14.6g}{self.amplitude[name]:>16.6g}" for name in self.period]
+        head = f"derivatives of a limit cycle, per unit of each parameter\n  {'':<16}{'period, s':>14}{'amplitude, m/s':>16}"
+        return "\n".join([head, *rows])
+
 
 @in_double_precision
 def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: bool = False) -> CycleDerivatives:
@@ -65,6 +70,7 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
         raise ValueError(
             f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
             f"{', '.join(sorted(cycle.scene.parameters))}."
+            f"{arguments.did_you_mean((unknown or [''])[0], cycle.scene.parameters)}"
         )
     arguments.truth("multipliers", multipliers)
     slopes = _slopes(cycle.scene, names, point_of(cycle), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))

@@ -17,6 +17,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
+from ..model.printing import as_call
 from ..model.scene import Scene, refuse_vector_contacts
 from ..steppers.event_exact import EventExact, for_derivatives
 from .around import peak_speed_along
@@ -46,6 +47,10 @@ class NearbyCycle(eqx.Module):
     residual: Float[Array, ""]
     found: Bool[Array, ""]
     multipliers: Complex[Array, " state"] | None
+
+    def __repr__(self) -> str:
+        values = {"period": self.period, "amplitude": self.amplitude, "residual": self.residual, "found": self.found}
+        return as_call("NearbyCycle", values)
 
 
 @refusing_reverse_in_single_precision

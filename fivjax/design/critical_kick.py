@@ -74,6 +74,8 @@ class RaisedCriticalKick(NamedTuple):
         )
         return f"{text} {self.why}" if self.why else text
 
+    __repr__ = __str__
+
 
 @in_double_precision
 def raise_critical_perturbation(

@@ -4,12 +4,16 @@ Values that are not known yet (inside `jit`, `grad` or `vmap`) cannot be checked
 are bad ends in a named status instead.
 """
 
+import difflib
 from collections.abc import Iterable
 
 import jax
 import numpy as np
 
 from .precision import is_known
+
+# Energies are products of two or three numbers that users give; they must be finite, too.
+LARGEST = 1e100
 
 
 def real_number(
@@ -27,6 +31,11 @@ def real_number(
     number = array.item()
     if not np.isfinite(number):
         raise ValueError(f"Argument `{name}` must be finite, but is {number}.")
+    if abs(number) > LARGEST:
+        raise ValueError(
+            f"Argument `{name}` must be at most {LARGEST:g} in size, because products of such numbers are computed, but is "
+            f"{number:g}."
+        )
     if minimum is not None and number < minimum:
         rule = "non-negative" if minimum == 0 else f"at least {minimum:g}"
         raise ValueError(f"Argument `{name}` must be {rule}, but is {number:g}.")
@@ -108,7 +117,15 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
     choices = list(choices)
     if value not in choices:
         listed = ", ".join(f'"{choice}"' for choice in choices)
-        raise ValueError(f"Argument `{name}` must be one of {listed}, but is {value!r}.")
+        raise ValueError(
+            f"Argument `{name}` must be one of {listed}, but is {value!r}.{did_you_mean(str(value), choices)}"
+        )
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """ " Did you mean `k1`?", for a name that is none of those known but close to one; else nothing."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean `{near[0]}`?" if near else ""
 
 
 def describe(value) -> str:

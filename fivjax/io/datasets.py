@@ -39,15 +39,22 @@ def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
     accessor.register()
     for name in list(dataset.variables):
         label(dataset[name])
-    dataset.attrs.update(
-        scene=json.dumps(describe(scene)),
-        settings=json.dumps(settings),
-        fivjax=metadata.version("fivjax"),
-        jax=jax.__version__,
-        diffrax=metadata.version("diffrax"),
-        device=jax.devices()[0].device_kind,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    about = {
+        "about": f"{scene!r}; {', '.join(f'{name} {value}' for name, value in settings.items())}".rstrip("; "),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "fivjax": metadata.version("fivjax"),
+        "jax": jax.__version__,
+        "diffrax": metadata.version("diffrax"),
+        "device": jax.devices()[0].device_kind,
+    }
+    # What only programs read comes last.
+    dataset.attrs = {
+        **about,
+        **dataset.attrs,
+        **about,
+        "settings": json.dumps(settings),
+        "scene": json.dumps(describe(scene)),
+    }
     return dataset
 
 

@@ -73,6 +73,11 @@ class Recording(eqx.Module):
     detached: tuple[float, float] | None
     known: dict[str, float]
 
+    def __repr__(self) -> str:
+        known = "".join(f", {name} = {value:g}" for name, value in self.known.items())
+        span = f"{len(self.t)} samples from {self.t[0]:g} to {self.t[-1]:g} s"
+        return f'Recording ("{self.regime}"): {", ".join(map(str, self.channels))}; {span}{known}'
+
     def __init__(
         self,
         t,

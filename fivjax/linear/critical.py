@@ -8,14 +8,14 @@ from jaxtyping import Array, Float, Int
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.kept_programs import kept
-from ..foundation.precision import returning_numpy
+from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
 from .gradients import with_own_gradient
-from .outcomes import CODES, Mechanism, StabilityOutcome
+from .outcomes import CODES, WHY, Mechanism, StabilityOutcome
 from .several_contacts import critical_friction_of_several, first_limit_of_several, one_contact
 from .system import as_scene, check_direction
 
@@ -30,6 +30,16 @@ class StabilityLimit(eqx.Module):
     mu: Float[Array, ""]
     frequency: Float[Array, ""]
     code: Int[Array, ""]
+
+    def __repr__(self) -> str:
+        if not all(map(is_known, (self.mu, self.frequency, self.code))):
+            return "StabilityLimit(<traced>)"
+        if self.outcome is not StabilityOutcome.FOUND:
+            return f"steady sliding under constant friction is {self.outcome.value}; {WHY[self.outcome]}"
+        return (
+            f"steady sliding is unstable above μ = {float(self.mu):.10g}, by {self.mechanism.value} at "
+            f"{float(self.frequency):.6g} Hz"
+        )
 
     @property
     def outcome(self) -> StabilityOutcome:

@@ -59,6 +59,8 @@ class Design(eqx.Module):
         moved = f"{self.quantity} {self.before:.6g} -> {self.after:.6g}{aim}"
         return f"{self.outcome.value.capitalize()}: {moved} with {changes}."
 
+    __repr__ = __str__
+
 
 @in_double_precision
 def raise_critical_friction(
@@ -209,7 +211,8 @@ def _checked_bounds(structure: Structure, bounds, tied):
     known = ", ".join(structure.parameters) or "none (it was given as matrices)"
     for key in (*bounds, *tied):
         if key not in structure.parameters:
-            raise ValueError(f"Structure has no parameter `{key}`; it has: {known}.")
+            near = arguments.did_you_mean(key, structure.parameters)
+            raise ValueError(f"Structure has no parameter `{key}`; it has: {known}.{near}")
     for key, pair in bounds.items():
         pair = arguments.bounds_about(key, pair, float(structure.parameters[key]))
         structure.replace(**{key: pair[0]})

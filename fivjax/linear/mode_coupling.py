@@ -30,6 +30,12 @@ class Coalescence(eqx.Module):
     damped: bool = eqx.field(static=True)
     outcome: StabilityOutcome = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        if self.outcome is not StabilityOutcome.FOUND:
+            return f"coalescence of two modes: {self.outcome.value}"
+        meet = f"come closest, {self.imperfection:.3g} in μ from meeting," if self.damped else "meet"
+        return f"two modes {meet} at μ = {self.mu:.8g}, {self.frequency:.6g} Hz, growth rate {self.growth_rate:.4g} 1/s"
+
 
 # Damping is increased from zero in this many steps, with this many Newton iterations at each.
 HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4

@@ -12,6 +12,14 @@ class StabilityOutcome(enum.StrEnum):
     UNDECIDED = "undecided"
 
 
+# Why there is no limit, as a sentence.
+WHY = {
+    StabilityOutcome.NEVER_UNSTABLE: "no modes couple and no stiffness is lost, at any μ (several contacts: up to 2)",
+    StabilityOutcome.ALWAYS_UNSTABLE: "a mode grows already at the smallest friction",
+    StabilityOutcome.UNDECIDED: "the search did not come to an end",
+}
+
+
 class Mechanism(enum.StrEnum):
     """How stability is lost at the limit."""
 

@@ -51,7 +51,8 @@ def with_axes(
         known = sorted(scene.parameters)
     unknown = [name for name in parameters if name not in known]
     if unknown:
-        raise ValueError(f"Unknown parameter `{unknown[0]}`; this system has: {', '.join(known)}.")
+        near = arguments.did_you_mean(unknown[0], known)
+        raise ValueError(f"Unknown parameter `{unknown[0]}`; this system has: {', '.join(known)}.{near}")
     axes = {name: arguments.axis(name, values) for name, values in parameters.items() if np.ndim(values) > 0}
     if len(axes) != count:
         wanted = "one axis, such as `mu=np.linspace(0, 0.5, 501)`" if count == 1 else "two axes"
@@ -61,4 +62,20 @@ def with_axes(
     # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the ends of the axes.
     for end in (0, -1):
         scene.replace(**{name: values[end] for name, values in axes.items()})
+    for name, values in axes.items():
+        if _unseen(scene, name, values):
+            raise ValueError(
+                f"Axis `{name}` changes nothing in linear theory, which looks at steady sliding under the load's final value: "
+                f"no kick and no impact. Follow another parameter, or make a map over `{name}` by `bistability_map`."
+            )
     return scene, axes
+
+
+def _unseen(scene: Scene, name: str, values: np.ndarray) -> bool:
+    """Whether a parameter is of impacts, or of the load without changing its final value."""
+    if name == "restitution":
+        return True
+    if name in scene.structure.parameters or name not in vars(scene.load):
+        return False
+    ends = [float(scene.replace(**{name: value}).load.final) for value in (values[0], values[-1])]
+    return len(values) > 1 and ends[0] == ends[1]

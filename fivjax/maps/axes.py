@@ -31,6 +31,7 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     unknown = [name for name in axes if name not in scene.parameters]
     if unknown:
         hint = " Give the scene a Pulse as its load." if unknown[0] in ("p", "duration", "start") else ""
+        hint = hint or arguments.did_you_mean(unknown[0], scene.parameters)
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
     checked = {name: arguments.axis(name, values) for name, values in axes.items()}
     # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the corners of the

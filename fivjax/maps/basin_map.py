@@ -106,7 +106,7 @@ def _states_among(scene: Scene, axes: dict) -> dict[str, int]:
     if unknown:
         raise ValueError(
             f"Unknown axis `{unknown[0]}`; the states are {', '.join(known)}, and the scene has "
-            f"{', '.join(sorted(scene.parameters))}."
+            f"{', '.join(sorted(scene.parameters))}.{arguments.did_you_mean(unknown[0], [*known, *scene.parameters])}"
         )
     return {name: known[name] for name in axes if name in known}
 

@@ -81,5 +81,8 @@ def map_dataset(
     first = Verdict(int(every.flat[0]))
     if first in FAILURES and np.all(every == first):
         dataset.attrs["failure"] = MEANING[first]
-    dataset.attrs["counts"] = json.dumps({verdict.name.lower(): int(np.sum(every == verdict)) for verdict in MEANING})
+    counts = {verdict.name.lower(): int(np.sum(every == verdict)) for verdict in MEANING}
+    found = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+    summary = f"{' × '.join(map(str, shape))} trajectories over {', '.join(axes)}: {found}"
+    dataset.attrs = {"summary": summary, **dataset.attrs, "counts": json.dumps(counts)}
     return dataset

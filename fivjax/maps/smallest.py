@@ -64,6 +64,8 @@ class SmallestKick(NamedTuple):
             f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
         )
 
+    __repr__ = __str__
+
 
 @overload
 def smallest_kick(

@@ -61,6 +61,8 @@ class SmallestPerturbation(NamedTuple):
             bound = f"certified: every history within {100 * self.certified:.6g} % slides for ever"
         return f"{found}\n{bound}\ngap: the bound is {100 * self.ratio:.3g} % of what was found, as a norm"
 
+    __repr__ = __str__
+
 
 class NoSquealingKick(ValueError):
     """No kick, state or history that was tried within the bounds leads to a limit cycle.

@@ -77,6 +77,7 @@ def checked_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ..
             if value not in names:
                 raise ValueError(
                     f"Argument `{name}` must be the index or name of a coordinate ({', '.join(names)}), but is {value!r}."
+                    f"{arguments.did_you_mean(value, names)}"
                 )
             return names.index(value)
         if not isinstance(value, np.ndarray):

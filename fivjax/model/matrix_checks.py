@@ -58,7 +58,9 @@ def checked_index(name: str, index, n: int) -> int:
     if isinstance(index, bool) or not isinstance(index, int | np.integer):
         raise TypeError(f"Argument `{name}` must be the index of a coordinate, but is {arguments.describe(index)}.")
     if not 0 <= index < n:
-        raise ValueError(f"Argument `{name}` must be between 0 and {n - 1}, but is {index}.")
+        raise ValueError(
+            f"Argument `{name}` must be the number of a coordinate, 0 to {n - 1} for {n} coordinates, but is {index}."
+        )
     return int(index)
 
 

@@ -109,7 +109,10 @@ class Scene(eqx.Module):
         """
         unknown = [name for name in changes if name not in self.parameters]
         if unknown:
-            raise ValueError(f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}.")
+            raise ValueError(
+                f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}."
+                f"{arguments.did_you_mean(unknown[0], self.parameters)}"
+            )
 
         def rebuilt(part):
             if isinstance(part, FrictionPerContact):

@@ -202,7 +202,9 @@ class Structure(eqx.Module):
         numbers = {name: real(value) for name, value in parameters.items()}
         unknown = [name for name in dampers if name not in numbers]
         if unknown:
-            raise ValueError(f"Argument `dampers` must name parameters, but has {unknown[0]!r}.")
+            raise ValueError(
+                f"Argument `dampers` must name parameters, but has {unknown[0]!r}.{arguments.did_you_mean(unknown[0], numbers)}"
+            )
         source = FromParameters(numbers, tuple(numbers), matrices_of, tuple(dampers), builder)
         checked = cls(*source.matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
@@ -340,7 +342,8 @@ class Structure(eqx.Module):
         unknown = sorted(set(changes) - set(self.parameters))
         if unknown:
             known = ", ".join(self.parameters) or "none (it was given as matrices)"
-            raise ValueError(f"Structure has no parameter `{unknown[0]}`; it has: {known}.")
+            near = arguments.did_you_mean(unknown[0], self.parameters)
+            raise ValueError(f"Structure has no parameter `{unknown[0]}`; it has: {known}.{near}")
         parameters, source = {**self.parameters, **changes}, self.source
         if source.builder is not None:
             return source.builder(**parameters)

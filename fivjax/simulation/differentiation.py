@@ -39,6 +39,13 @@ class Derivatives(eqx.Module):
     def __getitem__(self, name: str) -> Array:
         return self.by_name[name]
 
+    def __repr__(self) -> str:
+        def text(value):
+            return f"{float(value):.8g}" if np.size(value) == 1 else f"array of shape {np.shape(value)}"
+
+        slopes = ", ".join(f"d/d {name} = {text(slope)}" for name, slope in self.by_name.items())
+        return f"value {text(self.value)}; {slopes}; {self.events} contact events\n{self.reason}"
+
     @property
     def reason(self) -> str:
         """Why the derivatives exist or do not, as a sentence."""
@@ -106,7 +113,7 @@ def derivatives(
     if unknown or not names:
         raise ValueError(
             f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
-            f"{', '.join(sorted(scene.parameters))}."
+            f"{', '.join(sorted(scene.parameters))}.{arguments.did_you_mean((unknown or [''])[0], scene.parameters)}"
         )
     arguments.one_of("mode", mode, ("forward", "reverse"))
     arguments.real_number("margin", margin, minimum=0)

@@ -4,7 +4,10 @@ Signs and equations are those of `energy`.
 """
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, Int
+
+from ..foundation.precision import is_known
 
 
 class Flows(eqx.Module):
@@ -81,6 +84,13 @@ class Energy(eqx.Module):
     power: Flows  # W, at the row's instant and in its status
     ledger: Ledger  # the sums up to the row
     residual: Float[Array, " T"]  # growth of mechanical energy that no line accounts for, J
+
+    def __repr__(self) -> str:
+        if not (is_known(self.residual) and np.ndim(self.residual) == 1):
+            return "Energy(<traced or batched>)"
+        ends = {name: line[-1] for name, line in self.work.lines("work").items()} | {"impact_loss": self.impact[-1]}
+        lines = ", ".join(f"{name} {float(value):.4g}" for name, value in ends.items())
+        return f"energy ledger of {len(self.residual)} rows; at the end, in J: {lines}; residual {float(self.residual[-1]):.2g}"
 
     @property
     def mechanical(self) -> Float[Array, " T"]:

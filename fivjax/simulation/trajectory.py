@@ -66,6 +66,22 @@ class Trajectory(eqx.Module):
     # How it was computed, as pairs of name and value: method, dt, dt_save, t1, start.
     settings: tuple[tuple[str, str | float], ...] = eqx.field(static=True, default=())
 
+    def __repr__(self) -> str:
+        if not is_known((self.t, self.status, self.velocity, self.outcome)):
+            return f"Trajectory (traced) of {np.shape(self.t)[-1]} rows"
+        if np.ndim(self.t) != 1:
+            return f"Trajectory: a batch of shape {np.shape(self.t)[:-1]}, each of {np.shape(self.t)[-1]} rows"
+        t, status = np.asarray(self.t), np.asarray(self.status)
+        shares = ", ".join(f"{one.name.lower()} {100 * np.mean(status == one):.3g} %" for one in Status)
+        along = _at_contacts(np.asarray(self.velocity), self.scene.structure.tangential_directions)
+        ledger = "" if self.energy is None else "; with its energy ledger"
+        return (
+            f"Trajectory: {len(t)} rows from 0 to {t[-1]:g} s of {self.scene.structure.size} coordinates "
+            f"({', '.join(self.scene.structure.coordinates[:6])}{', …' if self.scene.structure.size > 6 else ''})\n"
+            f"  contact: {shares} of the rows; peak tangential speed {np.nanmax(np.abs(along), initial=0.0):.6g} m/s{ledger}\n"
+            f"  {self.meaning}"
+        )
+
     @property
     def meaning(self) -> str:
         """How the trajectory ended, in a sentence."""
