@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fivjax as fj
-from fivjax.io.references import HOME, PAPER_DOI
+from fivjax.io.references import PAPER_DOI
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -37,7 +37,8 @@ def test_what_to_cite_is_the_same_everywhere():
         assert author in fj.citation()
         assert author in CITATION
         assert author in readme
-    assert field("repository-code") == PROJECT["urls"]["Source"] == HOME
+    assert field("repository-code") == PROJECT["urls"]["Source"] == PROJECT["urls"]["Homepage"]
+    assert f"{{{PROJECT['urls']['Homepage']}}}" in fj.citation()
     assert field("url") == PROJECT["urls"]["Documentation"]
     assert field("license") == PROJECT["license"]
 
@@ -55,19 +56,23 @@ def test_a_user_s_file_is_clean_to_a_type_checker():
     assert done.returncode == 0, done.stdout
 
 
-def test_the_readme_can_be_shown_anywhere():
-    """A package index shows the README by itself: a relative picture or link is broken there. It is short enough to be read."""
+def test_the_readme_can_be_read_in_a_checkout():
+    """Its pictures and links to our own pages are files of the tree, so they show before anything is published. It is short
+    enough to be read.
+    """
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(readme.split()) <= 900
     for address in re.findall(r"\]\(([^)]+)\)", readme):
-        assert re.match("https://|#", address), address
-    ours = [address for address in re.findall(r"https://[^)\s]+", readme) if "fivjax" in address]
-    homes = (HOME, PROJECT["urls"]["Documentation"], HOME.replace("github.com", "raw.githubusercontent.com"))
-    for address in ours:
-        assert address.startswith(homes), address
-        for part in (r"blob/main/(.+)", r"raw\.githubusercontent\.com/fivjax/fivjax/main/(.+)"):
-            inside = re.search(part, address)
-            assert inside is None or (ROOT / inside.group(1)).exists(), address
+        assert address.startswith("https://doi.org/") or (ROOT / address).exists(), address
+
+
+def test_where_the_project_is_published_is_said_once():
+    """In the project file, from which all else reads it; `CITATION.cff`, whose form has no references, is held to it above."""
+    home = PROJECT["urls"]["Homepage"].removeprefix("https://")
+    site = PROJECT["urls"]["Documentation"].removeprefix("https://")
+    for path in [*ROOT.glob("*.md"), *(ROOT / "fivjax").rglob("*.py"), *(ROOT / "docs").glob("**/*.md")]:
+        text = path.read_text(encoding="utf-8")
+        assert home not in text and site.rstrip("/") not in text, path
 
 
 @pytest.mark.parametrize("name", ["CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md"])

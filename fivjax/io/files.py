@@ -33,7 +33,7 @@ def save_figure(figure, path: str | Path, **options) -> Path:
 
     **Example:**
 
-        >>> path = fj.save_figure(fj.plot.response(run), "response.png")
+        >>> path = fj.save_figure(fj.plot.response(run), "squeal.png")
     """
     path = check_writable(path)
     options = {"dpi": 150, "bbox_inches": "tight", "format": path.suffix.lstrip(".") or "png", **options}

@@ -2,7 +2,6 @@
 
 from importlib import metadata
 
-HOME = "https://github.com/fivjax/fivjax"
 PAPER_DOI = "10.26599/FRICT.2026.9441215"
 
 _SOFTWARE = """@software{{fivjax,
@@ -34,5 +33,7 @@ def citation() -> str:
         >>> print(fj.citation().splitlines()[0])
         @software{fivjax,
     """
-    software = _SOFTWARE.format(version=metadata.version("fivjax"), home=HOME)
+    # Where the project is published stands in `pyproject.toml` alone.
+    addresses = dict(line.split(", ", 1) for line in metadata.metadata("fivjax").get_all("Project-URL", []))
+    software = _SOFTWARE.format(version=metadata.version("fivjax"), home=addresses["Homepage"])
     return software + "\n\n" + _PAPER.format(doi=PAPER_DOI)

@@ -8,10 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
+from ..cycles.tori_on_branches import turning
 from .maps import bistability
 from .style import BLACK, COLOURS, GREEN, axis_label, check_dataset, legend_above, new_figure
 
 CALL = "fj.continue_cycle(scene, 'mu', (0.02, 0.3))"
+# Of cycles: stable, unstable, and unstable by a complex pair of multipliers.
+STYLES, LABELS = ("-", "--", "-."), ("stable", "unstable", "unstable, beside a torus")
+THIN, THICK = 1.3, 2.6
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 
 
@@ -22,7 +26,8 @@ def branch(
     tori: xr.Dataset | None = None,
     figure: Figure | None = None,
 ) -> Figure:
-    """A bifurcation diagram: steady sliding and limit cycles over a parameter; stable ones solid, unstable ones dashed.
+    """A bifurcation diagram: steady sliding and limit cycles over a parameter; stable ones solid, unstable ones dashed,
+    and dash-dotted where a torus branches off (see `tori_along`).
 
     **Arguments:** `branches`, a dataset from `continue_cycle`, or several over the same parameter by label; `beside`, a map
     from `bistability_map` that is drawn to the right; `tori`, from `tori_along`, the attractors where cycles are unstable.
@@ -53,8 +58,7 @@ def branch(
         _lines(axes, one, str(colour))
         if label:
             handles.append(Line2D([], [], color=str(colour), label=label))
-    if any(not np.all(one["stable"]) for one in several.values()):
-        handles += [Line2D([], [], color=BLACK, label="stable"), Line2D([], [], color=BLACK, ls="--", label="unstable")]
+    handles += _line_styles(several)
     if tori is not None:
         handles += _tori(axes, tori)
     axes.set(xlabel=axis_label(names.pop()), ylabel="peak tangential speed (m/s)")
@@ -63,19 +67,35 @@ def branch(
     return figure
 
 
+def _kinds(one: xr.Dataset) -> np.ndarray:
+    """For each point of a branch which of `STYLES` it is drawn in."""
+    kinds = np.where(one["stable"].values, 0, 1)
+    # At special points multipliers are those of a neighbour, or not known.
+    kinds[turning(one["multipliers"].values, np.full(one.sizes["point"], ""))] = 2
+    return kinds
+
+
+def _line_styles(several: Mapping[str, xr.Dataset]) -> list[Line2D]:
+    shown = {0, *np.concatenate([_kinds(one) for one in several.values()]).tolist()}
+    if not all(np.all(one["sliding_stable"]) for one in several.values()):
+        shown.add(1)
+    cycles = [Line2D([], [], color=BLACK, ls=STYLES[kind], lw=THIN, label=LABELS[kind]) for kind in sorted(shown)]
+    return [*cycles, Line2D([], [], color=BLACK, lw=THICK, label="steady sliding")]
+
+
 def _lines(axes: Axes, one: xr.Dataset, colour: str) -> None:
-    x, y, stable = one["parameter"].values, one["amplitude"].values, one["stable"].values
+    x, y, kinds = one["parameter"].values, one["amplitude"].values, _kinds(one)
     known = np.isfinite(y)
-    x, y, stable = x[known], y[known], stable[known]
-    # The line from a point to the next is solid where the first of them is stable.
-    for is_stable, style in ((True, "-"), (False, "--")):
-        chosen = stable == is_stable
+    x, y, kinds = x[known], y[known], kinds[known]
+    # The line from a point to the next has the style of the first of them.
+    for kind, style in enumerate(STYLES):
+        chosen = kinds == kind
         shown = chosen | np.append(False, chosen[:-1])
-        axes.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), color=colour, ls=style, lw=1.3)
+        axes.plot(np.where(shown, x, np.nan), np.where(shown, y, np.nan), color=colour, ls=style, lw=THIN)
     order = np.argsort(one["parameter"].values, kind="stable")
     x, slides = one["parameter"].values[order], one["sliding_stable"].values[order]
-    for is_stable, style in ((True, "-"), (False, "--")):
-        axes.plot(np.where(slides == is_stable, x, np.nan), np.zeros(len(x)), color=colour, ls=style, lw=1.3)
+    for is_stable, style in ((True, STYLES[0]), (False, STYLES[1])):
+        axes.plot(np.where(slides == is_stable, x, np.nan), np.zeros(len(x)), color=colour, ls=style, lw=THICK)
 
 
 def _tori(axes: Axes, tori: xr.Dataset) -> list[Line2D]:

@@ -10,10 +10,16 @@ from matplotlib.lines import Line2D
 from ..contact import Status
 from ..cycles.cycle import LimitCycle
 from ..foundation import arguments
-from .style import BLACK, BLUE, ORANGE, SKY, VERMILION, legend_above, new_figure
+from .style import BLACK, BLUE, ORANGE, VERMILION, legend_above, new_figure
 
 ROWS = 2000
-COLOURS = {Status.STICK: ORANGE, Status.SLIDE: BLUE, Status.DETACH: SKY}
+# Lines differ in their dashes, too: two of one brightness are not told apart in grey.
+COLOURS = {Status.STICK: ORANGE, Status.SLIDE: BLUE, Status.DETACH: VERMILION}
+STYLES = {
+    Status.STICK: {"ls": "-", "lw": 3.0},
+    Status.SLIDE: {"ls": "-", "lw": 1.4},
+    Status.DETACH: {"ls": "--", "lw": 1.4},
+}
 NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}
 
 
@@ -21,7 +27,7 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     """A limit cycle in the phase plane, coloured by contact mode, and its Floquet multipliers beside the unit circle.
 
     For a torus, the points of the section are drawn instead of the multipliers. `others` (for instance the saddle cycle) are
-    drawn dashed in the same phase plane. With several contacts, the one that moves fastest is shown.
+    drawn dotted in the same phase plane. With several contacts, the one that moves fastest is shown.
 
     **Raises:** `TypeError` for anything but a `LimitCycle`.
     """
@@ -30,13 +36,16 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     figure = new_figure(figure, 9.6, 4.6)
     plane, right = figure.subplots(1, 2, width_ratios=(3, 2))
     contact = _phase_plane(plane, cycle)
-    handles = [Line2D([], [], color=COLOURS[status], label=NAMES[status]) for status in _statuses(cycle, contact)]
+    handles = [
+        Line2D([], [], color=COLOURS[status], label=NAMES[status], **STYLES[status])
+        for status in _statuses(cycle, contact)
+    ]
     for other in others:
         run = other.trajectory(ROWS)
         x, v = _tangential(run, contact)
-        plane.plot(1e3 * x, v, color=BLACK, ls="--", lw=0.9)
+        plane.plot(1e3 * x, v, color=BLACK, ls=":", lw=1.1)
         label = "another cycle" if other.stable else "saddle cycle"
-        handles.append(Line2D([], [], color=BLACK, ls="--", label=f"{label}, {other.amplitude:.4g} m/s"))
+        handles.append(Line2D([], [], color=BLACK, ls=":", label=f"{label}, {other.amplitude:.4g} m/s"))
     plane.set(xlabel="tangential displacement (mm)", ylabel="tangential velocity (m/s)")
     legend_above(plane, handles, columns=3)
     if cycle.kind == "torus":
@@ -68,7 +77,7 @@ def _phase_plane(axes: Axes, cycle: LimitCycle) -> int:
         here = status == mode
         # A row belongs to the line segments before and after it.
         shown = here | np.append(False, here[:-1])
-        axes.plot(1e3 * np.where(shown, x, np.nan), np.where(shown, v, np.nan), color=COLOURS[mode], lw=1.3)
+        axes.plot(1e3 * np.where(shown, x, np.nan), np.where(shown, v, np.nan), color=COLOURS[mode], **STYLES[mode])
     belt = float(np.broadcast_to(cycle.scene.belt_speed, speeds.shape[1])[contact])
     low, high = axes.get_ylim()
     if low < belt < high:
@@ -80,11 +89,11 @@ def _multipliers(axes: Axes, cycle: LimitCycle) -> None:
     angle = np.linspace(0.0, 2 * np.pi, 361)
     axes.plot(np.cos(angle), np.sin(angle), color=BLACK, lw=0.8)
     inside = np.abs(cycle.multipliers) <= 1 + 1e-9
-    kinds = ((inside, BLUE, "inside the unit circle, or 1"), (~inside, VERMILION, "outside"))
-    for chosen, colour, name in kinds:
+    kinds = ((inside, BLUE, "o", "inside the unit circle, or 1"), (~inside, VERMILION, "s", "outside of it"))
+    for chosen, colour, marker, name in kinds:
         if np.any(chosen):
             values = cycle.multipliers[chosen]
-            axes.plot(values.real, values.imag, "o", color=colour, ms=6, label=f"{name} the unit circle")
+            axes.plot(values.real, values.imag, marker, color=colour, ms=6, label=name)
     axes.set(xlabel="Floquet multiplier, real part", ylabel="imaginary part", aspect="equal")
     legend_above(axes, axes.get_legend_handles_labels()[0], columns=2)
 
