@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.cli import main, outputs
+from fivjax.cli import main
 from fivjax.cli.analysis_commands import with_options
 from fivjax.cli.options import SceneOptions
 from fivjax.io.datasets import labelled
@@ -84,17 +83,6 @@ def test_friction_options():
     falling = SceneOptions(mu_static=0.3, mu_dynamic=0.2).scene().friction
     assert isinstance(falling, fj.ExponentialDecay) and float(falling.decay) == 0.5
     assert float(SceneOptions(mu_static=0.3, mu_dynamic=0.2, decay=0.7).scene().friction.decay) == 0.7
-
-
-def test_a_wait_is_said_on_a_terminal_only(monkeypatch, capsys):
-    """A long compilation must not look like a hang; a log file must not fill with carriage returns."""
-    with outputs.waiting("compiling", after=0.0):
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with outputs.waiting("compiling", after=0.0):
-        time.sleep(0.05)
-    assert "compiling … 0 s" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

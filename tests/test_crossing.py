@@ -8,7 +8,8 @@ import pytest
 import fivjax as fj
 from fivjax.batches import rounds
 from fivjax.batches.results import counted, not_run
-from fivjax.maps import bistability, engine, threshold
+from fivjax.foundation import progress
+from fivjax.maps import bistability, threshold
 from fivjax.maps.crossing import first_crossings
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
@@ -121,7 +122,7 @@ def test_numbers_go_with_their_nouns():
 def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkeypatch):
     """Compiling takes longer than many a map; a bar at 0 % looks as if nothing happened."""
     shown = io.StringIO()
-    monkeypatch.setattr(engine, "tqdm", lambda **options: REAL(**{**options, "file": shown, "mininterval": 0}))
+    monkeypatch.setattr(progress, "tqdm", lambda **options: REAL(**{**options, "file": shown, "mininterval": 0}))
 
     def two_rounds(batch, values, seeding, states, known, t_max, max_steps, verdicts, index, report):
         report(0)
@@ -135,7 +136,7 @@ def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkey
     assert "compiling" not in shown.getvalue().split("\r")[-1]
 
 
-REAL = engine.tqdm
+REAL = progress.tqdm
 
 
 @pytest.mark.slow

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from tqdm.auto import tqdm
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import following, stage, tick
 from ..io.recordings import Averaged, Recording, averaged
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, refuse_vector_contacts, sliding_equilibrium
@@ -50,7 +50,7 @@ def calibrate(
     rate: float | None = None,
     identifiable_within: float = 0.3,
     method: AbstractStepper | None = None,
-    progress: bool = True,
+    progress: bool | None = None,
 ) -> Calibration:
     """Parameters of a scene from one or several recordings.
 
@@ -134,10 +134,10 @@ def calibrate(
         else:
             guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
         search = Search(problem, guesses, recordings)
-        with tqdm(total=search.count, desc="calibrate", disable=None if progress else True) as bar:
-            for stage in search.run():
-                bar.set_postfix_str(stage)
-                bar.update()
+        with following("calibrate", shown=progress, total=search.count, unit=" stages"):
+            for number, words in enumerate(search.run()):
+                tick(min(number, 1))
+                stage(words)
         result = concluded(search, blocks, float(identifiable_within))
         # If there is no signal, contact events do not explain it any better.
         if not uneventful or result.outcome is FitOutcome.NO_SIGNAL:

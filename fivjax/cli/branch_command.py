@@ -9,7 +9,7 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
-from .outputs import Failure, Overwrite, output_paths, say, waiting
+from .outputs import Failure, Overwrite, output_paths, say
 from .parsing import axis, bound
 
 
@@ -45,8 +45,7 @@ class Branch:
             label = "" if other is None else f"{other} = {value:g}"
             here = scene if other is None else scene.replace(**{other: value})
             try:
-                with waiting(f"branch {label}: compiling and following"):
-                    branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
+                branches[label] = fj.continue_cycle(here, name, bounds, points=self.points)
             except fj.NoLimitCycle as none:
                 raise Failure(f"{label + ': ' if label else ''}{none}") from none
         for path, found in zip(data, branches.values(), strict=False):

@@ -11,6 +11,7 @@ import tyro
 
 import fivjax as fj
 
+from ..foundation.progress import in_lines
 from .analysis_commands import Calibrate, Cea
 from .branch_command import Branch
 from .compiled_code import keep_compiled_code
@@ -51,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     keep_compiled_code()
     try:
-        with _terminated_like_interrupted():
+        with _terminated_like_interrupted(), in_lines():
             command.run()
     except (ValueError, TypeError) as error:
         print(f"fivjax: {error}", file=sys.stderr)

@@ -8,7 +8,7 @@ import tyro
 import fivjax as fj
 
 from .options import SceneOptions
-from .outputs import Failure, Overwrite, output_paths, say, waiting
+from .outputs import Failure, Overwrite, output_paths, say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,8 @@ class Cycle:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
         scene = self.scene.scene()
         try:
-            with waiting("cycle: compiling and searching"):
-                cycle = fj.limit_cycle(scene)
-                others = [fj.saddle_cycle(scene, cycle)] if self.saddle else []
+            cycle = fj.limit_cycle(scene)
+            others = [fj.saddle_cycle(scene, cycle)] if self.saddle else []
         except fj.NoLimitCycle as none:
             raise Failure(str(none)) from none
         fj.save(cycle, data)

@@ -1,10 +1,5 @@
 """Output files: checked before any work, never overwritten without being asked for, and named at the end."""
 
-import contextlib
-import sys
-import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -51,29 +46,3 @@ def refuse_existing(*paths: Path) -> None:
 def say(*paths: Path) -> None:
     """Print which files were written."""
     print("\n".join(f"wrote {path}" for path in paths))
-
-
-@contextlib.contextmanager
-def waiting(what: str, after: float = 0.5) -> Iterator[None]:
-    """Inside this context, print every second on a terminal what the program is waiting for, and for how long; without a
-    terminal, nothing.
-    """
-    if not sys.stderr.isatty():
-        yield
-        return
-    done, begin = threading.Event(), time.perf_counter()
-
-    def tick() -> None:
-        wait = after
-        while not done.wait(wait):
-            print(f"\r{what} … {time.perf_counter() - begin:.0f} s", end="", file=sys.stderr, flush=True)
-            wait = 1.0
-        print("\r\033[K", end="", file=sys.stderr, flush=True)
-
-    ticker = threading.Thread(target=tick, daemon=True)
-    ticker.start()
-    try:
-        yield
-    finally:
-        done.set()
-        ticker.join()

@@ -9,7 +9,7 @@ import tyro
 import fivjax as fj
 
 from .options import MethodOptions, SceneOptions
-from .outputs import Overwrite, output_paths, say, waiting
+from .outputs import Overwrite, output_paths, say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +33,7 @@ class Simulate:
     def run(self) -> None:
         endings = (".nc", ".png", "_energy.png") if self.energy else (".nc", ".png")
         data, picture, *balance = output_paths(self.out, self.overwrite, *endings)
-        with waiting("simulate: compiling and stepping"):
-            run = fj.simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
+        run = fj.simulate(self.scene.scene(), self.t1, self.dt_save, self.method.stepper(), energy=self.energy)
         fj.save(run, data)
         fj.save_figure(fj.plot.response(run, self.quantity), picture)
         for path in balance:

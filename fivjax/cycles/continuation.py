@@ -15,6 +15,7 @@ from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.event_exact import EventExact
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+@reported("branch")
 @in_double_precision
 def continue_cycle(
     scene: Scene,
@@ -47,6 +49,7 @@ def continue_cycle(
     *,
     points: int = 400,
     derivatives: bool = False,
+    progress: bool | None = None,
 ) -> "xr.Dataset":
     """The branch of limit cycles, stable and unstable, that contains a given one, over a parameter of the scene.
 
@@ -61,6 +64,7 @@ def continue_cycle(
     - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own value lies between them.
     - `start`: as in `limit_cycle`; a `LimitCycle` may be unstable. Unless given, the scene's limit cycle, or its saddle cycle
       if the limit cycle is a torus.
+    - `progress`: as in `limit_cycle`.
     - `points`: the largest number of cycles computed in each direction.
     - `derivatives`: whether to differentiate special points in all parameters.
 
@@ -126,6 +130,8 @@ def continue_cycle(
     first = seen(family, curve, place)
     down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
     along = [*reversed(down.points), first, *up.points]
+    if derivatives:
+        stage("differentiating special points")
     slopes = derivatives_of_special_points(family, along) if derivatives else None
     return labelled(_dataset(xr, family, along, slopes), final, parameter=parameter).assign_attrs(
         parameter=parameter, begins=down.ending, ends=up.ending

@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
 from ..model.scene import Scene
 from .cycle import LimitCycle, point_of
 from .nearby import next_to
@@ -37,8 +38,11 @@ class CycleDerivatives(eqx.Module):
         return "\n".join([head, *rows])
 
 
+@reported("derivatives of a cycle")
 @in_double_precision
-def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: bool = False) -> CycleDerivatives:
+def cycle_derivatives(
+    cycle: LimitCycle, wrt: Iterable[str], *, multipliers: bool = False, progress: bool | None = None
+) -> CycleDerivatives:
     """Derivatives of period, peak tangential speed, state and multipliers of a periodic limit cycle.
 
         d = fj.cycle_derivatives(fj.limit_cycle(scene), ["mu", "belt_speed", "k1"])
@@ -46,7 +50,7 @@ def cycle_derivatives(cycle: LimitCycle, wrt: Iterable[str], *, multipliers: boo
 
     **Arguments:** `cycle`, from `limit_cycle` or `saddle_cycle`; `wrt`, names of parameters of its scene; `multipliers`,
     whether to differentiate the multipliers of the section's return map, too (largest first). This takes second derivatives,
-    which need minutes to compile.
+    which need minutes to compile; `progress` as in `limit_cycle`.
 
     **Returns:** `CycleDerivatives`.
 

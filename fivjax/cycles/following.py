@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..foundation.progress import stage
 from .branch_points import Point, seen
 from .meeting_sliding import where_sliding_is_met
 from .mode_changes import change_of_modes
@@ -37,6 +38,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
     points: list[Point] = []
     step = FIRST
     while len(points) < most:
+        stage(f"following, {len(points)} cycles so far")
         ahead = _ahead(curve, here.place, tangent, step)
         if ahead is None:
             return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported, stage
 from ..linear.spectrum import eigenvalues
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
 from ..steppers.event_exact import EventExact
@@ -33,12 +34,13 @@ FADED = 1e-2
 UNSTABLE = 1e-6
 
 
+@reported("saddle cycle")
 @in_double_precision
-def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
+def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: bool | None = None) -> LimitCycle:
     """The unstable cycle on the boundary between steady sliding and a limit cycle, under the final load.
 
     **Arguments:** `scene`, whose steady sliding is stable; `cycle`, the limit cycle on the other side, `limit_cycle(scene)`
-    unless given.
+    unless given; `progress` as in `limit_cycle`.
 
     **Returns:** a `LimitCycle` with exactly one multiplier outside the unit circle.
 
@@ -61,7 +63,8 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None) -> LimitCycle:
     stepper = EventExact()
     fates = _Fates(scene, stepper, cycle)
     low, high = np.zeros_like(cycle.deviation), cycle.deviation
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
+        stage(f"tracking the edge, round {number + 1}")
         low, high = fates.narrowed(low, high)
         paths = fates.together(low, high)
         found = fates.saddle_near(paths)

@@ -13,6 +13,7 @@ from ..contact import Contact, State, Status, status_from_forces
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported, stage
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..simulation.trajectory import Trajectory
@@ -57,8 +58,9 @@ class NoLimitCycle(ValueError):
     """
 
 
+@reported("limit cycle")
 @in_double_precision
-def limit_cycle(scene: Scene, start=None) -> LimitCycle:
+def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> LimitCycle:
     r"""A limit cycle of the scene under its final load.
 
     It is a fixed point $P(y) = y$ of the return map $P$ of the Poincaré section (where the tangential velocity rises through
@@ -67,6 +69,7 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
     pair of a state `(2n,)` in m and m/s and a status. From such a start, an unstable cycle may be found, too. Without `start`,
     trajectories are released from rest under several loads, and the stable cycle with the largest amplitude is returned.
+    `progress`: whether to show what it is doing; unless given, in terminals and notebooks.
 
     **Returns:** a `LimitCycle`.
 
@@ -103,12 +106,14 @@ def limit_cycle(scene: Scene, start=None) -> LimitCycle:
     )
 
 
+@reported("limit cycles")
 @in_double_precision
-def limit_cycles(scene: Scene, starts: Sequence = ()) -> list[LimitCycle]:
+def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None = None) -> list[LimitCycle]:
     """All stable limit cycles that a search finds, the one with the largest amplitude first.
 
     Trajectories are released from rest under several multiples of the final load, and from each of `starts` (states `(2n,)`
     in m and m/s, or trajectories). Several cycles may coexist; there may be others that no trajectory reached.
+    `progress` as in `limit_cycle`.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
 
@@ -148,6 +153,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
     for look in range(LOOKS):
         if not len(open_):
             break
+        stage(f"searching, {len(open_)} of {many} motions on their way" if look else "compiling, releasing motions")
         returns = points_along(scene, stepper, now, POINTS)
         y = np.asarray(returns.point.y)
         sizes = np.linalg.norm(weights * y, axis=-1)
@@ -169,6 +175,7 @@ def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met
             # Tori are sought only with one contact.
             turn = look % TORUS_AFTER == TORUS_AFTER - 1 and len(scene.structure.contacts) == 1
             if cycle is None and turn and _keeps_its_size(sizes[k]):
+                stage("following a torus")
                 cycle = torus_of(scene, stepper, here)
             if cycle is not None and cycle.stable and not _among(found, cycle):
                 found.append(cycle)
@@ -258,6 +265,7 @@ def _closed_near(
     if np.min(back) > NEARLY:
         return None
     crossings = int(np.argmax(back <= max(1.5 * np.min(back), 1e-9))) + 1
+    stage("closing a cycle")
     closed = close(scene, stepper, point, crossings)
     if closed is None or not _moves(scene, closed.point):
         return None

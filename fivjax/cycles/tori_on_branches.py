@@ -7,6 +7,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
 from ..io.datasets import labelled
 from ..steppers.event_exact import EventExact
 from .continuation import cycle_at
@@ -21,8 +22,9 @@ RELEASED = (1e-3, -1e-3, 0.02, -0.02)
 KINDS = ("torus", "locked", "another cycle", "none")
 
 
+@reported("tori")
 @in_double_precision
-def tori_along(branch: "xr.Dataset", points: int = 12) -> "xr.Dataset":
+def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None = None) -> "xr.Dataset":
     """The attractors beside the cycles of a branch that a pair of multipliers has made unstable.
 
         tori = fj.tori_along(fj.continue_cycle(scene, "mu", (0.02, 0.3)))
@@ -30,7 +32,8 @@ def tori_along(branch: "xr.Dataset", points: int = 12) -> "xr.Dataset":
     Where exactly one complex pair of multipliers lies outside the unit circle, beyond a Neimark–Sacker bifurcation, motions are
     released beside some of the cycles and followed to their attractor.
 
-    **Arguments:** `branch`, from `continue_cycle`; `points`, the largest number of its points that are examined.
+    **Arguments:** `branch`, from `continue_cycle`; `points`, the largest number of its points that are examined;
+    `progress` as in `continue_cycle`.
 
     **Returns:** a dataset over `point`: `place` (the index on the branch), `parameter`, `kind` ("torus"; "locked", a cycle that
     closes after more crossings of the section; "another cycle"; "none", if no attractor was found), `amplitude` (peak

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import following, stage, tick
 from ..io.datasets import labelled
 from ..model.scene import Scene
 from ..model.structure import Structure
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @in_double_precision
-def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr.Dataset":
+def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | None = None, **parameters) -> "xr.Dataset":
     r"""The modes of steady sliding over one parameter, each followed along the axis.
 
         fj.cea.modes(fj.belt_oscillator(), mu=np.linspace(0, 0.5, 501))
@@ -30,7 +31,8 @@ def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     halved until none does. Modes that cross without coupling are told apart by their shapes. Where two modes meet (undamped
     coalescence), nothing distinguishes them beyond; the one of higher frequency continues as the one that grows.
 
-    **Arguments:** `system`; one axis by name, as in `chart`; single numbers replace the system's own value.
+    **Arguments:** `system`; one axis by name, as in `chart`; single numbers replace the system's own value; `progress`, whether
+    to show how far it is: unless given, in terminals and notebooks.
 
     **Returns:** a dataset over the axis and `mode` with `frequency` (Hz, damped), `growth_rate` (1/s), `damping_ratio`
     (-Re λ/|λ|), `eigenvalue` (the one of the pair with positive imaginary part, or the larger of two real ones; 1/s),
@@ -45,18 +47,24 @@ def modes(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     """
     scene, axes = with_axes(system, direction, parameters, count=1)
     ((name, values),) = axes.items()
-    at = Sampler(scene, name)
-    samples = at.many(values)
-    followed = [samples[0]]
-    for k in range(1, len(values)):
-        before, now = followed[-1], samples[k]
-        at.looks = LOOKS
-        if before is not None and now is not None:
-            now = now.taken(matched(at, values[k - 1], before, values[k], now, HALVINGS))
-        followed.append(now)
-    dataset = _modes_dataset(scene, name, values, followed)
-    if name == "mu" and scene.friction.constant:
-        dataset = dataset.assign(_limits(scene))
+    with following("modes", shown=progress, total=len(values), unit=" values"):
+        stage("compiling")
+        at = Sampler(scene, name)
+        samples = at.many(values)
+        stage("following")
+        followed = [samples[0]]
+        tick()
+        for k in range(1, len(values)):
+            before, now = followed[-1], samples[k]
+            at.looks = LOOKS
+            if before is not None and now is not None:
+                now = now.taken(matched(at, values[k - 1], before, values[k], now, HALVINGS))
+            followed.append(now)
+            tick()
+        dataset = _modes_dataset(scene, name, values, followed)
+        if name == "mu" and scene.friction.constant:
+            stage("finding the stability limit")
+            dataset = dataset.assign(_limits(scene))
     return labelled(dataset, scene, analysis="modes of steady sliding", direction=direction)
 
 

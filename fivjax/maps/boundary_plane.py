@@ -16,6 +16,7 @@ from ..cycles.section_map import sliding_state
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
 from ..io.datasets import labelled
 from ..model.load import Pulse
 from ..model.scene import Scene
@@ -35,9 +36,15 @@ FLAT = 0.5
 ROUNDS, INSIDE = 2, 15
 
 
+@reported("boundary section")
 @in_double_precision
 def boundary_section(
-    scene: Scene, *, reach: float = 0.15, points: int = 41, p_range: tuple[float, float] = (1.0, 5.0)
+    scene: Scene,
+    *,
+    reach: float = 0.15,
+    points: int = 41,
+    p_range: tuple[float, float] = (1.0, 5.0),
+    progress: bool | None = None,
 ) -> "xr.Dataset":
     """The boundary between sliding and squeal in a plane of the Poincaré section through the saddle cycle.
 

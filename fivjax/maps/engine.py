@@ -14,12 +14,12 @@ from typing import Protocol
 
 import jax
 import numpy as np
-from tqdm.auto import tqdm
 
 from ..batches.attractors import Attractors
 from ..batches.blocks import workers as cores
 from ..batches.results import Verdicts, counted, not_run
 from ..batches.sharing import grouped
+from ..foundation.progress import Work, following
 from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -94,13 +94,18 @@ def run_to_verdict(
 
     attractors = {} if attractors is None else attractors
     at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
-    with stop_requests() as requested, _Bar(label, total, total - int(verdicts.pending().sum()), progress) as bar:
+    already, unit = total - int(verdicts.pending().sum()), " trajectories"
+    with (
+        stop_requests() as requested,
+        following(label, shown=progress, total=total, already=already, unit=unit) as work,
+    ):
+        ended = _Ended(work)
         try:
             # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
             needed_later = places is not None or bool(plan.parts[-1])
             for part in plan.parts:
                 _follow(
-                    plan, part, rows, verdicts, attractors, executor, at_a_time, keeper, needed_later, bar, requested
+                    plan, part, rows, verdicts, attractors, executor, at_a_time, keeper, needed_later, ended, requested
                 )
         except KeyboardInterrupt:
             left = int(verdicts.pending().sum())
@@ -125,7 +130,7 @@ def _follow(
     at_a_time: int,
     keeper: Keeper | None,
     needed_later: bool,
-    bar: "_Bar",
+    ended: "_Ended",
     requested: list[int],
 ) -> None:
     """Run the jobs of one part of the plan whose results are missing in the `rows` of each, and add the attractors that they
@@ -153,12 +158,12 @@ def _follow(
         if keeper is not None:
             keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else {})
         if workers is not None:
-            bar.ended(len(plan.jobs[number]))
+            ended(len(plan.jobs[number]))
 
     def given_up(number: int) -> None:
         # Not kept on disk: with more memory, or on another machine, the job may succeed.
         verdicts.verdict[rows(number)] = Verdict.WORKER_LOST
-        bar.ended(len(plan.jobs[number]))
+        ended(len(plan.jobs[number]))
 
     def stop() -> bool:
         return bool(requested)
@@ -169,7 +174,7 @@ def _follow(
         failed = []
 
         def report(count: int) -> None:
-            bar.ended(count)
+            ended(count)
             if requested or failed:
                 raise KeyboardInterrupt
 
@@ -194,30 +199,18 @@ def _follow(
             attractors.setdefault(key, one)
 
 
-class _Bar:
-    """A progress bar of trajectories that have ended; several threads may update it."""
+class _Ended:
+    """Counts trajectories that have ended; several threads may report to it."""
 
-    def __init__(self, label: str, total: int, already: int, shown: bool | None):
-        self.label, self.reports, self.lock = label, 0, threading.Lock()
-        self.bar = tqdm(
-            total=total,
-            initial=already,
-            # Nothing moves until the first round is compiled, which may take longer than the map.
-            desc=f"{label}, compiling …",
-            unit=" trajectories",
-            disable=None if shown is None else not shown,
-        )
+    def __init__(self, work: Work):
+        self.work, self.reports, self.lock = work, 0, threading.Lock()
+        # Nothing moves until the first round is compiled, which may take longer than the map.
+        work.enter("compiling …")
 
-    def __enter__(self) -> "_Bar":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.bar.close()
-
-    def ended(self, count: int) -> None:
+    def __call__(self, count: int) -> None:
         """Count so many more trajectories as ended."""
         with self.lock:
             self.reports += 1
             if self.reports == 2 or (self.reports == 1 and count):  # the first report comes before any step
-                self.bar.set_description(self.label, refresh=False)
-            self.bar.update(count)
+                self.work.enter("")
+            self.work.advance(count)

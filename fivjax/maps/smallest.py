@@ -20,6 +20,7 @@ from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..verdicts.sliding_proof import envelope_peak
@@ -75,6 +76,7 @@ def smallest_kick(
     *,
     p_step: float = 0.01,
     pieces: int = 16,
+    progress: bool | None = None,
 ) -> SmallestPerturbation: ...
 
 
@@ -86,9 +88,11 @@ def smallest_kick(
     *,
     p_step: float = 0.01,
     pieces: int = 16,
+    progress: bool | None = None,
 ) -> SmallestKick: ...
 
 
+@reported("smallest kick")
 @in_double_precision
 def smallest_kick(
     scene: Scene,
@@ -97,6 +101,7 @@ def smallest_kick(
     *,
     p_step: float = 0.01,
     pieces: int = 16,
+    progress: bool | None = None,
 ) -> "SmallestKick | SmallestPerturbation":
     """The smallest perturbation that leads to a limit cycle, and a certified bound below which none does.
 

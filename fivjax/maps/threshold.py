@@ -9,6 +9,7 @@ import xarray as xr
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
@@ -28,6 +29,7 @@ from .executors import with_workers
 POINTS_PER_ROUND = 15
 
 
+@reported("critical kicks")
 @in_double_precision
 @with_workers
 def critical_perturbation(
@@ -143,6 +145,7 @@ def critical_perturbation(
         stepping = np.where(np.isnan(fine.low), 0.0, np.abs(coarse.middle - fine.middle))
     answers = {}
     if derivatives:
+        stage("Newton's method and derivatives")
         fine, answers = with_derivatives(scene, functools.partial(_verdicts, run, method), columns, fine)
     # If the lower end of the range already squeals, there is no kick that slides.
     width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)

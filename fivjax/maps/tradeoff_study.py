@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from tqdm.auto import tqdm
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import following, stage, tick
 from ..io.datasets import labelled
 from ..linear.cea import eigenvalues
 from ..model.friction import Coulomb, ExponentialDecay
@@ -97,20 +97,24 @@ def tradeoff(
     measures = ("cost", "state_error", "p_crit_error", "wrong_verdicts", "undecided")
     table = {name: np.full((len(methods), len(precisions)), np.nan) for name in measures}
 
-    exact = EventExact(order=20, tolerance=1e-16)
-    reference = _end_state(scene, exact, t1)
-    edge = _boundary(scene, exact, p) if boundary else None
-    bar = tqdm(rows.items(), desc="tradeoff", unit="method", disable=None if progress is None else not progress)
-    for (name, kind), method in bar:
-        place = list(methods).index(name), precisions.index(kind)
-        own = scene if kind == "float64" else _single(scene)
-        table["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
-        table["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
-        if edge is not None and kind == "float64":
-            for measure, value in edge(method).items():
-                table[measure][place] = value
-    parts = _parts(scene, t1)
-    refined = refinement_trade(scene, refine) if refine else {}
+    with following("tradeoff", shown=progress, total=len(rows), unit=" methods"):
+        exact = EventExact(order=20, tolerance=1e-16)
+        stage("reference")
+        reference = _end_state(scene, exact, t1)
+        edge = _boundary(scene, exact, p) if boundary else None
+        for (name, kind), method in rows.items():
+            stage(f"{name}, {kind}")
+            place = list(methods).index(name), precisions.index(kind)
+            own = scene if kind == "float64" else _single(scene)
+            table["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
+            table["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
+            if edge is not None and kind == "float64":
+                for measure, value in edge(method).items():
+                    table[measure][place] = value
+            tick()
+        stage("parts")
+        parts = _parts(scene, t1)
+        refined = refinement_trade(scene, refine) if refine else {}
     halvings = {"halvings": np.arange(refine + 1)} if refine else {}
     dataset = xr.Dataset(
         {

@@ -3,9 +3,8 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from tqdm.auto import tqdm
-
 from ..foundation.precision import in_double_precision
+from ..foundation.progress import following, stage, tick
 from ..io.datasets import check_writable, save, save_figure, save_text
 from . import pictures
 from .figures import FIGURES
@@ -62,15 +61,16 @@ def reproduce(
             out.mkdir()
         check_writable(out / REPORT)
     runs, made = Runs(), Reproduction()
-    bar = tqdm(names, desc="reproduce", unit="figure", disable=None if progress is None else not progress)
-    for name in bar:
-        bar.set_postfix_str(_file_name(name))
-        one = FIGURES[name](runs)
-        pictures.captioned(one.picture, one.caption)
-        made[name] = one
-        if out is not None:
-            save_figure(one.picture, out / f"{_file_name(name)}.png")
-            save(one.data, out / f"{_file_name(name)}.nc")
+    with following("reproduce", shown=progress, total=len(names), unit=" figures"):
+        for name in names:
+            stage(_file_name(name))
+            one = FIGURES[name](runs)
+            pictures.captioned(one.picture, one.caption)
+            made[name] = one
+            if out is not None:
+                save_figure(one.picture, out / f"{_file_name(name)}.png")
+                save(one.data, out / f"{_file_name(name)}.nc")
+            tick()
     if out is not None:
         save_text(markdown(made), out / REPORT)
     return made

@@ -17,6 +17,7 @@ from jaxtyping import Array
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, known_to_numpy
+from ..foundation.progress import reported
 from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
@@ -64,6 +65,7 @@ class Derivatives(eqx.Module):
         return f"No derivative can be relied on: {where}, the sequence of events is about to be another."
 
 
+@reported("derivatives")
 @in_double_precision
 def derivatives(
     functional: Callable[[Trajectory], Array],
@@ -76,6 +78,7 @@ def derivatives(
     mode: str = "forward",
     method: AbstractStepper | None = None,
     margin: float = 1e-6,
+    progress: bool | None = None,
 ) -> Derivatives:
     """Derivatives of a functional of a trajectory in parameters of the scene, and whether they exist.
 

@@ -16,6 +16,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation.compiling import compiled
 from ..foundation.precision import known_to_numpy
+from ..foundation.progress import stage, tick
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper, rates
@@ -55,11 +56,14 @@ def rows_in_parts(
 
 def _parts(scene, method, y0, saved, most, energy) -> Iterator[dict]:
     bound, begin = np.asarray(most, np.int32), None
+    stage("compiling")
     for first in range(0, max(len(saved) - 1, 1), IN_A_PART):
         own = saved[first : first + IN_A_PART + 1]
         padded = np.pad(own, (0, IN_A_PART + 1 - len(own)), mode="edge")
         begin = _at_start(scene, y0, padded, energy) if begin is None else begin
         found, begin = _part(scene, method, y0, begin, padded, bound, energy)
+        stage("stepping")
+        tick(len(own) - 1)
         # A part begins where the one before it ended. Cut as NumPy arrays: JAX would compile a slice for each number of rows.
         kept = slice(min(first, 1), len(own))
         yield jax.tree.map(lambda leaf, kept=kept: known_to_numpy(leaf)[kept], found)

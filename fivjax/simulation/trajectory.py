@@ -22,6 +22,7 @@ from ..foundation.precision import (
     real,
     refusing_reverse_in_single_precision,
 )
+from ..foundation.progress import following
 from ..io.datasets import labelled
 from ..model.contact_coordinates import in_contact_coordinates, transformation
 from ..model.scene import Scene, refuse_painleve
@@ -146,6 +147,7 @@ def simulate(
     y0=None,
     energy: bool = False,
     derivatives: str = "both",
+    progress: bool | None = None,
 ) -> Trajectory:
     """The response of a scene from t = 0 to `t1`.
 
@@ -161,6 +163,7 @@ def simulate(
     - `derivatives`: the modes in which JAX may differentiate the run, "both", "forward", "reverse" or "none". One mode is
       faster than both (`jax.grad` about ten times). "none", for runs that are only compiled or batched, is up to twice as fast
       again, because derivatives need shorter steps. It has an effect only inside a JAX transformation.
+    - `progress`: whether to show how far a run of more than a second is; unless given, in terminals and notebooks.
 
     **Returns:** a `Trajectory` of NumPy arrays (of JAX arrays inside `jit`, `grad` or `vmap`). Where the motion is no longer
     finite, grows without bound, or has contact events without end, the rows from there on are NaN; `run.outcome`
@@ -194,7 +197,9 @@ def simulate(
         )
     refuse_painleve(scene)
     if not scene.structure.contacts_at_coordinates:
-        return _in_contact_coordinates(scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives)
+        return _in_contact_coordinates(
+            scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
+        )
     rows = math.ceil(t1 / dt_save - 1e-9)
     if rows > MOST_ROWS:
         raise ValueError(
@@ -211,7 +216,8 @@ def simulate(
     stepper = with_step_as_array(method)
     # Runs with known values are not differentiated.
     if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
-        found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
+        with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
+            found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
     else:
         modes = None if derivatives == "none" else derivatives
         found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
