@@ -190,10 +190,10 @@ def _shown_as(shown: bool | None) -> str:
 
 def _has_room() -> bool:
     """Whether there is a notebook, or a terminal in which a bar has room: those of some job systems have no columns."""
+    if type(sys.stderr).__module__.startswith("ipykernel."):
+        return True
     try:
-        if not sys.stderr.isatty():
-            return False
-        return "ipykernel" in sys.modules or os.get_terminal_size(sys.stderr.fileno()).columns > 0
+        return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except (AttributeError, OSError, ValueError):
         return False
 
