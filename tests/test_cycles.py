@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import fivjax as fj
+from fivjax.cycles import search
 from fivjax.cycles.torus import off_the_curve
 
 REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
@@ -163,11 +165,60 @@ def test_points_of_an_ellipse_lie_on_cubics_to_the_fourth_power_of_their_distanc
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.1)
 
 
-@pytest.mark.parametrize("belt_speed", [0.3, 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [0.2, 0.24, 0.27])
+def test_a_stick_slip_cycle_beside_stable_sliding_is_met_without_a_start(speed):
+    """Verasztó and Stépán's rig above its Hopf point: sliding attracts, and so does stick-slip, with an unstable cycle between.
+    Kicks by the load alone are too small there: 1 N moves the mass by less than the unstable cycle.
+    """
+    mass, stiffness, damping, high, low, decay = 0.538, 6957.0, 5.946, 6.0, 2.0, 10.0
+    structure = fj.Structure(
+        np.diag([mass, 1.0]), np.diag([damping, 1.0]), np.diag([stiffness, 1.0]), [0.0, -1.0], tangential=0, normal=1
+    )
+    cycle = fj.limit_cycle(fj.Scene(structure, fj.ExponentialDecay(high, low, decay), speed, fj.ConstantLoad(1.0)))
+
+    def force(slip):
+        return low + (high - low) * np.exp(-decay * slip)
+
+    def motion(t, y):
+        return [y[1], (force(speed - y[1]) - stiffness * y[0] - damping * y[1]) / mass]
+
+    def sticks(t, y):
+        return speed - y[1]
+
+    sticks.direction, sticks.terminal = -1, True
+    # Sticking ends where spring and damper reach the static force; it begins where the mass is as fast as the belt again.
+    begin = [(high - damping * speed) / stiffness, speed]
+    slip = solve_ivp(motion, (0.0, 0.2), begin, "DOP853", events=sticks, rtol=1e-12, atol=1e-15)
+    times = [t for t in slip.t_events[0] if t > 1e-4]
+    assert len(times) == 1
+    durations = {phase.status: phase.duration for phase in cycle.word}
+    assert durations[fj.Status.SLIDE] == pytest.approx(times[0], abs=1e-9)
+    assert durations[fj.Status.STICK] == pytest.approx((begin[0] - slip.y_events[0][-1][0]) / speed, abs=1e-9)
+    assert cycle.stable
+
+
+@pytest.mark.slow
+def test_a_cycle_that_only_a_slower_belt_s_leads_to_is_met(monkeypatch):
+    """Where motions released about sliding all come to rest, the cycle of a slower belt is followed to this one."""
+    monkeypatch.setattr(search, "SPEEDS", ())
+    monkeypatch.setattr(search, "FURTHER_SPEEDS", ())
+    monkeypatch.setattr(search, "LOADS", (1.0, 1.01))
+    monkeypatch.setattr(search, "FURTHER_LOADS", (1.02,))
+    # At 0.4 of 1.8 m/s sliding is unstable, so that every motion comes to the cycle.
+    found = fj.limit_cycle(benchmark_a(1.8))
+    reference = REFERENCE["benchmark_a"]["stick_slip"]["1.8"]
+    assert found.period == pytest.approx(reference["slip_time"] + reference["stick_time"], abs=1e-8)
+
+
+@pytest.mark.parametrize("belt_speed", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_below_the_fold_there_is_none(belt_speed):
     """Just below its fold the cycle's ghost holds trajectories for hundreds of periods; it is no cycle."""
     fold = {0.3: 0.1156, 1.0: 0.1679}[belt_speed]
-    with pytest.raises(fj.NoLimitCycle, match="No limit cycle was met"):
+    searched = (
+        r"from rest under 0 to 20 times the final load, nor by 6 from sticking .* at 0\.7 and 0\.4 of the belt speed"
+    )
+    with pytest.raises(fj.NoLimitCycle, match=searched):
         fj.limit_cycle(paper(belt_speed, mu=0.99 * fold))
 
 

@@ -23,8 +23,13 @@ from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
 from .torus import POINTS, SIDE_BY_SIDE, on_torus, torus_of
 
-# Trajectories are released from rest under these multiples of the final load.
-RELEASES = (1.2, 1.5, 2.0, 3.0, 4.5, 6.0)
+# Motions are released from rest under these multiples of the final load, and with the tangential velocities of steady sliding
+# moved by these multiples of the belt's: at 1 the contacts stick. The further ones only where the first meet nothing.
+LOADS, SPEEDS = (0.0, 1.2, 1.5, 2.0, 3.0, 4.5, 6.0), (1.0,)
+FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
+# Where these meet nothing either: shares of the belt speed at which a cycle is sought that is then followed to the whole of
+# it, in so many steps.
+SLOWER, STEPS = (0.7, 0.4), 6
 # How often trajectories are examined, once after each `POINTS` points of the section.
 LOOKS = 40
 # The largest number of points of the section in one period that is tried for a periodic motion.
@@ -68,7 +73,10 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 
     **Arguments:** `scene`; `start`, a first guess: a `Trajectory` (its last row), a `LimitCycle` (of a similar scene), or a
     pair of a state `(2n,)` in m and m/s and a status. From such a start, an unstable cycle may be found, too. Without `start`,
-    trajectories are released from rest under several loads, and the stable cycle with the largest amplitude is returned.
+    motions are released from rest under several loads and from sticking; where none comes to a cycle, with larger kicks to both
+    sides, and then from a cycle at a lower belt speed. Of the stable cycles and tori that they come to, the one with the
+    largest amplitude is returned. There may be larger ones: a torus is accepted only if a few thousand returns show its curve,
+    where a map follows it for longer.
     `progress`: whether to show what it is doing; unless given, in terminals and notebooks.
 
     **Returns:** a `LimitCycle`.
@@ -85,25 +93,26 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
     _check(scene)
     stepper = EventExact()
     if start is None:
-        met = attractors_met(scene, stepper, _released(scene, ()))
+        met = _met(scene, stepper)
         if not met or met[0].cycle is None:
             family = " Some came to periodic motions that are one of a family each: a second multiplier is 1."
             irregular = " Some stayed in motion, but near neither a cycle nor a torus that could be computed."
+            slower = " and ".join(f"{share:g}" for share in SLOWER)
             raise NoLimitCycle(
-                f"No limit cycle was met: none of the {len(RELEASES)} trajectories released ended on one."
-                f"{family if any(one.why == FAMILY_MET for one in met) else ''}"
+                f"No limit cycle was met: not by {len(LOADS + FURTHER_LOADS)} motions released from rest under 0 to "
+                f"{max(FURTHER_LOADS):g} times the final load, nor by {len(SPEEDS + FURTHER_SPEEDS)} from sticking and from "
+                f"{min(FURTHER_SPEEDS):g} to {max(FURTHER_SPEEDS):g} times the belt's speed, nor from a cycle at {slower} of "
+                f"the belt speed.{family if any(one.why == FAMILY_MET for one in met) else ''}"
                 f"{irregular if any(one.why == SUSTAINED for one in met) else ''} "
                 f"If you know a motion near one, give it as `start`."
             )
         return met[0].cycle
-    guess, crossings = _guess(scene, stepper, start)
-    for count in crossings:
-        closed = close(scene, stepper, guess, count)
-        if closed is not None and _moves(scene, closed.point):
-            return limit_cycle_of(scene, stepper, closed)
-    raise NoLimitCycle(
-        "No limit cycle was met from `start`: Newton's method did not close a cycle near it. Give a motion closer to one."
-    )
+    cycle = _closed_from(scene, stepper, start)
+    if cycle is None:
+        raise NoLimitCycle(
+            "No limit cycle was met from `start`: Newton's method did not close a cycle near it. Give a motion closer to one."
+        )
+    return cycle
 
 
 @reported("limit cycles")
@@ -111,8 +120,8 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None = None) -> list[LimitCycle]:
     """All stable limit cycles that a search finds, the one with the largest amplitude first.
 
-    Trajectories are released from rest under several multiples of the final load, and from each of `starts` (states `(2n,)`
-    in m and m/s, or trajectories). Several cycles may coexist; there may be others that no trajectory reached.
+    Motions are released as in `limit_cycle`, and from each of `starts` (states `(2n,)` in m and m/s, or trajectories). Several
+    cycles may coexist; there may be others that no motion reached, and tori that could not be computed.
     `progress` as in `limit_cycle`.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
@@ -125,7 +134,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
     """
     _check(scene)
     stepper = EventExact()
-    return [met.cycle for met in attractors_met(scene, stepper, _released(scene, starts)) if met.cycle is not None]
+    return [met.cycle for met in _met(scene, stepper, starts) if met.cycle is not None]
 
 
 class Met(NamedTuple):
@@ -133,6 +142,40 @@ class Met(NamedTuple):
 
     cycle: LimitCycle | None
     why: str
+
+
+def _met(scene: Scene, stepper: EventExact, starts: Sequence = ()) -> list[Met]:
+    """What motions come to that are released about steady sliding and from `starts`: the further ones only if there is no cycle
+    yet, and then a cycle that is followed from a lower belt speed.
+    """
+    met = attractors_met(scene, stepper, _released(scene, LOADS, SPEEDS, starts))
+    if not any(one.cycle for one in met):
+        met += attractors_met(scene, stepper, _released(scene, FURTHER_LOADS, FURTHER_SPEEDS))
+    if not any(one.cycle for one in met):
+        cycle = _from_slower(scene, stepper)
+        met = met if cycle is None else [Met(cycle, "computed"), *met]
+    return sorted(met, key=lambda one: -one.cycle.amplitude if one.cycle else 0.0)
+
+
+def _from_slower(scene: Scene, stepper: EventExact) -> LimitCycle | None:
+    """A stable cycle, followed in steps from one that is met at a lower belt speed."""
+    for share in SLOWER:
+        stage(f"searching at {share:g} of the belt speed")
+        slower = scene.replace(belt_speed=share * scene.belt_speed)
+        try:
+            sliding_equilibrium(under_final_load(slower))
+        except ValueError:
+            continue
+        met = attractors_met(slower, stepper, _released(slower, LOADS, SPEEDS))
+        for cycle in (one.cycle for one in met if one.cycle is not None and one.cycle.kind == "periodic"):
+            found: LimitCycle | None = cycle
+            for part in np.linspace(share, 1.0, STEPS + 1)[1:]:
+                found = _closed_from(scene.replace(belt_speed=part * scene.belt_speed), stepper, found)
+                if found is None:
+                    break
+            if found is not None and found.stable:
+                return found
+    return None
 
 
 def attractors_met(scene: Scene, stepper: EventExact, starts: Point) -> list[Met]:
@@ -286,11 +329,17 @@ def _in_contact_mode(scene: Scene, y: State) -> Contact:
     return jax.vmap(lambda y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(y)
 
 
-def _released(scene: Scene, starts: Sequence) -> Point:
-    states = np.asarray(_released_states(scene, jnp.asarray(RELEASES)))
+def _released(scene: Scene, loads: Sequence[float], speeds: Sequence[float], starts: Sequence = ()) -> Point:
+    """Motions from rest under multiples of the final load, from steady sliding with multiples of the belt's speed, and from
+    given states.
+    """
     rest = np.asarray(sliding_state(scene, scene.load.final))
+    tangential, _ = contact_coordinates(scene.structure)
+    moved = np.zeros((len(speeds), len(rest)))
+    moved[:, scene.structure.size + np.atleast_1d(tangential)] = np.outer(speeds, np.atleast_1d(scene.belt_speed))
     given = [_state_of(scene, start) - rest for start in starts]
-    return states_in_contact(scene, jnp.asarray(np.concatenate([states, np.stack(given)]) if given else states))
+    states = np.concatenate([np.asarray(_released_states(scene, jnp.asarray(loads))), moved, *np.array(given)[:, None]])
+    return states_in_contact(scene, jnp.asarray(states))
 
 
 def states_in_contact(scene: Scene, y: Float[jax.Array, "e state"]) -> Point:
@@ -308,6 +357,16 @@ def _state_of(scene: Scene, start) -> np.ndarray:
             f"{state.shape}."
         )
     return state
+
+
+def _closed_from(scene: Scene, stepper: EventExact, start) -> LimitCycle | None:
+    """The cycle that Newton's method closes from a motion near it, stable or not."""
+    guess, crossings = _guess(scene, stepper, start)
+    for count in crossings:
+        closed = close(scene, stepper, guess, count)
+        if closed is not None and _moves(scene, closed.point):
+            return limit_cycle_of(scene, stepper, closed)
+    return None
 
 
 def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
