@@ -35,6 +35,7 @@ class LinearSliding(eqx.Module):
     remainder: Float[Array, "*contacts m"]  # direction in which the remainder of the friction law acts
     remainder_slope: Float[Array, "*contacts"]  # bounds on that remainder, see `decays_nonlinearly`
     remainder_curvature: Float[Array, "*contacts"]
+    reach: Float[Array, ""]  # the share of all margins up to which these bounds hold, and no contact lifts off
     direction: Float[Array, "*contacts"]  # of the friction force
     exists: Bool[Array, ""]  # whether there is steady sliding, with normal forces that are not negative
     solvable: Bool[Array, ""]  # whether the contact problem has a unique solution in both directions of slip
@@ -86,6 +87,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
         remainder=jnp.concatenate([jnp.zeros(n, q.dtype), along])[keep],
         remainder_slope=slope / compliance**2,
         remainder_curvature=curvature / compliance**2 + 2 * jnp.abs(g_tn) * slope**2 / compliance**3,
+        reach=jnp.full_like(compliance, LOWEST_SLIP),
         direction=direction,
         exists=(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
         solvable=(compliance > 0) & (mechanics.normal_compliance(-direction, static) > 0),
@@ -99,7 +101,8 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     $N_0(z) = -A_0^{-1} a_n(z)$ under $D_0$, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$.
     Friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
     `remainder` has the columns of $M^{-1} P$. The remainder of the linearisation in column i is at most `remainder_slope` plus
-    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`decays_nonlinearly`).
+    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`decays_nonlinearly`). The
+    other contacts' friction changes a contact's force through $X$, too: `reach` says up to which deviation none can lift off.
     """
     n, load, law = scene.structure.size, scene.load.final, mechanics.friction
     q, normal_force = steady_sliding(scene, load)
@@ -133,6 +136,8 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     changes = jnp.abs(handed_on) * (slope * speed)
     most = LOWEST_SLIP * jnp.max(jnp.sum(changes, axis=1))
     added = jnp.max(forces + changes @ forces) / jnp.where(most < 0.9, 1 - most, 0.0)
+    # Contact by contact, the forces then change by no more than this times that deviation.
+    each = forces + changes @ (forces + LOWEST_SLIP * added)
     return LinearSliding(
         equilibrium=equilibrium,
         matrix=state_matrix(mass, damping, stiffness),
@@ -144,6 +149,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
         remainder=jnp.concatenate([jnp.zeros((n, len(direction)), q.dtype), columns])[keep].T,
         remainder_slope=slope * speed * added,
         remainder_curvature=curvature * speed**2 * forces,
+        reach=jnp.minimum(LOWEST_SLIP, jnp.min(forces / each)),
         direction=direction,
         exists=jnp.all((normal_force >= 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
         solvable=physics.slides_uniquely(mechanics),

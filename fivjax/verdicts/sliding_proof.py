@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status
-from ..linear.linearisation import LOWEST_SLIP, LinearSliding
+from ..linear.linearisation import LinearSliding
 from ..model.sliding import sliding_states
 
 ENVELOPE_DECADES = 12.0
@@ -81,20 +81,35 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     inverse = np.take_along_axis(inverse, order[:, :, None], axis=1)[:, :kept]
     vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
     count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
+    from_modal = np.einsum("gk,gmk->gmk", count, vectors)
     return SlidingModes(
         linear=linear,
         eigenvalues=eigenvalues.astype(complex),
         to_modal=inverse,
-        from_modal=count[:, None, :] * vectors,
+        from_modal=from_modal,
         regular=condition < WELL_CONDITIONED,
-        pressing=count * np.einsum("l...i,lik->l...k", linear.pressing, vectors),
-        slip=count * np.einsum("l...i,lik->l...k", linear.slip, vectors),
-        remainder=np.einsum("lki,l...i->l...k", np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
+        pressing=_of_modes(linear.pressing, from_modal),
+        slip=_of_modes(linear.slip, from_modal),
+        remainder=_in_modes(np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         slowest_decay=_slowest_decay(linear.frictionless),
         slowest_period=_slowest_period(eigenvalues),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
+
+
+def _of_modes(
+    rows: Float[np.ndarray, "groups *contacts m"], from_modal: Complex[np.ndarray, "groups m k"]
+) -> Complex[np.ndarray, "groups *contacts k"]:
+    """The shares of the modes in these functions of the state, given by their derivatives."""
+    return np.einsum("g...m,gmk->g...k", rows, from_modal)
+
+
+def _in_modes(
+    to_modal: Complex[np.ndarray, "groups k m"], columns: Float[np.ndarray, "groups *contacts m"]
+) -> Complex[np.ndarray, "groups *contacts k"]:
+    """These directions of the state in modal coordinates."""
+    return np.einsum("gkm,g...m->g...k", to_modal, columns)
 
 
 def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
@@ -136,28 +151,29 @@ def slides_forever(
         decays = decays_nonlinearly_together if mechanics.several else decays_nonlinearly
         return sliding & decays(modes, modal)
     members = modes.envelope.members
-    signals = [modes.pressing * modal, modes.slip * modal]
-    margins = [linear.pressing_margin, linear.slip_margin]
-    if mechanics.several:
-        signals, margins = (
-            [part[i] for part in parts for i in range(len(mechanics.places))] for parts in (signals, margins)
-        )
+    parts = _parts(modes.pressing, modal, linear.pressing_margin) + _parts(modes.slip, modal, linear.slip_margin)
     # The bound is costly. As the body of a loop it is computed for a batch only if some trajectory needs it: one for which
     # pressing and slip, with each cluster of modes at its present size, are within their margins.
-    for shares, margin in zip(signals, margins, strict=True):
+    for shares, margin in parts:
         sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
 
     def prove(carry):
         _, _, signals = carry
         peaks = [envelope_peak(shares, modes.envelope) for shares in signals]
         proved = jnp.asarray(True)
-        for peak, margin in zip(peaks, margins, strict=True):
+        for peak, (_, margin) in zip(peaks, parts, strict=True):
             proved = proved & (peak < margin)
         # The loop changes `signals`, because XLA would move work on loop constants out of the loop and always compute it.
         return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
 
-    begin = sliding, jnp.zeros_like(sliding), signals
+    begin = sliding, jnp.zeros_like(sliding), [shares for shares, _ in parts]
     return jax.lax.while_loop(lambda carry: carry[0], prove, begin)[1]
+
+
+def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], margin: Float[Array, "*contacts"]):
+    """Of each contact the parts of the modes in a quantity with these shares, and how far it may fall."""
+    parts = shares * modal
+    return [(parts, margin)] if margin.ndim == 0 else [(parts[i], margin[i]) for i in range(len(margin))]
 
 
 def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
@@ -224,22 +240,24 @@ def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool
     drive = jnp.sum(weights * jnp.abs(modes.remainder))
     bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
     rate = -jnp.max(modes.eigenvalues.real)
-    return (drive * bend * size < rate) & (size < LOWEST_SLIP * linear.slip_margin)
+    return (drive * bend * size < rate) & (size < linear.reach * linear.slip_margin)
 
 
 def decays_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
     r"""The same for several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any normal force or slip
-    speed, relative to its margin. None of these then changes by more than $E$ times its margin, the remainders are at most
+    speed, relative to its margin. No slip speed then changes by more than $E$ times its margin, nor does a normal force under
+    constant friction. Up to $E$ = `LinearSliding.reach` no normal force reaches zero either, the remainders are at most
     $c_i E^2$, and $\dot E ≤ -r E + \sum_i F_i c_i E^2$ with $F_i = \sum_k e_k |f_{ki}|$.
     """
     linear = modes.linear
-    shares = [
-        jnp.abs(modes.slip) / linear.slip_margin[:, None],
-        jnp.abs(modes.pressing) / linear.pressing_margin[:, None],
-    ]
-    weights = jnp.max(jnp.concatenate(shares), axis=0)
+    weights = jnp.maximum(_largest(modes.slip, linear.slip_margin), _largest(modes.pressing, linear.pressing_margin))
     size = jnp.sum(weights * jnp.abs(modal))
-    drive = jnp.sum(weights * jnp.abs(modes.remainder), axis=-1)
+    drive = jnp.einsum("ck,k->c", jnp.abs(modes.remainder), weights)
     bend = linear.remainder_slope + 0.5 * linear.remainder_curvature
     rate = -jnp.max(modes.eigenvalues.real)
-    return (jnp.sum(drive * bend) * size < rate) & (size < LOWEST_SLIP)
+    return (jnp.sum(drive * bend) * size < rate) & (size < linear.reach)
+
+
+def _largest(shares: Complex[Array, "contacts k"], margin: Float[Array, " contacts"]) -> Float[Array, " k"]:
+    """The largest share of each mode in a quantity of any contact, relative to its margin."""
+    return jnp.max(jnp.abs(shares) / margin[:, None], axis=0)
