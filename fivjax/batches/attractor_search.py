@@ -92,7 +92,8 @@ def _by_ensembles(
         running, trajectories = running[left], trajectories.compacted(left)
     if len(running):
         now = trajectories.tree[1]
-        add_tori_by_turns(maps, running, section_of(now), np.array(now.crossing), has_crossed(now), of_group, report)
+        usable = has_crossed(now) & (now.events > 0)
+        add_tori_by_turns(maps, running, section_of(now), np.array(now.crossing), usable, of_group, report)
 
 
 def _left_by_cycles(
@@ -100,7 +101,7 @@ def _left_by_cycles(
 ) -> Int[np.ndarray, " r"]:
     """The members that are still in motion where no cycle captures them; adds cycles where members are by now."""
     moving, latest, at = now.verdict == Verdict.UNDECIDED, np.array(now.crossing), section_of(now)
-    usable = moving & has_crossed(now)
+    usable = moving & has_crossed(now) & (now.events > 0)
     captured_by = come_to(maps, group, at, latest, usable, of_group)
     usable[list(captured_by)] = moving[list(captured_by)] = False
     picked = distinct(maps.weights * latest, group, usable)

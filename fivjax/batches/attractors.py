@@ -123,8 +123,8 @@ def come_to(
 
 
 def has_crossed(now) -> Bool[np.ndarray, " m"]:
-    """Which trajectories have crossed the section under their final load, and had events."""
-    return np.all(np.isfinite(now.crossing), axis=1) & (now.events > 0)
+    """Which trajectories have crossed the section under their final load."""
+    return np.all(np.isfinite(now.crossing), axis=1)
 
 
 def section_of(now) -> Section:

@@ -25,18 +25,34 @@ class Followed(NamedTuple):
     chaotic: Bool[np.ndarray, " m"]  # neighbours part exponentially, or did for long
     closing_in: Bool[np.ndarray, " m"]  # neighbours close in exponentially, as they do on a cycle
     at: Section  # where the motions are then
+    time: Float[np.ndarray, " m"]  # which that took, s
+    events: Int[np.ndarray, " m"]  # contact events on the way
+
+
+class _Parted(NamedTuple):
+    """Motions and their neighbours after `PARTING_OVER` returns."""
+
+    growth: Float[np.ndarray, " m"]  # the logarithm of the growth of their distance per return
+    time: Float[np.ndarray, " m"]  # s
+    events: Int[np.ndarray, " m"]
+    at: Section
+    beside: Float[np.ndarray, "m 2n"]  # neighbours in the direction in which those from before are by then
+    path: Float[np.ndarray, "m k 2n"]  # the motions' weighted states on the section
 
 
 def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Followed:
     """Whether neighbours part or close in exponentially where motions that start here lead to: asked over thousands of returns,
     because events may be rare. On a torus they do neither.
     """
-    at = maps.returns(group, at, 1).at
-    _, _, at, beside, _ = _parted(maps, group, at, _beside(at))
+    first = maps.returns(group, at, 1)
+    _, time, events, at, beside, _ = _parted(maps, group, first.at, _beside(first.at))
+    time, events = time + first.time, events + first.events
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
     for _ in range(PARTING_TIMES):
-        growth, _, at, beside, _ = _parted(maps, group[running], at, beside)
+        growth, taken, met, at, beside, _ = _parted(maps, group[running], at, beside)
+        time[running] += taken
+        events[running] += met
         parted[running] += PARTING_OVER * growth
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         last.put(running, at)
@@ -50,7 +66,7 @@ def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> 
     with np.errstate(invalid="ignore"):
         closing_in = most - parted >= CLOSED_IN
         chaotic = furthest >= np.where(closing_in, AS_ON_A_TORUS, PARTED)
-    return Followed(chaotic, closing_in & ~chaotic, last)
+    return Followed(chaotic, closing_in & ~chaotic, last, time, events)
 
 
 def parting_rates(maps: ReturnMaps, group, at: Section):
@@ -59,7 +75,7 @@ def parting_rates(maps: ReturnMaps, group, at: Section):
     """
     beside, growth, time, paths = _beside(at), np.full(len(group), np.nan), np.zeros(len(group)), []
     for _ in range(2):
-        growth, taken, at, beside, path = _parted(maps, group, at, beside)
+        growth, taken, _, at, beside, path = _parted(maps, group, at, beside)
         time = time + taken
         paths.append(path)
     return growth, time / (2 * PARTING_OVER), at, np.concatenate(paths, axis=1)
@@ -70,20 +86,17 @@ def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
     return at.y * (1 + APART)
 
 
-def _parted(maps: ReturnMaps, group, at: Section, beside):
-    """After `PARTING_OVER` returns: the logarithm of the growth of the distance to neighbours per return, the time taken (s),
-    where the motions are, neighbours in the direction in which those from before are by then, and the motions' weighted states
-    on the section.
-    """
+def _parted(maps: ReturnMaps, group, at: Section, beside) -> _Parted:
     weights = maps.weights
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     apart = np.linalg.norm(weights * (beside - at.y), axis=1)
     pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    pair, _, time, path, _ = maps.returns(np.tile(group, 2), pair, PARTING_OVER, PARTING_OVER)
-    at, other = pair.rows(slice(None, len(group))), pair.rows(slice(len(group), None))
+    pair, events, time, path, _ = maps.returns(np.tile(group, 2), pair, PARTING_OVER, PARTING_OVER)
+    own = slice(None, len(group))
+    at, other = pair.rows(own), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
     distance = np.linalg.norm(away, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log(distance[:, 0] / apart) / PARTING_OVER
         beside = at.y + APART * size * away / distance / weights
-    return growth, time[: len(group)], at, beside, weights * path[: len(group)]
+    return _Parted(growth, time[own], events[own], at, beside, weights * path[own])

@@ -6,9 +6,10 @@ verdict is open.
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
 from .attractor_search import ENSEMBLES, search
@@ -19,6 +20,7 @@ from .flattened import Flattened
 from .following import begun, compile_conclusions, follow
 from .kernels import Kernels, begin_building
 from .parting import followed_on
+from .progress import Progress
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .return_maps import ReturnMaps
 from .sharing import Batch, grouped, shared_by
@@ -85,16 +87,17 @@ def follow_all(
             in_time = now.t - now.skipped < np.maximum(limit, basins.settled_by)[group[pending]]
         else:
             in_time = now.t < limit[group[pending]]
-        if done >= max_steps:
-            verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
         entered: dict[int, Cycle | Torus] = {}
         if done > known_from:
             entered = basins.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[list(entered)] = Verdict.LIMIT_CYCLE
+        if done >= max_steps:
+            # Only now: their last steps may have led them to an attractor.
+            verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
         finished = (verdict != Verdict.UNDECIDED) | ~in_time
         late = finished & (verdict == Verdict.UNDECIDED)
         # Who says how long to follow says which motions count.
-        chaotic, at_last, sliding = basins.at_last(pending, now, late, proving=t_max is None, report=report)
+        chaotic, at_last, sliding, now = basins.at_last(pending, now, late, proving=t_max is None, report=report)
         verdict[list(at_last)], verdict[sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
         ended = Ended(verdict, *_described(len(pending), entered | at_last, chaotic))
         chosen = np.flatnonzero(finished)
@@ -131,6 +134,15 @@ def with_seeding(
 
 def _rows(tree, chosen: np.ndarray):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], tree)
+
+
+def _later(now: Progress, rows: Int[np.ndarray, " r"], time: Float[np.ndarray, " r"], events: Int[np.ndarray, " r"]):
+    """These trajectories after so much more time (s) and so many more events. When the last of them was is not known."""
+    t, total, last_event = (np.array(part) for part in (now.t, now.events, now.last_event))
+    t[rows] += time
+    total[rows] += events
+    last_event[rows[events > 0]] = np.nan
+    return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 
 def _described(count: int, attractor: dict[int, Cycle | Torus], chaotic: np.ndarray):
@@ -183,7 +195,7 @@ class Basins:
         """Finds attractors from where a few trajectories of each group are that have taken long: cycles of up to so many
         `crossings`, and tori.
         """
-        asks = has_crossed(now)
+        asks = self._may_be_captured(now)
         if not np.any(asks) or self.maps is None:
             return
         group = self.group[pending]
@@ -208,23 +220,23 @@ class Basins:
         """The attractors that have captured trajectories, by row."""
         if self.maps is None:
             return {}
-        asked = undecided & has_crossed(now)
+        asked = undecided & self._may_be_captured(now)
         return come_to(self.maps, self.group[pending], section_of(now), np.array(now.crossing), asked, self.known)
 
     def at_last(
         self, pending: np.ndarray, now, late: np.ndarray, proving: bool, report
-    ) -> tuple[np.ndarray, dict[int, Cycle | Torus], np.ndarray]:
-        """Of trajectories whose time is over: which are chaotic, and, if that is to be proved, the attractors that others have
-        come to, and which slide for ever.
+    ) -> tuple[np.ndarray, dict[int, Cycle | Torus], np.ndarray, Progress]:
+        """Of trajectories whose time is over: which are chaotic, and, if that is to be proved, the attractors that others come
+        to, and which slide for ever; and all of them when that is so, which may be long after their time was over.
         """
         chaotic, none = np.zeros(len(pending), bool), np.zeros(0, int)
-        asks = np.flatnonzero(late & has_crossed(now))
+        asks = np.flatnonzero(late & self._may_be_captured(now))
         if self.maps is None or not len(asks):
-            return chaotic, {}, none
+            return chaotic, {}, none, now
         group, at = self.group[pending[asks]], section_of(now).rows(asks)
         if not proving:
             chaotic[asks] = followed_on(self.maps, group, at).chaotic
-            return chaotic, {}, none
+            return chaotic, {}, none, now
         for g in np.unique(group).tolist():
             if g not in self.known_at_last:
                 self.known_at_last[g] = self.known[g].copy()
@@ -234,4 +246,11 @@ class Basins:
         if len(sliding):
             certain = slide_forever(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
             sliding = sliding[certain]
-        return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding]
+        decided = np.array([*found.attractor, *sliding], int)
+        now = _later(now, asks[decided], found.time[decided], found.events[decided])
+        return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding], now
+
+    def _may_be_captured(self, now: Progress) -> Bool[np.ndarray, " m"]:
+        """Which trajectories may be on an attractor: under constant friction, sliding alone has none but its equilibrium."""
+        constant = self.batch.scene.friction.constant
+        return has_crossed(now) & (now.events > 0 if constant else True)

@@ -8,7 +8,7 @@ their neighbourhood is, and tori however narrow the tube from which everything c
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from ..verdicts.tube import HOME
 from .attractors import Attractors, add_cycles, add_tori, come_to
@@ -25,13 +25,15 @@ TIMES, ONWARD = 4, 8192
 
 class Fates(NamedTuple):
     """What becomes of trajectories: which are chaotic, the attractors of others, by row, and which have no events any more, at
-    least for some time, with where they are by then.
+    least for some time. Where they are when that is known, how much later that is, and their contact events on the way.
     """
 
     chaotic: Bool[np.ndarray, " m"]
     attractor: dict[int, Cycle | Torus]
     without_events: Bool[np.ndarray, " m"]
     at: Section
+    time: Float[np.ndarray, " m"]  # s
+    events: Int[np.ndarray, " m"]
 
 
 def fates(
@@ -40,7 +42,7 @@ def fates(
     """What becomes of motions from these states; their loads are final. `of_group` are the attractors known of each group, and
     gets those that are found.
     """
-    at = maps.returns(group, at, 1).at
+    at, events, time, *_ = maps.returns(group, at, 1)
     attractor: dict[int, Cycle | Torus] = {}
     chaotic, quiet = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
@@ -55,12 +57,14 @@ def fates(
             found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report)
             chaotic[rows], quiet[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
+            time[rows] += found.time
+            events[rows] += found.events
             attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
             # Where none of these comes to anything, neither do others that go on.
             ended = found.chaotic | found.without_events
             ended[list(found.attractor)] = True
             onward &= np.isin(group, group[rows[ended]])
-    return Fates(chaotic, attractor, quiet, at)
+    return Fates(chaotic, attractor, quiet, at, time, events)
 
 
 def _followed(
@@ -75,22 +79,22 @@ def _followed(
     for tens of thousands.
     """
     followed = followed_on(maps, group, at)
-    now, chaotic = followed.at, followed.chaotic
+    now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
     attractor: dict[int, Cycle | Torus] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
-    for time in range(TIMES + 1):
+    for turn in range(TIMES + 1):
         new = come_to(maps, group, now, now.y, left, of_group)
         attractor |= new
         left[list(new)] = False
-        if time == TIMES or not np.any(left):
+        if turn == TIMES or not np.any(left):
             break
         report(0)
         picked = distinct(maps.weights * now.y, group, asks & left)
         if len(picked):
             _search(maps, group, now, followed.closing_in, picked, of_group, report)
         asks[picked] = False
-        drifting = _drifted(maps, group, now, left & onward)
+        drifting = _drifted(maps, group, now, time, events, left & onward)
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
@@ -98,17 +102,24 @@ def _followed(
     rows = np.flatnonzero(left & further & ~quiet)
     if len(rows):
         chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
-    return Fates(chaotic, attractor, quiet, now)
+    return Fates(chaotic, attractor, quiet, now, time, events)
 
 
-def _drifted(maps: ReturnMaps, group, now: Section, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: `now` they are further."""
+def _drifted(
+    maps: ReturnMaps, group, now: Section, time, events, asked: Bool[np.ndarray, " m"]
+) -> Bool[np.ndarray, " m"]:
+    """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: `now` they are further,
+    after that much more `time` and `events`.
+    """
     rows, drifting = np.flatnonzero(asked), np.zeros(len(asked), bool)
     if len(rows):
-        at, path = maps.path(group[rows], now.rows(rows), AT_A_TIME)
-        own = np.array([is_drifting(maps.weights * one) for one in path])
+        seen = maps.returns(group[rows], now.rows(rows), AT_A_TIME, AT_A_TIME)
+        own = np.array([is_drifting(maps.weights * one) for one in seen.path])
         rows = rows[own]
-        now.put(rows, maps.returns(group[rows], at.rows(own), ONWARD).at)
+        later = maps.returns(group[rows], seen.at.rows(own), ONWARD)
+        now.put(rows, later.at)
+        time[rows] += seen.time[own] + later.time
+        events[rows] += seen.events[own] + later.events
         drifting[rows] = True
     return drifting
 

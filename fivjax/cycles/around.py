@@ -171,14 +171,11 @@ def word(segments: Round) -> tuple[Phase, ...]:
 
     Sliding that reverses its direction is two phases. With several contacts, a phase lasts until the mode of one of them ends.
     """
-    if segments.contact.status.ndim > 1:
-        return word_of_several(segments)
     count = int(segments.count)
-    letters: list[tuple[tuple[int, float], float]] = []
+    letters: list[tuple[tuple[tuple, tuple], float]] = []
     for k in range(count):
-        status = int(segments.contact.status[k])
-        sliding = status == Status.SLIDE
-        key = status, float(segments.contact.direction[k]) if sliding else 0.0
+        status, direction = (np.atleast_1d(part[k]) for part in (segments.contact.status, segments.contact.direction))
+        key = tuple(status.tolist()), tuple(np.where(status == Status.SLIDE, direction, 0.0).tolist())
         broken = k > 0 and bool(np.any(segments.ended[k - 1]))
         duration = float(segments.h[k])
         if letters and letters[-1][0] == key and not broken:
@@ -187,25 +184,9 @@ def word(segments: Round) -> tuple[Phase, ...]:
             letters.append((key, duration))
     if len(letters) > 1 and letters[0][0] == letters[-1][0] and not bool(np.any(segments.ended[count - 1])):
         letters = [(letters[0][0], letters[0][1] + letters[-1][1]), *letters[1:-1]]
-    return tuple(Phase(Status(status), duration) for (status, _), duration in letters)
-
-
-def word_of_several(segments: Round) -> tuple[Phase, ...]:
-    """`word` for several contacts."""
-    letters: list[tuple[tuple, float]] = []
-    for k in range(int(segments.count)):
-        status, duration = np.asarray(segments.contact.status[k]), float(segments.h[k])
-        direction = np.where(status == Status.SLIDE, segments.contact.direction[k], 0.0)
-        key = (*status.tolist(), *direction.tolist())
-        broken = k > 0 and bool(np.any(segments.ended[k - 1]))
-        if letters and letters[-1][0] == key and not broken:
-            letters[-1] = key, letters[-1][1] + duration
-        elif duration > 0:
-            letters.append((key, duration))
-    if len(letters) > 1 and letters[0][0] == letters[-1][0]:
-        letters = [(letters[0][0], letters[0][1] + letters[-1][1]), *letters[1:-1]]
-    count = segments.contact.status.shape[1]
-    return tuple(Phase(tuple(map(Status, key[:count])), duration) for key, duration in letters)
+    several = segments.contact.status.ndim > 1
+    phases = [(tuple(map(Status, status)), duration) for (status, _), duration in letters]
+    return tuple(Phase(modes if several else modes[0], duration) for modes, duration in phases)
 
 
 def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:

@@ -29,8 +29,8 @@ class Verdict(enum.IntEnum):
 
 MEANING = {
     Verdict.SLIDING: "returns to steady sliding: a bound shows that no contact event can happen again",
-    Verdict.LIMIT_CYCLE: "captured by an attractor with contact events that was computed: it has entered a neighbourhood of a "
-    "stable cycle that the return map contracts, or stays in a tube about a torus that draws in all that starts in it",
+    Verdict.LIMIT_CYCLE: "captured by an attractor that was computed: it has entered a neighbourhood of a stable cycle "
+    "that the return map contracts, or stays in a tube about a torus that draws in all that starts in it",
     Verdict.UNDECIDED: "neither was proved before the time limit; raise `t_max`, or look at the trajectory with `simulate`",
     Verdict.NOT_FINITE: "the state stopped being finite; take a smaller step or check the parameters",
     Verdict.NO_EQUILIBRIUM: "no steady sliding to start from; change the load or the friction",
