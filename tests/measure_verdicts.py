@@ -6,12 +6,14 @@ certain to fade, or for ten thousand periods.
     python tests/measure_verdicts.py folds [--kicks K]
     python tests/measure_verdicts.py maps [--side N]
     python tests/measure_verdicts.py tori [--structures N] [--kicks K] [--seed S]
+    python tests/measure_verdicts.py contacts [--structures N] [--kicks K] [--seed S]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value; a
 disagreement counts unless the reference itself says otherwise of a kick that differs by 1e-14 to 1e-11;
 `folds` tries friction just below that at which the paper's limit cycle ends; `maps` the paper's map at belt speeds 1 and
-0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `cases` scenes that once had
-wrong verdicts. `--threads` is for the reference only.
+0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `contacts` structures with two to
+four contacts, under as many frictions, each contact against `oracle`; `cases` scenes that once had wrong verdicts. `--threads`
+is for the reference only.
 """
 
 import argparse
@@ -20,7 +22,9 @@ import time
 from collections import Counter
 
 import numpy as np
+import oracle
 import reference
+from scipy.linalg import block_diag
 
 import fivjax as fj
 
@@ -306,6 +310,93 @@ def tori(structures, kicks, seed, threads):
     print(f"trajectories by attractor: {dict(kinds)}")
 
 
+# ------------------------------------------------------------------------------------------------------------- contacts
+
+
+def of_blocks(rng, blocks):
+    """A structure of oscillators beside each other, each with its contact, in which nothing shows that they are not coupled:
+    their coordinates without contact are mixed.
+    """
+    count = len(blocks)
+    mass, damping, stiffness = (block_diag(*parts) for parts in zip(*(block[:3] for block in blocks), strict=True))
+    load, free = np.concatenate([block[3] for block in blocks]), np.arange(1, 3 * count, 3)
+    turn = np.eye(3 * count)
+    turn[np.ix_(free, free)] = np.linalg.qr(rng.normal(size=(count, count)))[0]
+    matrices = [0.5 * (one + one.T) for one in (turn.T @ part @ turn for part in (mass, damping, stiffness))]
+    contacts = [fj.ContactPoint(3 * i, 3 * i + 2) for i in range(count)]
+    return fj.Structure(*matrices, turn.T @ load, contacts=contacts)
+
+
+def draw_blocks(rng, count, heavy):
+    """The matrices of so many belt oscillators, each with its own damping: light, or from a third of the critical one up."""
+    blocks = []
+    for _ in range(count):
+        m1, k1 = rng.uniform(0.3, 1.0), rng.uniform(5e4, 2e5)
+        parts = dict(m1=m1, m2=m1 * rng.uniform(0.05, 0.5), k1=k1, k2=k1 * rng.uniform(0.5, 2.0))
+        share = np.exp(rng.uniform(*np.log((0.3, 4.0) if heavy else (2e-3, 2e-2))))
+        parts |= dict(c1=2 * share * np.sqrt(k1 * m1), c2=2 * share * np.sqrt(parts["k2"] * m1))
+        parts = {name: float(value) for name, value in parts.items()}
+        structure = fj.belt_oscillator(**parts, theta=float(rng.uniform(-0.4, 0.4)))
+        blocks.append(tuple(map(np.asarray, structure.matrices)))
+    return blocks
+
+
+def each_by_oracle(blocks, law, belt, p, duration, t_max):
+    """The oracle's verdict on each contact of a trajectory, alone."""
+    return [
+        oracle.verdict(oracle.Model(*block, 0, 2, law, belt, oracle.Load(100.0, p, 0.0, duration)), t_max, rtol=1e-8)
+        for block in blocks
+    ]
+
+
+def contacts(structures, kicks, seed):
+    """As many frictions as contacts, two to four; friction constant or falling with slip speed; damping light or heavy."""
+    rng, told, t_max, examples = np.random.default_rng(seed), Counter(), 4.0, []
+    for i in range(structures):
+        count, falling, heavy = 2 + i % 3, bool(i // 3 % 2), bool(i // 6 % 2)
+        blocks = draw_blocks(rng, count, heavy)
+        structure, belt = of_blocks(rng, blocks), float(rng.uniform(0.3, 3.0))
+        frictions, p = np.sort(rng.uniform(0.02, 0.4, count)), np.sort(rng.uniform(0.0, 5.0, kicks))
+        higher, decay = float(rng.uniform(0.01, 0.1)), float(rng.uniform(0.2, 3.0))
+        law = fj.ExponentialDecay(frictions[-1] + higher, frictions[0], decay) if falling else fj.Coulomb(frictions[0])
+        scene = fj.Scene(structure, law, belt, fj.Pulse(100.0, 1.2, 0.02))
+        axes = {"mu_dynamic" if falling else "mu": frictions, "p": p}
+        found = fj.bistability_map(scene, t_max=t_max, progress=False, **axes)
+        kind = f"{count} contacts, {'falling' if falling else 'constant'}, {'heavy' if heavy else 'light'}"
+        for g, mu in enumerate(frictions):
+            own = oracle.ExponentialDecay(float(law.mu_static), mu, decay) if falling else oracle.Constant(mu)
+            for k in range(kicks):
+                lane = found.isel({next(iter(axes)): g, "p": k})
+                verdict, decided = int(lane["verdict"]), float(lane["decided_at"])
+                told[kind, "trajectories"] += 1
+                told[kind, {0: "sliding", 1: "limit cycle", -1: "undecided"}.get(verdict, "failed")] += 1
+                if verdict not in (0, 1):
+                    continue
+                truth = each_by_oracle(blocks, own, belt, p[k], 0.02, 2 * t_max)
+                kinds, events = [one.kind for one in truth], sum(one.events for one in truth)
+                last = max((one.last_event for one in truth if one.events), default=0.0)
+                if verdict == 0:
+                    wrong = "limit cycle" in kinds or last > decided * (1 + 1e-9)
+                    known, alike = "undecided" not in kinds, events == int(lane["contact_events"])
+                    told[kind, "other number of events"] += known and not wrong and not alike
+                else:
+                    wrong, known = set(kinds) == {"sliding"}, set(kinds) != {"undecided"}
+                told[kind, "false"] += wrong
+                told[kind, "not known to the oracle"] += not (wrong or known)
+                if wrong:
+                    examples.append(
+                        f"[{i}] {kind} mu={mu!r} p={p[k]!r}: {verdict} at {decided} s; oracle {kinds}, {last} s"
+                    )
+        if i % 12 == 11 or i == structures - 1:
+            total = Counter()
+            for (_, what), number in told.items():
+                total[what] += number
+            print(f"{i + 1} structures: {dict(total)}", flush=True)
+    for kind in sorted({kind for kind, _ in told}):
+        print(f"{kind}: " + ", ".join(f"{what} {told[kind, what]}" for one, what in told if one == kind))
+    print("\n".join(examples))
+
+
 def maps(side, threads):
     """The paper's map at two more belt speeds."""
     for v in (1.0, 0.5):
@@ -422,7 +513,7 @@ def cases(names):
 def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori"])
+    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori", "contacts"])
     parser.add_argument("names", nargs="*", choices=[[], *CASES], help="which cases")
     parser.add_argument("--structures", type=int, default=500)
     parser.add_argument("--kicks", type=int, default=40)
@@ -434,6 +525,8 @@ def main():
         random(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
     elif chosen.study == "tori":
         tori(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
+    elif chosen.study == "contacts":
+        contacts(chosen.structures, chosen.kicks, chosen.seed)
     elif chosen.study == "folds":
         folds(chosen.kicks, chosen.threads)
     elif chosen.study == "maps":

@@ -68,7 +68,8 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     linear = jax.tree.map(np.asarray, linear)
     finite = np.all(np.isfinite(linear.matrix), axis=(-2, -1))
     matrix = np.where(finite[:, None, None], linear.matrix, -np.eye(linear.matrix.shape[-1]))
-    eigenvalues, vectors = np.linalg.eig(matrix)
+    # Real ones where all of them are.
+    eigenvalues, vectors = (part.astype(complex) for part in np.linalg.eig(matrix))
     # A defective matrix has no modal coordinates. Infinite entries make every bound infinite, so nothing is proved.
     inverse = np.full(vectors.shape, np.inf, complex)
     condition = np.where(finite, np.linalg.cond(vectors), np.inf)
@@ -84,7 +85,7 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     from_modal = np.einsum("gk,gmk->gmk", count, vectors)
     return SlidingModes(
         linear=linear,
-        eigenvalues=eigenvalues.astype(complex),
+        eigenvalues=eigenvalues,
         to_modal=inverse,
         from_modal=from_modal,
         regular=condition < WELL_CONDITIONED,
