@@ -31,11 +31,11 @@ def shapes_are_checked(monkeypatch):
             monkeypatch.setattr(sliding_proof, name, jaxtyped(typechecker=beartype)(function))
 
 
-def some_sliding(rng, groups, contacts, size, damping):
-    """Any linear motions with this many coordinates free, whose contacts feel any of them."""
+def some_sliding(rng, groups, contacts, size, dampings):
+    """Any linear motions with this many coordinates free, whose contacts feel any of them; each scene with its own damping."""
     stiffness = [a @ a.T + 0.3 * np.eye(size) for a in rng.normal(size=(groups, size, size))]
     matrix = np.zeros((groups, 2 * size, 2 * size))
-    for one, k in zip(matrix, stiffness, strict=True):
+    for one, k, damping in zip(matrix, stiffness, dampings, strict=True):
         one[:size, size:], one[size:, :size], one[size:, size:] = np.eye(size), -k, -damping * (np.eye(size) + 0.1 * k)
     rows = rng.normal(size=(3, groups, contacts, 2 * size))
     each, one = np.ones((groups, contacts)), np.ones(groups)
@@ -45,16 +45,16 @@ def some_sliding(rng, groups, contacts, size, damping):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("damping", [0.02, 1.0, 30.0], ids=["light", "heavy", "overdamped"])
+@pytest.mark.parametrize("least", [0.02, 1.0, 30.0], ids=["light to heavy", "heavy", "overdamped"])
 @pytest.mark.parametrize(("groups", "contacts"), [(2, 2), (3, 3), (4, 4), (3, 2), (2, 3), (1, 4)])
-def test_modal_sums_are_the_motion_of_each_scene(groups, contacts, damping):
+def test_modal_sums_are_the_motion_of_each_scene(groups, contacts, least):
     """Against SciPy's matrix exponential: forces, slip and the remainder's direction, of every contact in every scene."""
     rng = np.random.default_rng(groups + 10 * contacts)
-    # Lightly damped, there are as many modes as contacts; overdamped, twice as many.
-    linear = some_sliding(rng, groups, contacts, contacts, damping)
+    # In the first scene as many modes as contacts, in the others more: real ones, which count once.
+    dampings = least * 300.0 ** (np.arange(groups) / groups)
+    linear = some_sliding(rng, groups, contacts, contacts, dampings)
     modes = sliding_modes(linear)
     assert modes.pressing.shape[:2] == (groups, contacts)
-    assert modes.pressing.shape[2] == contacts or damping > 0.02
     for g in range(groups):
         z = rng.normal(size=2 * contacts)
         w = modes.to_modal[g] @ z
@@ -128,16 +128,17 @@ def proved(scenes, deviations):
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)])
 def test_proved_sliding_of_coupled_contacts_never_ends_with_as_many_scenes_as_contacts(count):
-    """Light damping and heavy, as many frictions as contacts; the slowest motions fade within the times looked at."""
+    """Lightly and heavily damped structures beside each other; the slowest motions fade within the times looked at."""
     rng, held, missed, ended = np.random.default_rng(count), 0, 0, 0
-    for damping in (0.05, 0.5, 6.0):
-        structure, belt = coupled(rng, count, damping, 0.2), rng.uniform(0.3, 1.0, count)
-        frictions = np.linspace(0.0, 0.3, count)
-        scenes = [fj.Scene(structure, fj.Coulomb(mu), belt, fj.ConstantLoad(1.0)) for mu in frictions]
+    for turn in range(3):
+        belt, frictions = rng.uniform(0.3, 1.0, count), np.linspace(0.0, 0.3, count)
+        structures = [coupled(rng, count, (0.05, 6.0, 0.5, 2.0)[(turn + i) % 4], 0.2) for i in range(count)]
+        parts = zip(structures, frictions, strict=True)
+        scenes = [fj.Scene(structure, fj.Coulomb(mu), belt, fj.ConstantLoad(1.0)) for structure, mu in parts]
         y = rng.normal(size=(400, 4 * count)) * 10 ** rng.uniform(-2, 1, size=(400, 1))
         y[:, 1::2] = 0.0
         says = proved(scenes, y)
-        for mu, one in zip(frictions, says, strict=True):
+        for structure, mu, one in zip(structures, frictions, says, strict=True):
             force, slip = true_margins(structure, mu, belt, y, 3000, 0.05)
             slides = (force > 0) & (slip > 0)
             assert np.all(slides[one])
