@@ -1,0 +1,108 @@
+"""When a verdict holds: of trajectories that are followed on after their time, and of those whose steps are used up."""
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.batches import rounds
+from fivjax.batches.attractors import Attractors
+from fivjax.batches.progress import Progress
+from fivjax.batches.return_maps import Images, Section
+from fivjax.batches.uncaptured import fates
+
+GROWTH, RETURN = 2e-3, 0.1
+
+
+def law(x):
+    """x → x + r (x - 1)(4 - x): away from an unstable cycle at 1, and slowly to a stable one at 4."""
+    return x + GROWTH * (x - 1) * (4 - x)
+
+
+class Line:
+    """A return map of which one coordinate is free, in place of `ReturnMaps`; one event per return beyond 2, none before."""
+
+    weights, known_to, normal, sliding = np.ones(4), 1e-6, 1, np.ones(2)
+    structure, section = types.SimpleNamespace(size=2, contacts=[None]), np.array([1.0, 0.0])
+
+    def returns(self, group, at, crossings, kept=1, peaks=False):
+        crossings = np.broadcast_to(crossings, len(group))
+        x, events, path = at.y[:, 0].copy(), np.zeros(len(group), np.int32), np.full((len(group), kept, 4), np.nan)
+        for k in range(int(np.max(crossings, initial=0))):
+            going = k < crossings
+            events += going & (x > 2)
+            x = np.where(going, law(x), x)
+            y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
+            path[going] = np.concatenate([path[going, 1:], y[going, None]], axis=1)
+        y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
+        return Images(Section(y, at.status, at.direction), events, RETURN * crossings, path, x)
+
+    def path(self, group, at, count):
+        found = self.returns(group, at, count, count)
+        return found.at, found.path
+
+    def derived(self, group, at, crossings):
+        found, derivative = self.returns(group, at, crossings), np.zeros((len(group), 4, 4))
+        for row, (x, count) in enumerate(zip(at.y[:, 0], np.broadcast_to(crossings, len(group)), strict=True)):
+            derivative[row, 0, 0] = 1.0
+            for _ in range(count):
+                derivative[row, 0, 0] *= 1 + GROWTH * (5 - 2 * x)
+                x = law(x)
+        return found.at, found.time, derivative
+
+    def peaks(self, group, at, crossings):
+        return self.returns(group, at, crossings).at.y[:, 0]
+
+    def free_directions(self, status):
+        return np.eye(4)[:, :1]
+
+
+def test_what_is_proved_after_the_time_is_over_has_its_own_time_and_events():
+    """State, time and events when a motion is captured belong together, by the law alone; one that is there at once is soon."""
+    x0 = np.array([1.01, 1.2, 3.9999])
+    y = np.stack([x0, *np.zeros((3, 3))], axis=1)
+    known = {0: Attractors([], []), 1: Attractors([], [])}
+    at = Section(y, np.ones(3, np.int32), np.ones(3))
+    found = fates(Line(), np.array([0, 1, 1]), at, known, lambda _: None)  # type: ignore[arg-type]
+    assert set(found.attractor) == {0, 1, 2}
+    for row, x in enumerate(x0):
+        returns, events = round(found.time[row] / RETURN), 0
+        assert found.time[row] == pytest.approx(returns * RETURN)
+        for _ in range(returns):
+            events, x = events + (x > 2), law(x)
+        assert x == pytest.approx(found.at.y[row, 0], abs=1e-12)
+        assert events == found.events[row]
+        cycle = found.attractor[row]
+        assert cycle.amplitude == pytest.approx(4.0) and abs(x - 4) <= cycle.neighbourhood.radius
+    assert np.all(found.time[:2] > 300 * RETURN), "the others begin far from where they are captured"
+
+
+def test_the_result_is_that_of_the_instant_of_the_proof():
+    """Only of those that were followed on: their time, all their events, and no time of the last one if there were more."""
+    parts = dict.fromkeys(field.name for field in dataclasses.fields(Progress))
+    parts |= {"t": np.array([5.0, 6.0, 7.0]), "events": np.array([2, 3, 4]), "last_event": np.array([1.0, 2.0, 3.0])}
+    now = Progress(**parts)  # type: ignore[arg-type]
+    later = rounds._later(now, np.array([2, 0]), np.array([10.0, 20.0]), np.array([0, 9]))
+    assert later.t.tolist() == [25.0, 6.0, 17.0] and later.events.tolist() == [11, 3, 4]
+    assert np.array_equal(later.last_event, [np.nan, 2.0, 3.0], equal_nan=True)
+    assert now.t.tolist() == [5.0, 6.0, 7.0], "what is followed by others stays"
+
+
+def test_who_reaches_a_cycle_with_the_last_step_is_captured(monkeypatch):
+    """As many steps as the last trajectory took to its verdict are enough for it."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
+    taken, real = [], rounds.follow
+
+    def counted(*args):
+        taken.append(args[-1])
+        real(*args)
+
+    monkeypatch.setattr(rounds, "follow", counted)
+    axes = {"mu": [0.2], "p": [1.02, 1.2, 1.5, 2.0]}
+    expected = fj.bistability_map(scene, progress=False, **axes)
+    assert fj.Verdict.LIMIT_CYCLE in expected["verdict"]
+    found = fj.bistability_map(scene, progress=False, max_steps=sum(taken), **axes)
+    for name in ("verdict", "decided_at", "amplitude"):
+        np.testing.assert_array_equal(found[name], expected[name])
