@@ -8,7 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
+from fivjax.contact import Contact
 from fivjax.cycles import search
+from fivjax.cycles.around import Round, word
 from fivjax.cycles.torus import off_the_curve
 
 REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
@@ -276,3 +278,23 @@ def test_benchmark_a_against_another_kind_of_solver(belt_speed):
     np.testing.assert_allclose(saddle.multipliers, [sliding["multiplier"], 1.0], atol=1e-8)
     run = saddle.trajectory(4000)
     assert run.displacement[:, 0].max() == pytest.approx(sliding["peak_displacement"], abs=2e-6)
+
+
+@pytest.mark.parametrize("contacts", [1, 2, 3])
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, ends):
+    """Sliding, sticking, sliding, 1, 2 and 3 s: the first and the last are one phase that the section cuts, unless it ended there."""
+    shape = () if contacts == 1 else (contacts,)
+    status, direction = np.full((4, *shape), fj.Status.SLIDE), np.ones((4, *shape))
+    # Of several contacts only the last one sticks.
+    status.reshape(4, contacts)[1, -1] = fj.Status.STICK
+    ended = np.zeros((4, *shape, 2), bool)
+    ended[:2, ..., 0] = True
+    ended[2] = ends
+    times = np.array([1.0, 2.0, 3.0, 0.0])
+    segments = Round(np.cumsum(times) - times, times, np.zeros((4, 4)), Contact(status, direction), ended, np.array(3))  # type: ignore[arg-type]
+    found = word(segments)
+    assert [phase.duration for phase in found] == ([1.0, 2.0, 3.0] if ends else [4.0, 2.0])
+    sticking = (fj.Status.SLIDE,) * (contacts - 1) + (fj.Status.STICK,)
+    assert found[1].status == (sticking if contacts > 1 else fj.Status.STICK)
+    assert found[0].status == ((fj.Status.SLIDE,) * contacts if contacts > 1 else fj.Status.SLIDE)

@@ -3,8 +3,11 @@
 import dataclasses
 import types
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
+from scipy.integrate import solve_ivp
 
 import fivjax as fj
 from fivjax.batches import rounds
@@ -106,3 +109,56 @@ def test_who_reaches_a_cycle_with_the_last_step_is_captured(monkeypatch):
     found = fj.bistability_map(scene, progress=False, max_steps=sum(taken), **axes)
     for name in ("verdict", "decided_at", "amplitude"):
         np.testing.assert_array_equal(found[name], expected[name])
+
+
+class Humped(fj.AbstractFriction):
+    """Friction that falls fastest at some slip speed: sliding loses stability to a small cycle that slides all the time."""
+
+    mu_static: Float[Array, ""]
+    mu_dynamic: Float[Array, ""]
+    constant = False
+
+    @property
+    def static(self):
+        return self.mu_static
+
+    def __call__(self, slip_speed):
+        return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-(slip_speed**2))
+
+    def variation(self, slip_speed):
+        drop = (self.mu_static - self.mu_dynamic) * jnp.ones_like(slip_speed)
+        return 0.86 * drop, 2.0 * drop
+
+
+@pytest.mark.slow
+def test_a_cycle_that_slides_all_the_time_captures_whoever_comes_to_it():
+    """A mass on a belt just below its upper Hopf point, against SciPy: one kick never has an event, one has two in the beginning.
+    At the time of the verdict the motion is on the cycle.
+    """
+    speed, damping = 1.12, 0.3
+    structure = fj.Structure(np.eye(2), np.diag([damping, 1.0]), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, Humped(1.0, 0.5), speed, fj.Pulse(1.0, p=1.2, duration=1.0))
+    m = fj.bistability_map(scene, belt_speed=[speed], p=[1.02, 3.0], progress=False).isel(belt_speed=0)
+    assert m["verdict"].values.tolist() == [1, 1] and m["attractor"].values.tolist() == [0, 0]
+    assert m["contact_events"].values.tolist() == [0, 2]
+    assert np.array_equal(m["last_event"], [np.nan, 1.0], equal_nan=True)
+
+    def pushed(x, v, load):
+        return load * (0.5 + 0.5 * np.exp(-((speed - v) ** 2))) - damping * v - x
+
+    y, t, decided = [0.5 + 0.5 * np.exp(-(speed**2)), 0.0], 0.0, m["decided_at"].values[0]
+    for end, load in ((1.0, 1.02), (decided, 1.0), (decided + 10.0, 1.0), (4000.0, 1.0), (4010.0, 1.0)):
+        run = solve_ivp(
+            lambda _, y, load=load: [y[1], pushed(*y, load)],
+            (t, end),
+            y,
+            "DOP853",
+            rtol=1e-10,
+            atol=1e-12,
+            max_step=0.05,
+        )
+        assert np.all(run.y[1] < speed)
+        y, t, peak = run.y[:, -1], end, np.max(np.abs(run.y[1]))
+        if end == decided + 10.0:
+            assert peak == pytest.approx(m["amplitude"].values[0], rel=0.1)
+    np.testing.assert_allclose(m["amplitude"], peak, rtol=1e-3)

@@ -52,6 +52,29 @@ found = fj.bistability_map(scene, mu=[0.1, 0.227], p=[1.0, 1.1, 1.2, 1.3], t_max
 assert found["verdict"].shape == (2, 4)
 """
 
+# The proofs of two contacts, in as many scenes and in more, under constant and under falling friction.
+PROOFS_TOGETHER = """
+import jax
+import numpy as np
+import jax.numpy as jnp
+from fivjax.contact import Contact, Mechanics
+from fivjax.linear.linearisation import linear_sliding
+from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
+
+contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+structure = fj.Structure(np.eye(4), 0.1 * np.eye(4), np.diag([1.0, 5.0, 2.0, 5.0]), [0, -1, 0, -1], contacts=contacts)
+with jax.enable_x64(True):
+    for law in (fj.Coulomb(0.2), fj.ExponentialDecay(0.21, 0.2, 0.5)):
+        scene = fj.Scene(structure, law, 0.5, fj.ConstantLoad(1.0))
+        linear = jax.tree.map(np.asarray, linear_sliding(scene))
+        for groups in (2, 3):
+            modes = sliding_modes(jax.tree.map(lambda leaf: np.stack([leaf] * groups), linear))
+            assert modes.pressing.shape == (groups, 2, 2)
+        modes = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), modes)
+        contact = Contact(jnp.ones(2, jnp.int32), jnp.ones(2))
+        assert slides_forever(Mechanics(scene), modes, contact, 1e-6 * jnp.eye(8)[0], True)
+"""
+
 MISTAKE = """
 import jax.numpy as jnp
 from jaxtyping import TypeCheckError
@@ -75,5 +98,5 @@ def in_process(code: str) -> subprocess.CompletedProcess:
 @pytest.mark.slow
 def test_annotations_hold_in_a_simulation_a_stability_limit_and_a_map():
     """No annotation says what is not so; and the checker is at work, because it refuses arrays that do not match."""
-    done = in_process(CHECKED + WORK + MISTAKE)
+    done = in_process(CHECKED + WORK + PROOFS_TOGETHER + MISTAKE)
     assert done.returncode == 0, done.stderr[-3000:]
