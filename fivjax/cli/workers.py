@@ -3,9 +3,11 @@
 import contextlib
 import multiprocessing
 import signal
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 
+from ..foundation.kept_folder import NotKept
 from .compiled_code import keep_compiled_code
 
 
@@ -31,8 +33,11 @@ def workers_of(count: int, dask: str | None) -> Iterator:
 
 
 def _begin() -> None:
-    """In each worker process: ignore Ctrl-C, which the process that hands out the jobs handles."""
+    """In each worker process: ignore Ctrl-C, which the process that hands out the jobs handles. That one also says what cannot
+    be kept.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warnings.simplefilter("ignore", NotKept)
     keep_compiled_code()
 
 

@@ -2,39 +2,42 @@
 
 That cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large ones. So
 the traced program is kept, too (`jax.export`), as are other values that take long to make. The file name is a digest of all
-that this depends on: fivjax's own source, the versions of Python, JAX, equinox and NumPy, the device, the function, shapes and
-types of its arrays, and its other arguments.
+that this depends on: fivjax's own source, the versions of Python and of the libraries whose code is traced, the device, the
+function, shapes and types of its arrays, and its other arguments.
 
-A damaged file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its
-name does not tell what it does; such programs are traced in each process.
+A file has a program as JAX writes it, and the form of its result as text (`plain_trees`); nothing in it is unpickled. A damaged
+file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its name does
+not tell what it does; such programs are traced in each process.
 """
 
+import contextlib
 import functools
 import hashlib
 import io
 import os
 import pickle
 import platform
-import tempfile
 import threading
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import numpy as np
 
 from .compiling import compiled, less_thought, transformed
+from .kept_folder import folder_to_keep_in, keep, make_room, read_kept
+from .plain_trees import NotPlain, from_text, structure_to_text, to_text, with_zeros
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 # The folder inside that of the compilation cache, and how many bytes it may hold: what was used longest ago is removed first.
 FOLDER, LARGEST = "fivjax-traced", 200 * 2**20
-# What these packages define is fixed by their versions, or by fivjax's source.
-KNOWN_PACKAGES = ("fivjax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "builtins", "functools")
-DIGEST_BYTES = 32
+# Libraries whose code may be in a program. What they define is fixed by their versions.
+LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy", "warp-lang")
+KNOWN_PACKAGES = ("fivjax", "builtins", "functools", *LIBRARIES)
 
 
 def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable[P, R]:
@@ -59,7 +62,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
             # Threads that want the same program wait for the one that makes it.
             with lock:
                 if key not in programs:
-                    programs[key] = _program(function, Path(folder), structure, rest, arrays, quickly_compiled)
+                    programs[key] = _program(function, folder, structure, rest, arrays, quickly_compiled)
         program = programs[key]
         return otherwise(*args, **kwargs) if program is None else program(arrays)
 
@@ -67,15 +70,16 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
 
 
 def kept_value(make: Callable[..., R], *args) -> R:
-    """What a function makes of its arguments, which can be pickled and takes long to make; kept like traced programs."""
+    """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs."""
     folder = _folder()
-    path = None if folder is None else _place(make, Path(folder), None, args)
+    path = None if folder is None else _place(make, folder, None, args)
     if path is None:
         return make(*args)
-    found = _found(path, pickle.loads)
+    found = _found(path, from_text)
     if found is None:
         found = make(*args)
-        _write(path, pickle.dumps(found))
+        with contextlib.suppress(NotPlain):
+            _keep(path, to_text(found).encode())
     return found
 
 
@@ -92,11 +96,11 @@ class _Foreign(Exception):
 
 def _folder() -> str | None:
     folder = jax.config.jax_compilation_cache_dir
-    return None if folder is None or "://" in folder else os.path.join(folder, FOLDER)
+    return None if not folder or "://" in folder else os.path.join(folder, FOLDER)
 
 
 def _program(
-    function: Callable, folder: Path, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool
+    function: Callable, folder: str, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool
 ) -> Callable | None:
     """A function of the arrays, read from the folder or made and written there; none where it cannot be named."""
     path = _place(function, folder, structure, rest)
@@ -104,49 +108,55 @@ def _program(
         return None
     options = less_thought() if quickly_compiled else {}
 
-    def ready(text: bytes) -> Callable:
+    def ready(content: bytes) -> Callable:
         from jax import export
 
-        exported, form = pickle.loads(text)
+        form, _, exported = content.partition(b"\0")
+        result = from_text(form)
         exported = export.deserialize(bytearray(exported))
         run = jax.jit(exported.call, compiler_options=options).lower(*arrays).compile()
-        result = jax.tree.structure(form)
         return lambda arrays: jax.tree.unflatten(result, run(*arrays))
 
     found = _found(path, ready)
     if found is not None:
         return found
     try:
-        text = _traced(function, structure, rest, arrays)
-    except (_Foreign, pickle.PicklingError, AttributeError, NotImplementedError):
+        content = _traced(function, structure, rest, arrays)
+    except (NotPlain, NotImplementedError):
         return None
-    _write(path, text)
-    return ready(text)
+    _keep(path, content)
+    return ready(content)
 
 
-def _place(function: Callable, folder: Path, structure, rest: tuple) -> Path | None:
-    """The file for what a function makes of such arguments; none where these cannot be named."""
+def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
+    """The file for what a function makes of such arguments; none where these cannot be named, or nothing can be kept."""
     try:
-        return folder / f"{function.__name__}-{_digest(function, structure, rest)}"
+        name = f"{function.__name__}-{_digest(function, structure, rest)}"
+        place = folder_to_keep_in(folder)
+        return None if place is None else place / name
     except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
         return None
 
 
 def _found(path: Path, ready: Callable[[bytes], R]) -> R | None:
     """What is made ready from a file; none where there is no such file."""
+    content = read_kept(path)
+    if content is None:
+        return None
     try:
-        found = ready(_read(path))
-        os.utime(path)
-        return found
-    except OSError:  # not there
-        pass
-    except Exception:  # damaged, or of a kind that this JAX does not read: made anew
+        return ready(content)
+    except Exception:  # of a kind that this JAX does not read: made anew
         path.unlink(missing_ok=True)
-    return None
+        return None
+
+
+def _keep(path: Path, content: bytes) -> None:
+    keep(path, content)
+    make_room(path.parent, LARGEST)
 
 
 def _traced(function: Callable, structure, rest: tuple, arrays: Sequence) -> bytes:
-    """The function traced for such arrays, and the form of its result."""
+    """The form of a function's result, and the function traced for such arrays."""
     forms = []
 
     def of_arrays(*arrays):
@@ -160,14 +170,13 @@ def _traced(function: Callable, structure, rest: tuple, arrays: Sequence) -> byt
     from jax import export
 
     exported = export.export(jax.jit(of_arrays))(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
-    return _pickled((bytes(exported.serialize()), _with_zeros(forms[-1])))
+    return structure_to_text(forms[-1]).encode() + b"\0" + exported.serialize()
 
 
 def _digest(function: Callable, structure, rest: tuple) -> str:
-    versions = [f"{package.__name__} {package.__version__}" for package in (jax, eqx, np)]
     device = jax.devices()[0]
     built_on = [
-        *versions,
+        *_versions(),
         platform.python_version(),
         device.platform,
         device.device_kind,
@@ -175,6 +184,13 @@ def _digest(function: Callable, structure, rest: tuple) -> str:
     ]
     name = f"{function.__module__}.{function.__qualname__}"
     return hashlib.sha256(_pickled((_source(), built_on, name, structure, rest))).hexdigest()[:40]
+
+
+@functools.cache
+def _versions() -> list[str]:
+    """Those of the libraries that are installed."""
+    found = {name: list(metadata.distributions(name=name)) for name in LIBRARIES}
+    return [f"{name} {one.version}" for name, those in found.items() for one in those[:1]]
 
 
 @functools.cache
@@ -188,13 +204,13 @@ def _source() -> str:
 
 
 class _Pickler(pickle.Pickler):
-    """Refuses classes and functions of other packages, because pickle would only write their names. The structure of a tree
-    is written as such a tree of zeros.
+    """Writes what is digested; nothing is read back. Refuses classes and functions of other packages, because pickle would only
+    write their names. The structure of a tree is written as such a tree of zeros.
     """
 
     def reducer_override(self, obj):
         if isinstance(obj, jax.tree_util.PyTreeDef):
-            return jax.tree.structure, (_with_zeros(obj),)
+            return jax.tree.structure, (with_zeros(obj),)
         if isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__")):
             package = (getattr(obj, "__module__", None) or "").partition(".")[0]
             if package not in KNOWN_PACKAGES:
@@ -209,38 +225,3 @@ def _pickled(what) -> bytes:
     pickler.fast = True
     pickler.dump(what)
     return buffer.getvalue()
-
-
-def _with_zeros(structure):
-    return jax.tree.unflatten(structure, [0.0] * structure.num_leaves)
-
-
-def _read(path: Path) -> bytes:
-    data = path.read_bytes()
-    digest, text = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
-    if hashlib.sha256(text).digest() != digest:
-        raise ValueError(f"{path} is damaged.")
-    return text
-
-
-def _write(path: Path, text: bytes) -> None:
-    """Writes a file whole or not at all; in a folder that cannot be written to, nothing is kept."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(text).digest() + text)
-        os.replace(name, path)
-        _make_room(path.parent)
-    except OSError:
-        return
-
-
-def _make_room(folder: Path) -> None:
-    """Removes what was used longest ago, until the rest is small enough."""
-    files = sorted(((file.stat().st_mtime, file.stat().st_size, file) for file in folder.iterdir()), reverse=True)
-    total = 0
-    for _, size, file in files:
-        total += size
-        if total > LARGEST:
-            file.unlink(missing_ok=True)

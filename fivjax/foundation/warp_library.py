@@ -9,13 +9,18 @@ import functools
 import importlib.util
 import os
 import sys
+import tempfile
 import threading
 from typing import Any
 
 import jax
 
+from . import kept_kernels
+
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()
+# Modules that are loaded, with the devices that they are loaded on.
+_LOADED: set[tuple[Any, str]] = set()
 
 
 def is_installed() -> bool:
@@ -42,8 +47,22 @@ def _initialised():
             '`pip install "fivjax[gpu]"` on all machines of the run, or on none.'
         ) from None
     with _quietly(wp), _without_stderr():
-        wp.init()
+        try:
+            wp.init()
+        except OSError:  # Warp does not begin without a folder of its own; fivjax's kernels do not need it
+            _init_elsewhere(wp)
     return wp
+
+
+def _init_elsewhere(wp) -> None:
+    """Initialise Warp with a temporary folder, and leave its setting as it was: kernels of others fail as they would have."""
+    before = wp.config.kernel_cache_dir
+    with tempfile.TemporaryDirectory(prefix="fivjax-") as folder:
+        wp.config.kernel_cache_dir = folder
+        try:
+            wp.init()
+        finally:
+            wp.config.kernel_cache_dir = before
 
 
 def devices() -> list[str]:
@@ -53,12 +72,13 @@ def devices() -> list[str]:
 
 
 def load(module, names: list[str]) -> None:
-    """Compile a Warp module for these devices, or find it in Warp's own cache."""
+    """Compile a Warp module for these devices, or find it among the kernels that are kept."""
     wp = warp()
     with ONE_AT_A_TIME, _quietly(wp):
-        for name in names:
-            # A kernel on a CPU is compiled anew for each size of a block of threads; there it is one.
-            wp.load_module(module, name, block_dim=1 if name == "cpu" else None)
+        missing = [name for name in names if (module, name) not in _LOADED]
+        if missing:
+            kept_kernels.load(wp, module, missing)
+            _LOADED.update((module, name) for name in missing)
 
 
 @contextlib.contextmanager

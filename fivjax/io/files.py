@@ -1,9 +1,20 @@
-"""Files that are whole or absent: written under another name in the same folder, then renamed."""
+"""Output files: checked before any work, then whole or absent (`foundation.whole_files`)."""
 
 import os
-import tempfile
+import stat
 from io import BytesIO
 from pathlib import Path
+
+from ..foundation.whole_files import try_to_write, write_whole
+
+# What a path may lead to that is no file, and is never replaced by one.
+NO_FILES = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link that leads back to itself",
+}
 
 
 def check_writable(path: str | Path) -> Path:
@@ -12,18 +23,43 @@ def check_writable(path: str | Path) -> Path:
     **Raises:** `ValueError` with the reason.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"Output path `{path}` is a folder; give the name of a file in it.")
-    if path.parent.exists() and not path.parent.is_dir():
-        raise ValueError(f"Output folder `{path.parent}` is not a folder but a file; give another.")
-    if not path.parent.is_dir():
-        raise ValueError(f"Output folder `{path.parent}` does not exist; create it first.")
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".fivjax."):
-            pass
+        _check(path, _place(path))
     except OSError as error:
-        raise ValueError(f"Output folder `{path.parent}` cannot be written: {error.strerror}.") from error
+        raise ValueError(f"Output path `{path}` cannot be written: {error.strerror}.") from error
     return path
+
+
+def _check(path: Path, place: Path) -> None:
+    """`place` is where the path leads."""
+    there = _status(place)
+    if there is not None and stat.S_ISDIR(there.st_mode):
+        raise ValueError(f"Output path `{path}` is a folder; give the name of a file in it.")
+    if there is not None and not stat.S_ISREG(there.st_mode):
+        kind = NO_FILES.get(stat.S_IFMT(there.st_mode), "something else")
+        raise ValueError(f"Output path `{path}` is no file but {kind}; give another.")
+    if place.parent.exists() and not place.parent.is_dir():
+        raise ValueError(f"Output folder `{place.parent}` is not a folder but a file; give another.")
+    if not place.parent.is_dir():
+        raise ValueError(f"Output folder `{place.parent}` does not exist; create it first.")
+    if there is not None and not os.access(place, os.W_OK):
+        raise ValueError(f"Output file `{path}` is write-protected; permit writing, or give another.")
+    try:
+        try_to_write(place.parent)
+    except OSError as error:
+        raise ValueError(f"Output folder `{place.parent}` cannot be written: {error.strerror}.") from error
+
+
+def _place(path: Path) -> Path:
+    """Where a path leads: files are written through symbolic links."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
+def _status(place: Path) -> os.stat_result | None:
+    try:
+        return os.lstat(place)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def save_figure(figure, path: str | Path, **options) -> Path:
@@ -51,21 +87,9 @@ def save_text(text: str, path: str | Path) -> Path:
 
 
 def replace_whole(path: Path, content: bytes) -> Path:
-    """Write a file with this content in place of whatever is there, atomically; returns its path."""
-    # In the same folder, so that the final rename stays within one file system and is atomic.
-    handle, part = tempfile.mkstemp(dir=path.parent, prefix=".fivjax.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            # On the disk before it gets its name: after a power failure there is the old file or the new one.
-            os.fsync(file.fileno())
-        # `mkstemp` makes private files; a result has the permissions of any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(part, 0o666 & ~mask)
-        os.replace(part, path)
-    except BaseException:
-        Path(part).unlink(missing_ok=True)
-        raise
+    """Write a file with this content in place of what is there, atomically; returns its path. The place where a symbolic link
+    leads is written, and a file that is replaced keeps its permissions.
+    """
+    place = _place(path)
+    write_whole(place, content, like=_status(place))
     return path

@@ -1,0 +1,157 @@
+"""Kernels of Warp, kept in a folder of fivjax's own inside Warp's, with digests.
+
+Warp itself takes a file of its cache for what its name says, so a damaged one crashes the process, or computes something else.
+Here each kernel has a folder, named by the digest of its code and options and by the processor, with the digests of the files
+in it. They are compared before anything is loaded; what is damaged or cannot be loaded is built anew.
+
+Kernels are built in a temporary folder with room to spare, because the compiler ends the whole process where the disk is full.
+Neither Warp's own folder nor its settings are changed, so that kernels of others are not affected.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from .kept_folder import cannot_keep, folder_to_keep_in, read_own
+from .whole_files import own_folder
+
+# The folder inside Warp's, and the file with the digests of a kernel's other files.
+FOLDER, DIGESTS = "fivjax", "digests.json"
+# Room for building a kernel (bytes): it needs a hundredth of that.
+ROOM = 2**25
+
+
+def load(wp, module, names: list[str]) -> None:
+    """Load a Warp module on these devices.
+
+    **Raises:** `OSError` where it has to be built and no temporary folder has room.
+    """
+    with _as_built(wp, module):
+        folder = folder_to_keep_in(Path(wp.config.kernel_cache_dir or tempfile.gettempdir()) / FOLDER)
+        missing = [name for name in names if folder is None or not _loaded(wp, module, name, folder)]
+        if missing:
+            _build_and_load(wp, module, missing, folder)
+
+
+def _loaded(wp, module, name: str, folder: Path) -> bool:
+    """Whether it was among what is kept."""
+    with _for_device(module, name):
+        place = folder / _key(wp, module, name)
+        if not _is_whole(place):
+            return False
+        try:
+            wp.load_aot_module(module, device=name, module_dir=place)
+        except Exception:  # whatever Warp raises for what it cannot load
+            return False
+    return True
+
+
+def _build_and_load(wp, module, names: list[str], folder: Path | None) -> None:
+    failures = []
+    for parent in _with_room(failures, folder):
+        try:
+            with own_folder(parent) as build:
+                for name in names:
+                    with _for_device(module, name):
+                        (binary,) = wp.compile_aot_module(module, device=name, module_dir=build / "kernel")
+                        if folder is not None:
+                            _keep(folder, _key(wp, module, name), [binary, *binary.parent.glob("*.meta")])
+                        wp.load_aot_module(module, device=name, module_dir=build / "kernel")
+            return
+        except OSError as error:
+            failures.append(f"{parent}: {error.strerror or error}")
+    raise OSError(f"Kernels cannot be built, because no folder has room for that ({'; '.join(failures)})")
+
+
+def _with_room(failures: list[str], kept: Path | None) -> Iterator[Path]:
+    """Folders that have room for building; why others have not is added to the failures."""
+    try:
+        temporary = [Path(tempfile.gettempdir())]
+    except OSError as error:
+        temporary = []
+        failures.append(str(error.strerror))
+    for parent in (*temporary, Path("/dev/shm"), kept):
+        if parent is None or not parent.is_dir():
+            continue
+        try:
+            with own_folder(parent) as probe, open(probe / "room", "wb", buffering=0) as file:
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(file.fileno(), 0, ROOM)
+                else:
+                    file.write(bytes(ROOM))
+        except OSError as error:
+            failures.append(f"{parent}: {error.strerror or error}")
+            continue
+        yield parent
+
+
+def _keep(folder: Path, key: str, files: list[Path]) -> None:
+    """Keep these files under a name, all of them or none."""
+    place = folder / key
+    try:
+        with own_folder(folder) as part:
+            digests = {}
+            for file in files:
+                content = file.read_bytes()
+                digests[file.name] = hashlib.sha256(content).hexdigest()
+                (part / file.name).write_bytes(content)
+            (part / DIGESTS).write_text(json.dumps(digests))
+            if not _is_whole(place):
+                shutil.rmtree(place, ignore_errors=True)
+                try:
+                    os.rename(part, place)
+                except OSError:
+                    if not _is_whole(place):  # by another process
+                        raise
+    except OSError as error:
+        cannot_keep(folder, error.strerror or str(error))
+
+
+def _is_whole(place: Path) -> bool:
+    """Whether these are the files that were kept there."""
+    try:
+        digests = json.loads(read_own(place / DIGESTS))
+        return len(digests) > 0 and all(
+            hashlib.sha256(read_own(place / name)).hexdigest() == digest for name, digest in digests.items()
+        )
+    except (OSError, ValueError, AttributeError, TypeError):
+        return False
+
+
+def _key(wp, module, name: str) -> str:
+    """The name of what is kept for a device: what is computed, and by which processor."""
+    device = wp.get_device(name)
+    code = module.get_module_hash(module.options["block_dim"]).hex()
+    if device.is_cpu:
+        return f"{code}-{wp.get_cpu_kernel_cache_key(cpu_compiler_flags=module.options['cpu_compiler_flags'])}"
+    return f"{code}-{wp.config.version}-sm{device.arch}"
+
+
+@contextlib.contextmanager
+def _for_device(module, name: str) -> Iterator[None]:
+    """A kernel on a CPU is compiled for blocks of one thread, and that is how it is launched there."""
+    before = module.options["block_dim"]
+    if name == "cpu":
+        module.options["block_dim"] = 1
+    try:
+        yield
+    finally:
+        module.options["block_dim"] = before
+
+
+@contextlib.contextmanager
+def _as_built(wp, module) -> Iterator[None]:
+    """Without headers compiled first: one module does not repay them, and Warp leaves them behind in the temporary folder."""
+    before = wp.config.use_precompiled_headers
+    wp.config.use_precompiled_headers = False
+    # What names a kernel depends on the setting.
+    module.mark_modified()
+    try:
+        yield
+    finally:
+        wp.config.use_precompiled_headers = before
