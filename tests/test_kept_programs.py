@@ -1,5 +1,8 @@
 """What was traced is found by a later process, made anew where it is damaged or out of date, and never trusted by name alone."""
 
+import os
+import pickle
+from importlib import metadata
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,8 +14,10 @@ import pytest
 import fivjax as fj
 from fivjax.batches.flattened import flatten
 from fivjax.contact import Contact
-from fivjax.foundation import kept_programs
+from fivjax.foundation import kept_folder, kept_programs
+from fivjax.foundation.kept_folder import NotKept
 from fivjax.foundation.kept_programs import kept, kept_value
+from fivjax.foundation.plain_trees import NotPlain, from_text, structure_to_text, to_text
 
 
 class Counted:
@@ -118,8 +123,75 @@ def test_the_folder_stays_small_and_what_was_used_last_stays(folder, monkeypatch
 def test_a_folder_that_cannot_be_made_is_done_without(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr(kept_programs, "_folder", lambda: str(tmp_path / "file" / "kept"))
-    found = values(Counted().in_a_new_process()(1.0, Y, np.asarray(5.0)))
+    with pytest.warns(NotKept, match="cannot be made: Not a directory"):
+        found = values(Counted().in_a_new_process()(1.0, Y, np.asarray(5.0)))
     np.testing.assert_array_equal(found["times"], 5 * Y)
+
+
+def test_the_name_covers_every_library_whose_code_may_be_in_a_program(folder, monkeypatch):
+    for library in ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy", "warp-lang"):
+        assert f"{library} {metadata.version(library)}" in kept_programs._versions()
+    function = Counted()
+    function.in_a_new_process()(2.0, Y, np.asarray(1.0))
+    monkeypatch.setattr(kept_programs, "_versions", lambda: ["diffrax 0"])
+    function.in_a_new_process()(2.0, Y, np.asarray(1.0))
+    assert function.traced == 2 and len(list(folder.iterdir())) == 2
+
+
+class Calls:
+    """Unpickled, it makes a folder."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_no_file_is_unpickled_whatever_its_digest(folder, tmp_path):
+    function, made = Counted(), []
+
+    def squares(numbers):
+        made.append(numbers)
+        return {number: number**2 for number in numbers}
+
+    for _ in range(2):
+        function.in_a_new_process()(2.0, Y, np.asarray(3.0))
+        assert kept_value(squares, (2, 3)) == {2: 4, 3: 9}
+        for path in folder.iterdir():
+            kept_folder.keep(path, pickle.dumps(Calls(tmp_path / "called")))
+    assert function.traced == 2 and len(made) == 2 and not (tmp_path / "called").exists()
+
+
+@pytest.mark.parametrize("text", ['{"class": "os:system", "fields": {"dict": []}}', '{"class": "fivjax.io.files:os", "fields": 1}',
+                                  '{"class": "fivjax:Scene", "fields": {"dict": [["other", 1]]}}', '{"function": "eval"}', "[1]",
+                                  '{"class": "fivjax.none:Scene", "fields": {"dict": []}}', "{", "["*9999])  # fmt: skip
+def test_text_that_names_anything_but_plain_parts_is_none(text):
+    with pytest.raises((NotPlain, ValueError, RecursionError)):
+        from_text(text)
+
+
+def test_plain_values_come_back():
+    plain = {"several": (2.5, None, [True, "text\0"]), "infinite": float("inf"), "named": {1: "one"}}
+    assert from_text(to_text(plain)) == plain
+    structure = jax.tree.structure({**plain, "law": fj.Coulomb(0.25, 0.5), "flat": flatten(Contact(Y, Y))})
+    assert from_text(structure_to_text(structure)) == structure
+    with pytest.raises(NotPlain):
+        to_text(np.zeros(2))
+    with pytest.raises(NotPlain):
+        structure_to_text(jax.tree.structure(eqx.nn.Identity()))
+
+
+def test_no_flipped_bit_is_read(tmp_path):
+    path = tmp_path / "kept"
+    kept_folder.keep(path, b"some program")
+    whole = path.read_bytes()
+    for bit in range(8 * len(whole)):
+        path.write_bytes((int.from_bytes(whole, "big") ^ (1 << bit)).to_bytes(len(whole), "big"))
+        assert kept_folder.read_kept(path) is None and not path.exists(), "and is removed"
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        assert kept_folder.read_kept(path) is None
 
 
 def test_under_a_transformation_it_is_part_of_what_the_caller_compiles(folder):

@@ -1,6 +1,8 @@
 """Results on disk: whole or absent, opened again as they were, with the scene and the settings that made them."""
 
 import json
+import os
+import socket
 
 import diffrax
 import equinox as eqx
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float
 from refusing import refused
 
 import fivjax as fj
+from fivjax.foundation import whole_files
 from fivjax.io import files
 from fivjax.model.friction import AbstractFriction
 from fivjax.model.scene import IMPACT_LAWS
@@ -141,7 +144,7 @@ def test_nothing_on_disk_is_ever_half_written(run, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    for name in ("fsync", "chmod", "replace"):
+    for name in ("fsync", "fchmod", "replace"):
         with monkeypatch.context() as broken:
             broken.setattr(files.os, name, full)
             with pytest.raises(OSError, match="No space left"):
@@ -150,6 +153,65 @@ def test_nothing_on_disk_is_ever_half_written(run, tmp_path, monkeypatch):
                 fj.save_figure(fj.plot.response(run), path, format="png")
         assert path.read_bytes() == before
         assert [found.name for found in tmp_path.iterdir()] == ["run.nc"]
+
+
+def test_a_file_is_written_through_links_and_keeps_its_permissions(tmp_path):
+    """As by any other program: a link stays a link, and what only its owner could read stays that owner's."""
+    (tmp_path / "far").mkdir()
+    files.save_text("old", tmp_path / "far" / "secret.md")
+    (tmp_path / "far" / "secret.md").chmod(0o600)
+    (tmp_path / "link.md").symlink_to("far/secret.md")
+    (tmp_path / "new.md").symlink_to("far/new.md")
+    for name in ("link.md", "new.md"):
+        assert files.save_text("new", tmp_path / name) == tmp_path / name
+        assert (tmp_path / name).is_symlink() and (tmp_path / name).read_text() == "new"
+    assert (tmp_path / "far" / "secret.md").stat().st_mode & 0o777 == 0o600
+    ordinary = tmp_path / "ordinary"
+    ordinary.touch()
+    assert (tmp_path / "far" / "new.md").stat().st_mode == ordinary.stat().st_mode
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "far",
+        "link.md",
+        "new.md",
+        "new.md",
+        "ordinary",
+        "secret.md",
+    ]
+
+
+def test_what_is_no_file_is_never_replaced_by_one(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "null").symlink_to("/dev/null")
+    (tmp_path / "round").symlink_to("round")
+    (tmp_path / "nowhere").symlink_to("none/file.md")
+    with socket.socket(socket.AF_UNIX) as opened:
+        opened.bind(str(tmp_path / "socket"))
+    before = {path.name: path.lstat() for path in tmp_path.iterdir()}
+    for name, kind in {
+        "fifo": "a FIFO",
+        "socket": "a socket",
+        "null": "a device",
+        "round": "leads back to itself",
+    }.items():
+        with refused(ValueError, "Output path", name, kind, "give another"):
+            files.save_text("text", tmp_path / name)
+    with refused(ValueError, "Output folder", "none", "does not exist"):
+        files.save_text("text", tmp_path / "nowhere")
+    assert {path.name: path.lstat() for path in tmp_path.iterdir()} == before
+
+
+def test_what_killed_savers_leave_is_removed_and_what_is_being_written_is_not(tmp_path):
+    handle, living = whole_files._begun(tmp_path, 0o600)
+    with whole_files.own_folder(tmp_path) as folder:
+        (tmp_path / ".fivjax.file.part").write_text("left")
+        (tmp_path / ".fivjax.folder.part").mkdir()
+        (tmp_path / ".fivjax.folder.part" / "file").write_text("left")
+        (tmp_path / ".hidden").write_text("of somebody else")
+        files.save_text("text", tmp_path / "text.md")
+        assert set(tmp_path.iterdir()) == {living, folder, tmp_path / ".hidden", tmp_path / "text.md"}
+    os.close(handle)
+    files.save_text("text", tmp_path / "text.md")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "text.md"]
 
 
 def test_a_scene_prints_its_values(run):

@@ -68,13 +68,7 @@ def own_folder(parent: Path) -> Iterator[Path]:
     **Raises:** `OSError` where it cannot be made.
     """
     remove_left_over(parent)
-    while True:
-        folder = _hidden(parent)
-        folder.mkdir(0o700)
-        handle = None if fcntl is None else os.open(folder, os.O_RDONLY)
-        if handle is None or _still_there(handle, folder):
-            break
-        os.close(handle)
+    folder, handle = _begun_folder(parent)
     try:
         yield folder
     finally:
@@ -104,6 +98,20 @@ def _begun(folder: Path, mode: int) -> tuple[int, Path]:
         if _still_there(handle, part):
             return handle, part
         os.close(handle)
+
+
+def _begun_folder(parent: Path) -> tuple[Path, int | None]:
+    """A new folder under a hidden name, and what holds its lock."""
+    while True:
+        folder = _hidden(parent)
+        folder.mkdir(0o700)
+        if fcntl is None:
+            return folder, None
+        with contextlib.suppress(FileNotFoundError):
+            handle = os.open(folder, os.O_RDONLY)
+            if _still_there(handle, folder):
+                return folder, handle
+            os.close(handle)
 
 
 def _still_there(handle: int, path: Path) -> bool:
