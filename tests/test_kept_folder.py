@@ -100,12 +100,14 @@ def test_where_nothing_can_be_kept_one_sentence_says_so(tmp_path, monkeypatch):
         warnings.simplefilter("always")
         for _ in range(3):
             assert folder_to_keep_in(tmp_path / "file" / "kept") is None
+        keep(tmp_path / "file" / "kept", b"content")
     (only,) = said
     assert only.category is NotKept and "Not a directory" in str(only.message) and "same" in str(only.message)
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
+    kept_folder._told.clear()
     keep(tmp_path / "kept", b"before")
     monkeypatch.setattr(whole_files.os, "replace", full)
     with pytest.warns(NotKept, match="No space left on device"):
@@ -146,6 +148,7 @@ def test_the_command_line_does_without_a_folder(tmp_path, monkeypatch, capsys, w
         warnings.simplefilter("always")
         keep_compiled_code()
         said = capsys.readouterr().err
+        kept_folder._told.clear()
         assert said.startswith("fivjax: Compiled code is not kept") and said.count("\n") == 1
         monkeypatch.setenv("XDG_CACHE_HOME", "relative")
         monkeypatch.setattr(Path, "home", classmethod(lambda _: (_ for _ in ()).throw(RuntimeError)))

@@ -49,8 +49,8 @@ def _folder_of_caches() -> Path | None:
 
 
 def _remove_partial(folder: Path) -> None:
-    """Remove programs that JAX began to write on a full disk, or that a process was killed at: those without the file that JAX
-    writes next. With such a one it would keep nothing any more.
+    """Remove programs that JAX could only begin to write, as on a full disk: those without the file that it writes next. With
+    such a one in the folder it would keep nothing any more.
     """
     import filelock
 
@@ -70,10 +70,13 @@ def _show(message, category, *where) -> None:
         print(f"fivjax: {text}", file=sys.stderr)
     elif text.startswith(NOT_WRITTEN):
         cannot_keep(folder, text.partition("': ")[2])
+        if jax.config.jax_compilation_cache_max_size == LARGEST:
+            _remove_partial(Path(folder))
     elif text.startswith(NOT_READ):
         tell(
             f"A compiled program in folder `{folder}` is damaged, so that each start takes longer. Remove the folder; it is "
-            "made anew."
+            "made anew.",
+            about=NOT_READ,
         )
     else:
         _show_otherwise(message, category, *where)

@@ -50,19 +50,19 @@ def checked(folder: str | Path) -> Checked:
 
 
 def folder_to_keep_in(folder: str | Path) -> Path | None:
-    """`checked`, without the reason: it is told once."""
+    """`checked`, without the reason, which is told."""
     path, reason = checked(folder)
     if path is None:
         tell(f"Compiled code is not kept, because folder `{folder}` {reason}. {CONSEQUENCE}")
     return path
 
 
-def tell(sentence: str) -> None:
-    """Warn, once in a process, that something is not kept."""
+def tell(sentence: str, about: str = "what is not kept") -> None:
+    """Warn, once in a process about each subject: what hinders one file hinders the next."""
     with _telling:
-        if sentence in _told:
+        if about in _told:
             return
-        _told.add(sentence)
+        _told.add(about)
     warnings.warn(sentence, NotKept, stacklevel=3)
 
 
