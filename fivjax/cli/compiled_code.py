@@ -6,7 +6,7 @@ import sys
 import warnings
 from pathlib import Path
 
-from ..foundation.kept_folder import NotKept, cannot_keep, folder_to_keep_in, tell
+from ..foundation.kept_folder import NO_HOME, NotKept, cannot_keep, folder_to_keep_in, tell
 
 # The largest size of the compiled code that is kept, in bytes.
 LARGEST = 2**30
@@ -42,9 +42,7 @@ def _folder_of_caches() -> Path | None:
     try:
         return Path.home() / ".cache"
     except RuntimeError:
-        tell(
-            "Compiled code is not kept, because this user has no home folder; set XDG_CACHE_HOME to a folder of your own."
-        )
+        tell(NO_HOME)
         return None
 
 

@@ -19,6 +19,7 @@ DIGEST_BYTES = 32
 # What others than the owner must not be permitted: writing; and looking inside, which what is below needs to be reached.
 WRITING, ENTERING = 0o022, 0o011
 CONSEQUENCE = "Results are the same, but each start takes longer."
+NO_HOME = "Compiled code is not kept, because this user has no home folder; set XDG_CACHE_HOME to a folder of your own."
 
 _told: set[str] = set()
 _telling = threading.Lock()

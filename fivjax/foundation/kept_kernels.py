@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from .kept_folder import cannot_keep, folder_to_keep_in, read_own
+from .kept_folder import NO_HOME, cannot_keep, folder_to_keep_in, read_own, tell
 from .whole_files import own_folder
 
 # The folder inside Warp's, and the file with the digests of a kernel's other files.
@@ -32,10 +32,17 @@ def load(wp, module, names: list[str]) -> None:
     **Raises:** `OSError` where it has to be built and no temporary folder has room.
     """
     with _as_built(wp, module):
-        folder = folder_to_keep_in(Path(wp.config.kernel_cache_dir or tempfile.gettempdir()) / FOLDER)
+        folder = _folder(Path(wp.config.kernel_cache_dir))
         missing = [name for name in names if folder is None or not _loaded(wp, module, name, folder)]
         if missing:
             _build_and_load(wp, module, missing, folder)
+
+
+def _folder(of_warp: Path) -> Path | None:
+    if of_warp.is_absolute():
+        return folder_to_keep_in(of_warp / FOLDER)
+    tell(NO_HOME)
+    return None
 
 
 def _loaded(wp, module, name: str, folder: Path) -> bool:

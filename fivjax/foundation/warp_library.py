@@ -47,11 +47,22 @@ def _initialised():
             '`pip install "fivjax[gpu]"` on all machines of the run, or on none.'
         ) from None
     with _quietly(wp), _without_stderr():
-        try:
-            wp.init()
-        except OSError:  # Warp does not begin without a folder of its own; fivjax's kernels do not need it
+        if not _has_place(wp):
+            # What Warp would take is a folder named ~ in the present one.
+            wp.config.kernel_cache_dir = os.path.join("~", ".cache", "warp", wp.config.version)
             _init_elsewhere(wp)
+        else:
+            try:
+                wp.init()
+            except OSError:  # Warp does not begin without a folder of its own; fivjax's kernels do not need it
+                _init_elsewhere(wp)
     return wp
+
+
+def _has_place(wp) -> bool:
+    """Whether Warp is told a folder for its kernels, or the user has a home folder for it."""
+    named = wp.config.kernel_cache_dir, *map(os.environ.get, ("WARP_CACHE_PATH", "XDG_CACHE_HOME"))
+    return any(named) or os.path.isabs(os.path.expanduser("~"))
 
 
 def _init_elsewhere(wp) -> None:
