@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from ..foundation import linear_solve
 from ..io.recordings import Channel
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
@@ -40,7 +41,7 @@ def characteristic_residual(
         apart = jnp.abs(pole - poles)
         apart = jnp.prod(jnp.where((apart == 0) | ~found, 1.0, jnp.maximum(apart, 1e-3 * jnp.abs(pole))))
         scale = (2 * jnp.abs(pole)) ** m * jnp.abs(pole) ** (m - jnp.sum(found))
-        return jnp.linalg.det(dynamic(pole)) / (apart * scale * COARSE_POLE * jnp.abs(pole))
+        return linear_solve.determinant(dynamic(pole)) / (apart * scale * COARSE_POLE * jnp.abs(pole))
 
     residual = [jnp.where(found, jax.vmap(determinant)(poles), 0.0)]
     measured = {}

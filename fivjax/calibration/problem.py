@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
 from ..model.scene import Scene
 from .cycle_closing import corrected, is_closed, predicted
 from .cycle_misfit import CycleMisfit
@@ -143,7 +144,7 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
     for i, (cycle, gap, contact) in enumerate(zip(cycles, unclosed, contacts, strict=True)):
         own = slice(rows + i * count, rows + (i + 1) * count), slice(size + i * count, size + (i + 1) * count)
         systems.append(slopes[own])
-        solved = jnp.linalg.solve(systems[-1], jnp.concatenate([slopes[own[0], :size], gap[:, None]], axis=1))
+        solved = solve(systems[-1], jnp.concatenate([slopes[own[0], :size], gap[:, None]], axis=1))
         follow.append(-solved[:, :-1])
         # The Jacobian includes the change of the cycle with the parameters; to first order the residuals are those of the
         # closed cycle.

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ..foundation.linear_solve import solve
+from ..foundation.matrix_factors import exponential, orthonormal_columns
 from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
@@ -45,9 +47,9 @@ class SlidingMisfit(AbstractWaveformMisfit):
     def compared(self, scene, own, share):
         weight = window(self.edges, share)[:, None] / self.sigma
         waves, target = self._waves(scene), weight * self.means
-        q, r = jnp.linalg.qr((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
+        q, r = orthonormal_columns((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
         target = target.ravel()
-        amplitudes = jax.scipy.linalg.solve_triangular(r, q.T @ target)
+        amplitudes = solve(r, q.T @ target)
         return Compared(finite(target - q @ (q.T @ target)), waves @ amplitudes, jnp.zeros(0), None)
 
     def _waves(self, scene) -> Float[Array, "B k m"]:
@@ -56,7 +58,7 @@ class SlidingMisfit(AbstractWaveformMisfit):
         matrix = linear_sliding(scene).matrix
         m = matrix.shape[0] // 2
         width = self.edges[1] - self.edges[0]
-        states = _powers(jax.scipy.linalg.expm(width * matrix), self.edges.shape[0])
+        states = _powers(exponential(width * matrix), self.edges.shape[0])
         keep = free_in_sliding(scene.structure).tolist()
         columns = []
         for quantity, coordinate in self.channels:
@@ -100,7 +102,7 @@ def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[A
     """The same for constant friction, if no contact ever stops sliding: exact, from one jump of the load to the next."""
     n, matrix = scene.structure.size, linear_sliding(scene).matrix
     keep = free_in_sliding(scene.structure).tolist()
-    steps = _powers(jax.scipy.linalg.expm((instants[1] - instants[0]) * matrix), instants.shape[0])
+    steps = _powers(exponential((instants[1] - instants[0]) * matrix), instants.shape[0])
 
     def equilibrium(force):
         q, _ = steady_sliding(scene, force)
@@ -111,12 +113,12 @@ def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[A
     found = jnp.broadcast_to(rest, (instants.shape[0], len(rest)))
     jumps = scene.load.jumps
     for k in range(jumps.shape[0]):
-        z = rest + jax.scipy.linalg.expm((jumps[k] - begin) * matrix) @ (z - rest)
+        z = rest + exponential((jumps[k] - begin) * matrix) @ (z - rest)
         begin = jumps[k]
         until = jumps[k + 1] if k + 1 < jumps.shape[0] else jnp.inf
         middle = begin + jnp.minimum(0.5 * (until - begin), 1.0)
         rest = equilibrium(scene.load(middle))
-        moving = steps @ (jax.scipy.linalg.expm((instants[0] - begin) * matrix) @ (z - rest)) + rest
+        moving = steps @ (exponential((instants[0] - begin) * matrix) @ (z - rest)) + rest
         found = jnp.where((instants >= begin)[:, None], moving, found)
     columns = jnp.array([*keep, *(n + i for i in keep)])
     return jnp.zeros((instants.shape[0], 2 * n)).at[:, columns].set(found)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..foundation.linear_solve import solve
 from ..model.friction import AbstractFriction
 from ..model.friction_per_contact import FrictionPerContact
 from ..model.scene import Scene, steady_slip_speeds
@@ -60,7 +61,7 @@ class Mechanics(eqx.Module):
         right = jnp.concatenate(
             [-matrices.stiffness, -matrices.damping, matrices.load_direction[:, None], columns], axis=1
         )
-        solved = jnp.linalg.solve(matrices.mass, right)
+        solved = solve(matrices.mass, right)
         count = len(self.places)
         self.free_position = solved[:, :n]
         self.free_velocity = solved[:, n : 2 * n]
@@ -104,7 +105,7 @@ class Mechanics(eqx.Module):
         """
         matrices = structure.matrices
         springs = Springs(matrices.stiffness)
-        from_springs = -jnp.linalg.solve(matrices.mass, springs.stretch.T * springs.rates)
+        from_springs = -solve(matrices.mass, springs.stretch.T * springs.rates)
         return self._with_reference(rest, springs, from_springs)
 
     @property

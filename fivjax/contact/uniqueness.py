@@ -7,10 +7,12 @@ so it is enough to check $±μ_i$. `model.delassus_matrix` has the same test for
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ..foundation.linear_solve import determinant
 from .mechanics import Mechanics
 
 # Up to `ALL` contacts, all principal minors are checked; with more contacts, those of up to `TOGETHER` contacts at a time.
@@ -27,11 +29,11 @@ def slides_uniquely(mechanics: Mechanics) -> Bool[Array, ""]:
         return (mechanics.normal_compliance(one, static) > 0) & (mechanics.normal_compliance(-one, static) > 0)
     _, g_tn, g_nn = mechanics.compliance
     count, dragged = len(mechanics.places), g_tn.T * mechanics.friction.static
-    unique = jnp.ones((), bool)
+    unique, determinants = jnp.ones((), bool), jax.vmap(jax.vmap(determinant))
     for size in range(1, 1 + (count if count <= ALL else TOGETHER)):
         subsets = np.array(list(itertools.combinations(range(count), size)))
         signs = np.array(list(itertools.product((1.0, -1.0), repeat=size)))
         rows, columns = subsets[:, :, None], subsets[:, None, :]
         matrices = g_nn[rows, columns] + dragged[rows, columns] * signs[:, None, None, :]
-        unique = unique & jnp.all(jnp.linalg.det(matrices) > 0)
+        unique = unique & jnp.all(determinants(matrices) > 0)
     return unique

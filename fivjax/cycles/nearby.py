@@ -16,6 +16,7 @@ from ..contact import Contact, same_mode
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
+from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
 from ..model.scene import Scene, refuse_vector_contacts
@@ -132,7 +133,7 @@ def next_to(scene: Scene, before: Scene, point: Point, crossings, stages: int, m
         state=where_found(root.y + sliding_state(scene, scene.load.final)),
         residual=root.missed,
         found=found,
-        multipliers=where_found(_by_size(jnp.linalg.eigvals(root.jacobian))) if multipliers else None,
+        multipliers=where_found(_by_size(eigenvalues(root.jacobian))) if multipliers else None,
     )
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, Rest, State
 from ..foundation.carried import depending_on
 from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
@@ -84,7 +85,7 @@ def longest_return(scene: Scene) -> Float[Array, ""]:
     free = free_in_sliding(structure)
     stiffness = structure.stiffness[jnp.ix_(free, free)]
     along = np.searchsorted(free, tangential)
-    compliance = jnp.linalg.solve(stiffness, jnp.eye(len(free))[:, along])[along]
+    compliance = solve(stiffness, jnp.eye(len(free))[:, along])[along]
     compliance = jnp.diag(compliance) if jnp.ndim(compliance) else compliance
     _, force = steady_sliding(scene, scene.load.final)
     sticking = 2 * scene.friction.static * jnp.abs(force) * compliance / jnp.abs(scene.belt_speed)

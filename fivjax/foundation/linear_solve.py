@@ -1,9 +1,9 @@
-"""Small linear systems by elimination, written out.
+"""Linear systems and determinants by elimination, without LAPACK.
 
-In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device.
-`jax.numpy.linalg.solve` calls LAPACK system by system instead. Worse, two such calls in one compiled batch of some ten
-thousand systems can wait for each other for ever (jaxlib 0.10.2 on two cores: batched triangular solves share a pool of
-threads and block it).
+In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device. LAPACK is called system
+by system instead. Worse, its calls can wait for each other for ever: those of jaxlib 0.10.0 to 0.10.2 share a batch out to
+XLA's pool of threads and wait for it, inside a thread of that pool. As many such calls at a time as the pool has threads, in
+one program or in several, hold all of them (`tests/test_standstill.py`). See `matrix_routines` for what is left to LAPACK.
 """
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-# For larger systems LAPACK is the better choice, and batches of them are small.
+# Larger systems are eliminated in a loop: written out, they would take longer to compile than to solve.
 LARGEST = 10
 
 
@@ -20,8 +20,6 @@ def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, " n *k"]) -> Inex
 
     Not finite for a singular matrix. A derivative takes one more solution; the elimination itself is not differentiated.
     """
-    if matrix.shape[0] > LARGEST:
-        return jnp.linalg.solve(matrix, right)
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
@@ -30,21 +28,58 @@ def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, " n *k"]) -> Inex
     )
 
 
-def _eliminated(matrix, right):
-    n = matrix.shape[0]
-    table = jnp.concatenate([matrix, right.reshape(n, -1)], axis=1)
-    index = np.arange(n)
-    for k in range(n):
-        size = jnp.where(index >= k, jnp.abs(table[:, k]), -1.0)
-        largest = size == jnp.max(size)
-        largest = largest & (jnp.cumsum(largest) == 1)
-        pivot = jnp.sum(jnp.where(largest[:, None], table, 0.0), axis=0)
-        table = jnp.where(largest[:, None], table[k], table)
-        pivot = pivot / pivot[k]
-        table = jnp.where((index == k)[:, None], pivot, table - table[:, k, None] * pivot)
-    return table[:, n:].reshape(right.shape)
-
-
 def inverse(matrix: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
     """The inverse, not finite for a singular matrix."""
     return solve(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype))
+
+
+def determinant(matrix: Inexact[Array, "n n"]) -> Inexact[Array, ""]:
+    """The determinant, by Gauss elimination with partial pivoting, which is differentiated as it stands."""
+    n = matrix.shape[0]
+    index = np.arange(n)
+
+    def further(k, so_far):
+        product, table = so_far
+        pivot, swapped, place = _pivoted(table, k)
+        # What is no number has no largest entry, and so no place.
+        sign = jnp.where(place == k, 1.0, jnp.where(place < n, -1.0, jnp.nan))
+        product = product * pivot[k] * sign
+        # A pivot of zero has nothing but zeros below it.
+        shares = jnp.where(index > k, swapped[:, k], 0.0) / jnp.where(pivot[k] == 0, 1.0, pivot[k])
+        return product, swapped - shares[:, None] * pivot
+
+    return _repeated(n, further, (jnp.ones((), matrix.dtype), matrix))[0]
+
+
+def _eliminated(matrix, right):
+    n = matrix.shape[0]
+    index = np.arange(n)
+
+    def further(k, table):
+        pivot, swapped, _ = _pivoted(table, k)
+        pivot = pivot / pivot[k]
+        return jnp.where((index == k)[:, None], pivot, swapped - swapped[:, k, None] * pivot)
+
+    return _repeated(n, further, jnp.concatenate([matrix, right.reshape(n, -1)], axis=1))[:, n:].reshape(right.shape)
+
+
+def _pivoted(table, k):
+    """The pivot's row in column k, the table with row k in its place, and that place. (Row k itself is left where it was, too:
+    nobody reads it there.)
+    """
+    index = np.arange(table.shape[0])
+    size = jnp.where(index >= k, jnp.abs(table[:, k]), -1.0)
+    # By sums and comparisons, because indices that differ within a batch would be gathered system by system.
+    place = jnp.min(jnp.where(size == jnp.max(size), index, table.shape[0]))
+    chosen = (index == place)[:, None]
+    pivot = jnp.sum(jnp.where(chosen, table, 0.0), axis=0)
+    return pivot, jnp.where(chosen, table[k], table), place
+
+
+def _repeated(count: int, further, value):
+    """`further(k, value)` for each k below a count: written out for a few, else in a loop."""
+    if count > LARGEST:
+        return jax.lax.fori_loop(0, count, further, value)
+    for k in range(count):
+        value = further(k, value)
+    return value

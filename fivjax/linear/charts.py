@@ -8,6 +8,7 @@ import numpy as np
 
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
+from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import labelled
 from ..model.scene import Scene
@@ -21,9 +22,8 @@ from .system import with_axes
 if TYPE_CHECKING:
     import xarray as xr
 
-POINTS_AT_ONCE = 8192
-# In batches that call LAPACK: small enough that parallel parts of it do not block each other (see `foundation.linear_solve`).
-POINTS_AT_ONCE_BY_LAPACK = 64
+# Points that are computed together, by polynomials and by eigenvalues: the latter need a matrix for each.
+POINTS_AT_ONCE, POINTS_WITH_MATRICES = 8192, 64
 
 
 @in_double_precision
@@ -62,7 +62,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     columns = [values.ravel() for values in grid]
     points = columns[0].size
     expanded = scene.structure.size - 1 <= LARGEST_EXPANDED
-    batch = min(POINTS_AT_ONCE if expanded else POINTS_AT_ONCE_BY_LAPACK, points)
+    batch = min(POINTS_AT_ONCE if expanded else POINTS_WITH_MATRICES, points)
     padding = -points % batch
     columns = [np.concatenate([c, np.repeat(c[-1:], padding)]).reshape(-1, batch) for c in columns]
     results = _chart(scene, tuple(axes), [real(c) for c in columns])
@@ -111,7 +111,7 @@ def _chart(scene, names, columns):
         normal_force, exists = _steady_state(point)
         matrix = linear_sliding(point).matrix
         ok = exists & jnp.all(jnp.isfinite(matrix))
-        roots = jnp.linalg.eigvals(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
+        roots = eigenvalues(jnp.where(ok, matrix, jnp.eye(matrix.shape[0])))
         fastest = jnp.argmax(roots.real)
         results = roots.real[fastest], jnp.abs(roots.imag[fastest]) / (2 * jnp.pi), jnp.nan
         return *(jnp.where(ok, r, jnp.nan) for r in results), normal_force

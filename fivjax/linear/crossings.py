@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..foundation.linear_solve import inverse, solve
+from ..foundation.matrix_routines import eigenvalues
 from .feedback import Loop
 from .gradients import significant_growth
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER, PAINLEVE
@@ -69,7 +70,7 @@ def first_limit(loop: Loop) -> Limit:
     typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
     usable = jnp.isfinite(inverse_gain) & (inverse_gain > 0)
     # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
-    marginal = jnp.max(jnp.linalg.eigvals(state).real) > -1e-11
+    marginal = jnp.max(eigenvalues(state).real) > -1e-11
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
     gains = jnp.where(usable, 1 / jnp.where(usable, inverse_gain, 1.0), jnp.inf)
     gains, omega, codes = jax.lax.sort((gains, omega, codes), num_keys=1)
@@ -162,4 +163,4 @@ def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[A
     chosen = (quality > 0) & (quality == jnp.max(quality))
     chosen = chosen & (jnp.cumsum(chosen) == 1)
     best = jnp.sum(jnp.where(chosen[:, None, None], projected, 0.0), axis=0)
-    return jnp.sum(jnp.where(chosen, shifts, 0.0)) + 1 / jnp.linalg.eigvals(best)
+    return jnp.sum(jnp.where(chosen, shifts, 0.0)) + 1 / eigenvalues(best)

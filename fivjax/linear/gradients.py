@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..foundation.matrix_routines import eigenvectors
 from ..foundation.precision import in_double_precision
 
 
@@ -16,7 +17,7 @@ def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """
     usable = jnp.all(jnp.isfinite(matrix))
     matrix = jnp.where(usable, matrix, 0.0)
-    _, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(matrix), compute_left_eigenvectors=True)
+    _, left, right = eigenvectors(jax.lax.stop_gradient(matrix))
     left = left.conj().T
     left = left / jnp.sum(left * right.T, axis=1, keepdims=True)
     # The derivative of an eigenvalue is that of left A right with constant eigenvectors.

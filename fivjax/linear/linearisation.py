@@ -129,7 +129,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
 
     rest = jnp.zeros(len(keep), q.dtype)
     _, g_tn, g_nn = mechanics.compliance
-    handed_on = jnp.linalg.solve(g_nn + g_tn.T * dragging, g_tn.T)
+    handed_on = solve(g_nn + g_tn.T * dragging, g_tn.T)
     columns = mechanics.from_tangential - (mechanics.from_tangential * dragging + mechanics.from_normal) @ handed_on
     slope, curvature = law.variation(LOWEST_SLIP * speed)
     forces = jnp.abs(normal_force)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.matrix_routines import log_determinant
 from ..foundation.precision import real, returning_numpy
 from ..model.sliding import sliding_matrices
 from ..model.structure import Structure
@@ -100,8 +101,8 @@ def _margin(structure, mu, direction):
 
 def _relative_determinant(matrix, reference):
     # In logarithms, because a determinant with hundreds of rows would often overflow or underflow.
-    sign, size = jnp.linalg.slogdet(matrix)
-    reference_sign, reference_size = jnp.linalg.slogdet(reference)
+    sign, size = log_determinant(matrix)
+    reference_sign, reference_size = log_determinant(reference)
     return sign * reference_sign * jnp.exp(size - jax.lax.stop_gradient(reference_size))
 
 

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..foundation.linear_solve import solve
+from ..foundation.matrix_routines import eigenvalues
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
@@ -61,7 +63,7 @@ def sliding_forces(structure: Structure, friction: Float[Array, " c"], force) ->
     normal, free = np.atleast_1d(contact_coordinates(structure)[1]), free_coordinates(structure)
     *_, stiffness, load = structure.matrices
     rows = sliding_rows(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)
-    displacements = jnp.linalg.solve(rows[:, free], rows[:, -1] * force)
+    displacements = solve(rows[:, free], rows[:, -1] * force)
     return stiffness[normal][:, free] @ displacements - load[normal] * force
 
 
@@ -110,7 +112,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     ends = (looks[jnp.maximum(place - 1, 0)], looks[place])
     low, high = jax.lax.fori_loop(0, HALVINGS, halved, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
-    values = jnp.linalg.eigvals(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
+    values = eigenvalues(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
     omega = jnp.abs(values[jnp.argmax(values.real)].imag)
     undamped = jnp.all(structure.damping == 0)
     flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
@@ -139,7 +141,7 @@ def _(primals, tangents):
 
     def growth(structure, mu):
         matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
-        return jnp.max(jnp.linalg.eigvals(matrix).real)
+        return jnp.max(eigenvalues(matrix).real)
 
     _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))
     _, along_mu = jax.jvp(lambda m: growth(structure, m), (at,), (jnp.ones_like(at),))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from ..foundation import arguments
+from ..foundation import arguments, matrix_routines
 from ..foundation.compiling import compiled
 from ..foundation.precision import is_known, real, returning_numpy
 from ..model.scene import Scene, sliding_equilibrium
@@ -18,7 +18,7 @@ from .gradients import with_own_gradient
 from .several_contacts import one_contact, sliding_motion
 from .system import as_scene, check_direction
 
-# Small enough that LAPACK calls in parallel parts of a batch do not block each other (see `foundation.linear_solve`).
+# Points whose matrices are in memory together.
 POINTS_AT_ONCE = 256
 
 
@@ -107,7 +107,7 @@ def _check_frictions(mu) -> None:
 
 @compiled
 def _eigenvalues(scene):
-    found = jnp.linalg.eigvals(sliding_motion(scene)[0])
+    found = matrix_routines.eigenvalues(sliding_motion(scene)[0])
     return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
 
 
@@ -116,7 +116,9 @@ def _eigenvalues_over(structure, mu, direction):
     return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
 
 
-_growth_rate = compiled(with_own_gradient(lambda scene: jnp.max(jnp.linalg.eigvals(sliding_motion(scene)[0]).real)))
+_growth_rate = compiled(
+    with_own_gradient(lambda scene: jnp.max(matrix_routines.eigenvalues(sliding_motion(scene)[0]).real))
+)
 
 
 @returning_numpy

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
 from ..foundation.precision import returning_numpy
 from .structure import Structure
 
@@ -57,7 +58,7 @@ def delassus(structure: Structure) -> Delassus:
 def _delassus(structure: Structure) -> Delassus:
     count = len(structure.contacts)
     w = jnp.concatenate([structure.tangential_directions, structure.normal_directions], axis=1)
-    g = w.T @ jnp.linalg.solve(structure.mass, w)
+    g = w.T @ solve(structure.mass, w)
     g = 0.5 * (g + g.T)
     return Delassus(g[:count, :count], g[:count, count:], g[count:, count:])
 

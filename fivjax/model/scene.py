@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
 from .delassus_matrix import delassus, has_one_solution
@@ -206,7 +207,7 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
     _, _, stiffness = sliding_matrices(structure, friction)
     load = sliding_load(structure, friction)
-    reduced = jnp.linalg.solve(stiffness, load * force)
+    reduced = solve(stiffness, load * force)
     # Where the stiffness is singular but for rounding, the displacements are so large that their rounding outweighs the load.
     rounding = jnp.finfo(reduced.dtype).eps * jnp.max(jnp.abs(stiffness)) * jnp.max(jnp.abs(reduced))
     reduced = jnp.where(rounding > 1e-3 * jnp.max(jnp.abs(load * force)), jnp.nan, reduced)
@@ -250,7 +251,7 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
 @compiled
 def _painleve_friction(structure: Structure):
     columns = jnp.eye(structure.size)[:, jnp.array([structure.tangential, structure.normal])]
-    compliance = columns.T @ jnp.linalg.solve(structure.mass, columns)
+    compliance = columns.T @ solve(structure.mass, columns)
     coupling = jnp.abs(compliance[0, 1])
     return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
 

@@ -15,6 +15,7 @@ from .. import contact as physics
 from ..contact import Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.linear_solve import solve
 from ..foundation.precision import (
     Returned,
     in_double_precision,
@@ -246,7 +247,7 @@ def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
     x, _ = transformation(structure)
     if y0 is not None:
         y = checked_start(structure.size, y0)
-        y0 = snapped_to_belt(inner, jnp.concatenate([jnp.linalg.solve(x, half) for half in jnp.split(y, 2)]))
+        y0 = snapped_to_belt(inner, jnp.concatenate([solve(x, half) for half in jnp.split(y, 2)]))
     run = simulate(inner, *how, y0=y0, **options)
     rows = {name: getattr(run, name) @ x.T for name in ("displacement", "velocity", "acceleration")}
     return dataclasses.replace(run, **rows, scene=scene)

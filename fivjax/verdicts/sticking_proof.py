@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
+from ..foundation.linear_solve import solve
 from ..model.scene import Scene
 
 
@@ -76,4 +77,4 @@ def sticks_forever(drift: StickingDrift, mechanics: Mechanics, contact: Contact,
 
 
 def _solve(matrix, right):
-    return right if matrix.shape[0] == 0 else jnp.linalg.solve(matrix, right)
+    return right if matrix.shape[0] == 0 else solve(matrix, right)
