@@ -1,16 +1,22 @@
 """fivjax: friction-induced vibration in JAX: slide, stick, detach, squeal; differentiable and in batches."""
 
 import sys
-from importlib import metadata
 
 import lazy_loader
 
 from .io.accessor import draw_with as _draw_with
 
 # A name is imported when it is first used, so that `import fivjax` is fast and a map loads no optimiser.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-__version__ = metadata.version("fivjax")
+
+def __getattr__(name):
+    if name != "__version__":
+        return _imported(name)
+    # Half of the time that `import fivjax` would take.
+    from importlib import metadata
+
+    return metadata.version("fivjax")
 
 
 def _show(dataset, **options):

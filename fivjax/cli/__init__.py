@@ -1,7 +1,14 @@
 """The command line, `fivjax …`: the public API with sensible defaults; each command writes data and a picture.
 
-Heavy packages are imported only when a command runs, so that `--help`, `--version` and errors in options come at once.
+Heavy packages are imported only when a command runs, so that `--help`, `--version` and errors in options come at once; and
+nothing at all before signals are handled (`program`).
 """
 
-from .command_line import main as main
-from .command_line import program as program
+from .program import program as program
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command, see `command_line.main`."""
+    from .command_line import main
+
+    return main(arguments)

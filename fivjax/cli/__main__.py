@@ -1,5 +1,5 @@
 """`python -m fivjax.cli` is `fivjax`."""
 
-from .command_line import program
+from .program import program
 
 program()

@@ -1,11 +1,11 @@
-"""The program: its commands and exit codes."""
+"""The commands, and the exit codes of what they raise."""
 
 import contextlib
-import os
 import signal
 import sys
 import threading
-from typing import NoReturn
+from collections.abc import Callable, Iterator
+from types import FrameType
 
 import tyro
 
@@ -19,6 +19,7 @@ from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
 from .parsing import numbers
+from .program import exit_code, handled
 from .simulate_command import Simulate
 from .study_commands import Reproduce, Tradeoff
 
@@ -34,10 +35,12 @@ COMMANDS = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType | None], None] | None = None) -> int:
     """Run one command. Returns the exit code; errors are sentences on standard error.
 
-    0: success; 1: no result, or the disk did not take it; 2: refused before any work; 130: interrupted.
+    0: success; 1: no result, or the disk did not take it; 2: refused before any work; 130: interrupted; 143: terminated.
+
+    `interrupt` is called when SIGINT or SIGTERM arrives, and raises `KeyboardInterrupt`; so does what stands in for it.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
@@ -51,50 +54,41 @@ def main(arguments: list[str] | None = None) -> int:
             args=arguments,
         )
     keep_compiled_code()
+    received: list[int] = []
     try:
-        with _terminated_like_interrupted(), in_lines():
+        with _interruptible(received, interrupt or _interrupt), in_lines():
             command.run()
-    except (ValueError, TypeError) as error:
-        print(f"fivjax: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
-        return 1
-    except Failure as failure:
-        print(f"fivjax: {failure}", file=sys.stderr)
-        return 1
-    except Interrupted as interruption:
-        print(f"fivjax: {interruption}", file=sys.stderr)
-        return 130
-    except KeyboardInterrupt:
-        print("fivjax: Interrupted; nothing was written.", file=sys.stderr)
-        return 130
+    except BaseException as error:
+        if isinstance(error, Interrupted | KeyboardInterrupt) or received:
+            said = error if isinstance(error, Interrupted) else "Interrupted; nothing was written."
+            print(f"fivjax: {said}", file=sys.stderr)
+            return exit_code(received[0] if received else signal.SIGINT)
+        if isinstance(error, OSError):
+            print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
+            return 1
+        if isinstance(error, ValueError | TypeError | Failure):
+            print(f"fivjax: {error}", file=sys.stderr)
+            return 1 if isinstance(error, Failure) else 2
+        raise
     return 0
 
 
-def program() -> NoReturn:
-    """`main`, and the end of the process at once: Python would take half a second to take apart what JAX has made."""
-    code = main()
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except OSError:  # nobody reads it any more; the code is Python's own for this
-        code = code or 120
-    os._exit(code)
+def _interrupt(*_) -> None:
+    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
-def _terminated_like_interrupted():
-    """SIGTERM, which a batch system sends before it kills a process, ends a run in the same orderly way as Ctrl-C."""
+def _interruptible(received: list[int], interrupt: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Note SIGINT and SIGTERM in `received` before they interrupt."""
 
-    def interrupt(*_):
-        raise KeyboardInterrupt
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        interrupt(number, frame)
 
     # Only a program's main thread may set signal handlers.
-    mine = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, interrupt) if mine else None
+    before = handled(note) if threading.current_thread() is threading.main_thread() else {}
     try:
         yield
     finally:
-        if mine:
-            signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

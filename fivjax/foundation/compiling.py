@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .forking import refuse_if_forked
 from .precision import is_known
 
 P = ParamSpec("P")
@@ -38,6 +39,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_if_forked()
         return (within if transformed((args, kwargs)) else alone())(*args, **kwargs)
 
     return call

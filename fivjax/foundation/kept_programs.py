@@ -27,6 +27,7 @@ import equinox as eqx
 import jax
 
 from .compiling import compiled, less_thought, transformed
+from .forking import refuse_if_forked
 from .kept_folder import folder_to_keep_in, keep, make_room, read_kept
 from .plain_trees import NotPlain, from_text, structure_to_text, to_text, with_zeros
 
@@ -50,6 +51,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_if_forked()
         folder = _folder()
         if folder is None or transformed((args, kwargs)):
             return otherwise(*args, **kwargs)

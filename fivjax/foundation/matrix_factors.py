@@ -1,4 +1,4 @@
-"""The exponential of a matrix, and orthonormal columns, by products and sums only: see `linear_solve` for why without LAPACK."""
+"""The exponential of a matrix, and orthonormal columns, without LAPACK: see `linear_solve` for why."""
 
 import math
 

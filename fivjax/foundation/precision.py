@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .forking import refuse_if_forked
+
 P = ParamSpec("P")
 R = TypeVar("R")
 # Arrays that a user gets back: NumPy's where values are known, JAX's under a transformation; see above.
@@ -33,6 +35,7 @@ def in_double_precision(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_if_forked()
         with jax.enable_x64(True):
             return function(*args, **kwargs)
 
@@ -44,6 +47,7 @@ def returning_numpy(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_if_forked()
         with jax.enable_x64(True):
             return jax.tree.map(known_to_numpy, function(*args, **kwargs))
 

@@ -2,12 +2,18 @@
 
 Python raises `KeyboardInterrupt` between any two instructions: perhaps while a file is being written, or inside a destructor,
 where it is swallowed and the run goes on.
+
+A thread inside compiled code cannot be stopped. So it is waited for only for a while, and then left behind.
 """
 
 import contextlib
 import signal
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+# How long threads are waited for once a run is to stop, s.
+PATIENCE = 2.0
 
 
 @contextlib.contextmanager
@@ -39,3 +45,23 @@ def stop_requests() -> Iterator[list[int]]:
             signal.signal(number, handler)
         if signal.SIGTERM in caught:
             signal.raise_signal(signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def waited_for(pool: ThreadPoolExecutor, *used: ThreadPoolExecutor) -> Iterator[tuple[ThreadPoolExecutor, ...]]:
+    """A pool of threads, and others that these use, which are waited for when the context ends; where it ends by an exception,
+    for `PATIENCE` at most.
+    """
+    try:
+        yield pool, *used
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        # A pool waits for ever, so a thread waits for it.
+        waiting = threading.Thread(target=pool.shutdown, daemon=True)
+        waiting.start()
+        waiting.join(PATIENCE)
+        for one in used:
+            one.shutdown(wait=False, cancel_futures=True)
+        raise
+    for one in (pool, *used):
+        one.shutdown()

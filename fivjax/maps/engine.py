@@ -20,7 +20,7 @@ from ..batches.blocks import workers as cores
 from ..batches.results import Verdicts, counted, not_run
 from ..batches.sharing import grouped
 from ..foundation.progress import Work, following
-from ..foundation.stopping import stop_requests
+from ..foundation.stopping import stop_requests, waited_for
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
@@ -165,38 +165,61 @@ def _follow(
         verdicts.verdict[rows(number)] = Verdict.WORKER_LOST
         ended(len(plan.jobs[number]))
 
-    def stop() -> bool:
-        return bool(requested)
-
     if not missing:
         pass
     elif workers is None:
-        failed = []
-
-        def report(count: int) -> None:
-            ended(count)
-            if requested or failed:
-                raise KeyboardInterrupt
-
-        with ThreadPoolExecutor(cores()) as blocks, ThreadPoolExecutor(at_a_time) as threads:
-            mine = Workers(threads)
-
-            def here(number: int):
-                # Results of an interrupted job are returned but not kept on disk, so that all results kept are of whole jobs.
-                partly = functools.partial(write, number)
-                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report, partly)
-
-            try:
-                hand_out(missing, here, mine, done, given_up, stop)
-            except BaseException:
-                failed.append(True)
-                raise
+        _run_here(missing, job, write, done, given_up, at_a_time, ended, requested)
     else:
         them = workers
-        hand_out(missing, lambda number: them.submit(run_job, job(number)), them, done, given_up, stop)
+        hand_out(
+            missing, lambda number: them.submit(run_job, job(number)), them, done, given_up, lambda: bool(requested)
+        )
     for number in part:
         for key, one in found.get(number, {}).items():
             attractors.setdefault(key, one)
+
+
+def _run_here(
+    missing: list[int],
+    job: Callable[[int], Job],
+    write: Callable[[int, Verdicts], None],
+    done: Callable[[int, Done], None],
+    given_up: Callable[[int], None],
+    at_a_time: int,
+    ended: "_Ended",
+    requested: list[int],
+) -> None:
+    """Run jobs in threads of this process. Those that are left behind (`waited_for`) end at their next report, and change
+    nothing any more.
+    """
+    failed, over = [], []
+
+    def report(count: int) -> None:
+        if not over:
+            ended(count)
+        if requested or failed:
+            raise KeyboardInterrupt
+
+    def interrupted(number: int, results: Verdicts) -> None:
+        # Results of an interrupted job are returned but not kept on disk, so that all results kept are of whole jobs.
+        if not over:
+            write(number, results)
+
+    try:
+        with waited_for(ThreadPoolExecutor(at_a_time), ThreadPoolExecutor(cores())) as (threads, blocks):
+            mine = Workers(threads)
+
+            def here(number: int):
+                then = functools.partial(interrupted, number)
+                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report, then)
+
+            try:
+                hand_out(missing, here, mine, done, given_up, lambda: bool(requested))
+            except BaseException:
+                failed.append(True)
+                raise
+    finally:
+        over.append(True)
 
 
 class _Ended:
