@@ -3,11 +3,13 @@
 import contextlib
 import multiprocessing
 import signal
+import sys
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 
 from ..foundation.kept_folder import NotKept
+from ..foundation.parent import end_with_parent
 from .compiled_code import keep_compiled_code
 
 
@@ -25,6 +27,8 @@ def workers_of(count: int, dask: str | None) -> Iterator:
         with contextlib.closing(_client(dask)) as client:
             yield client
     elif count:
+        # An interrupted program leaves the pool's semaphores to Python's resource tracker, which would complain of it.
+        sys.warnoptions.append("ignore:resource_tracker:UserWarning")
         context = multiprocessing.get_context("spawn")
         # A function, so that the map makes the pool, replaces it when workers die, and ends it when it is interrupted.
         yield lambda: ProcessPoolExecutor(count, mp_context=context, initializer=_begin)
@@ -33,9 +37,10 @@ def workers_of(count: int, dask: str | None) -> Iterator:
 
 
 def _begin() -> None:
-    """In each worker process: ignore Ctrl-C, which the process that hands out the jobs handles. That one also says what cannot
-    be kept.
+    """In each worker process: ignore Ctrl-C, which the process that hands out the jobs handles, and end with that process. That
+    one also says what cannot be kept.
     """
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore", NotKept)
     keep_compiled_code()

@@ -20,7 +20,8 @@ PATIENCE = 2.0
 def stop_requests() -> Iterator[list[int]]:
     """Inside this context the first signal is only added to the list that it gives; a second one stops the run at once.
 
-    At the end the former handlers are back, and a SIGTERM that was noted is sent again.
+    At the end the former handlers are back, and a signal that was noted is sent again; but not a Ctrl-C that nobody else
+    handles, which has done what it is for.
     """
     caught: list[int] = []
     # Only a program's main thread may set signal handlers.
@@ -43,8 +44,8 @@ def stop_requests() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if signal.SIGTERM in caught:
-            signal.raise_signal(signal.SIGTERM)
+        if caught and before[caught[0]] is not signal.default_int_handler:
+            signal.raise_signal(caught[0])
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 import contextlib
 import functools
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -126,11 +126,14 @@ def bistability_map(
         executor=executor,
         keeper=keeper,
     )
-    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper), ThreadPoolExecutor(1) as aside:
+    with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         # Compiled and computed while trajectories are followed.
+        aside = ThreadPoolExecutor(1)
         limit = aside.submit(linear_limit, scene, axes)
+        aside.shutdown(wait=False)
         if not refine:
-            return map_dataset(scene, method, t_max, grid, run(label="map"), limit.result())
+            verdicts = run(label="map")
+            return map_dataset(scene, method, t_max, grid, verdicts, _known_by_now(limit, verdicts))
         found: dict = {}  # attractors, which finer levels need not find again
 
         def level(places: np.ndarray, what: str) -> Verdicts:
@@ -138,6 +141,11 @@ def bistability_map(
 
         cells = refined(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
-    dataset = map_dataset(scene, method, t_max, grid, cells.verdicts, limit.result(), cells)
+    dataset = map_dataset(scene, method, t_max, grid, cells.verdicts, _known_by_now(limit, cells.verdicts), cells)
     dataset.attrs.update(audit_note(cells.audit))
     return dataset
+
+
+def _known_by_now(limit: Future, verdicts: Verdicts) -> dict[str, float]:
+    """The linear limit. Whoever interrupts a map does not wait for it."""
+    return {} if np.any(verdicts.pending()) and not limit.done() else limit.result()

@@ -17,6 +17,7 @@ from ..batches import rounds
 from ..batches.attractors import Attractors
 from ..batches.results import Verdicts, not_run
 from ..batches.sharing import Batch
+from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -67,6 +68,8 @@ def run_job(
     job by an exception; `interrupted` then gets the verdicts known by then.
     """
     if threads is None:
+        # Also in a pool that a user has made: its workers would wait for jobs of a killed process for ever.
+        end_with_parent()
         with ThreadPoolExecutor(max_workers=1) as one:
             return run_job(job, one, report, interrupted)
     task = job.task
