@@ -173,7 +173,7 @@ def test_a_killed_command_is_resumed_bit_for_bit(tmp_path):
     assert killed_map.run(folders["killed"], "SIGKILL", 0.05, cache).returncode == -9
     assert not (folders["killed"] / "map.nc").exists()
     ended = killed_map.run(folders["killed"], "SIGTERM", 0.05, cache)
-    assert ended.returncode == 130, ended.stderr
+    assert ended.returncode == 143, ended.stderr
     assert "--resume" in ended.stderr and "Traceback" not in ended.stderr
     assert not (folders["killed"] / "map.nc").exists()
     assert killed_map.run(folders["killed"], cache=cache).returncode == 0

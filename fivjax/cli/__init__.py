@@ -4,7 +4,7 @@ Heavy packages are imported only when a command runs, so that `--help`, `--versi
 nothing at all before signals are handled (`program`).
 """
 
-from .program import program as program
+from .ending import program as program
 
 
 def main(arguments: list[str] | None = None) -> int:

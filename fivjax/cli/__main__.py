@@ -1,5 +1,5 @@
 """`python -m fivjax.cli` is `fivjax`."""
 
-from .program import program
+from .ending import program
 
 program()

@@ -19,7 +19,7 @@ from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
 from .parsing import numbers
-from .program import exit_code, handled
+from .signals import exit_code, handled
 from .simulate_command import Simulate
 from .study_commands import Reproduce, Tradeoff
 

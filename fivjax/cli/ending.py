@@ -14,13 +14,13 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
 
+from .signals import SIGNALS, exit_code, handled
+
 # The process ends within five seconds of a signal.
 PATIENCE = 4.0  # s
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def program() -> NoReturn:
@@ -36,20 +36,6 @@ def program() -> NoReturn:
     except OSError:  # nobody reads it any more; the code is Python's own for this
         code = code or 120
     os._exit(code)
-
-
-def exit_code(number: int) -> int:
-    """The exit code of a process that a signal has ended."""
-    return 128 + number
-
-
-def handled(handler: Callable) -> dict[int, Callable]:
-    """Have the signals handled so, but for those that are ignored (`nohup`); returns their former handlers."""
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    before = {number: former for number, former in before.items() if former not in (signal.SIG_IGN, None)}
-    for number in before:
-        signal.signal(number, handler)
-    return before
 
 
 def _at_once(number: int, _: FrameType | None) -> NoReturn:

@@ -1,0 +1,20 @@
+"""The signals that end a command, and their exit codes."""
+
+import signal
+from collections.abc import Callable
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def exit_code(number: int) -> int:
+    """The exit code of a process that a signal has ended."""
+    return 128 + number
+
+
+def handled(handler: Callable) -> dict:
+    """Have the signals handled so, but for those that are ignored (`nohup`); returns their former handlers."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before = {number: former for number, former in before.items() if former not in (signal.SIG_IGN, None)}
+    for number in before:
+        signal.signal(number, handler)
+    return before
