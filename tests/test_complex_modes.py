@@ -74,6 +74,45 @@ def test_a_band_of_a_large_pencil_holds_all_its_modes(monkeypatch):
     assert modes.residuals.max() < 1e-9
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_real_eigenvalues_of_large_systems_are_found(seed, monkeypatch):
+    """Divergence, once or twice at one rate, and overdamped modes, among oscillators: each λ² + cλ + k = 0, in closed form."""
+    monkeypatch.setattr(mode_search, "DENSE", 50)
+    rng = np.random.default_rng(seed)
+    n, damping = 60, 1.0
+    springs = (2 * np.pi * np.linspace(100, 6000, n)) ** 2
+    springs[: 1 + seed % 3] = -(200.0**2)
+    springs[3:5] = 0.2, 0.25  # slow motions, overdamped and critically damped
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    pencil = fj.cea.Pencil(np.eye(n), damping * np.eye(n), turn @ np.diag(springs) @ turn.T)
+    modes = fj.cea.complex_modes(pencil, up_to=1500.0)
+    root = np.sqrt(damping**2 / 4 - springs + 0j)
+    wanted = np.concatenate([-damping / 2 + root, (-damping / 2 - root)[root.imag == 0]])
+    wanted = wanted[(np.abs(wanted.real) < modes.strip) & (wanted.imag <= 2 * np.pi * 1500)]
+    # Rounding of the stiffness, 1e-16 (2π 6000/s)², moves a slow motion by itself over the damping, the critical one by its root.
+    np.testing.assert_allclose(modes.eigenvalues, wanted[np.lexsort((wanted.real, wanted.imag))], rtol=1e-8, atol=1e-3)
+    assert np.sum(modes.eigenvalues.imag == 0) == 2 * (1 + seed % 3) + 4
+    assert modes.growth_rates.max() == pytest.approx(root.real.max() - damping / 2, rel=1e-10)
+    assert len(modes.unstable) == 1 + seed % 3
+    assert f"searched: growth rates between -{modes.strip:.5g} and" in repr(modes)
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_rigid_body_motions_are_neither_stable_nor_unstable(dense, monkeypatch):
+    """A free chain, undamped and damped: rounding must not turn its motion at rest into a growing one."""
+    monkeypatch.setattr(mode_search, "DENSE", 300 if dense else 20)
+    stiffness = 1e6 * (2 * np.eye(60) - np.eye(60, k=1) - np.eye(60, k=-1))
+    stiffness[0, 0] = stiffness[-1, -1] = 1e6
+    for damping in (0.0, 1e-6):
+        modes = fj.cea.complex_modes(fj.cea.Pencil(0.01 * np.eye(60), damping * stiffness, stiffness), up_to=300.0)
+        elastic = 2e4 * np.sin(np.pi * np.arange(1, 12) / 120)
+        np.testing.assert_allclose(
+            modes.frequencies[modes.frequencies > 0] * 2 * np.pi, elastic[: np.sum(modes.frequencies > 0)], rtol=1e-6
+        )
+        assert modes.frequencies[0] == modes.growth_rates[0] == modes.damping_ratios[0] == 0
+        assert not len(modes.unstable)
+
+
 def test_dense_modes_of_unsymmetric_matrices():
     """All modes of a small pencil, also with a coordinate without mass, against another dense route."""
     pencil = random_pencil(12)
@@ -168,6 +207,15 @@ def test_equal_eigenvalues_have_no_derivative_of_their_own():
         fj.cea.complex_modes(pencil), {"k": fj.cea.Pencil(0 * np.eye(2), 0 * np.eye(2), np.eye(2))}
     )
     assert np.all(np.isnan(slopes["k"]))
+
+
+def test_derivatives_at_zero():
+    """Two masses of 1 kg on dampers of 2 N·s/m, joined by a spring: a spring dk to the ground moves the eigenvalue 0 to -dk/2."""
+    joined = 1e4 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    modes = fj.cea.complex_modes(fj.cea.Pencil(np.eye(2), 2 * np.eye(2), joined))
+    (at_rest,) = np.flatnonzero(modes.eigenvalues == 0)
+    change = {"k": fj.cea.Pencil(np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2))}
+    np.testing.assert_allclose(fj.cea.eigenvalue_derivatives(modes, change, which=at_rest)["k"], [-0.5], rtol=1e-6)
 
 
 def test_a_reduction_keeps_statics_exactly_and_says_what_it_costs(big):

@@ -63,7 +63,9 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
     """Right and left eigenvector of the eigenvalue nearest to a value, by inverse iteration with one factorisation."""
     from scipy.sparse.linalg import splu
 
-    factors = splu(pencil.at(value * (1 + APART)), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
+    # Rigid-body motions, at zero, have no size of their own; that of the other eigenvalues is a measure.
+    size = abs(value) or np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum())
+    factors = splu(pencil.at(value + APART * size), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
     found = []
     for transposition in ("N", "H"):
         vector = np.random.default_rng(0).standard_normal(pencil.size) + 0j

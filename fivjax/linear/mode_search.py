@@ -3,6 +3,9 @@ r"""Complex modes of small and large systems: dense, or by shift and invert in a
 $(λ^2 M + λ C + K)\, x = 0$ is a linear problem in $(x, λx/ω)$. Its eigenvalues near a shift $s$ are the largest ones of an
 operator that needs one sparse factorisation of $s^2 M + s C + K$, of the size of the structure. Shifts along the imaginary
 axis are added until the discs in which all eigenvalues were found cover the band.
+
+The matrices are real, so eigenvalues are real or come in conjugate pairs. Which of the two is decided in real arithmetic, never
+by the sign of an imaginary part that may be rounding.
 """
 
 import dataclasses
@@ -25,15 +28,26 @@ AT_ONCE = 24
 MOST_SHIFTS = 40
 # Half the width of the strip of growth rates that is searched, as a share of a disc's radius.
 STRIP = 0.5
+# How far a shift lies off the imaginary axis, as a share of half the part of the band that it is for.
+BESIDE = 1e-3
+# Eigenvalues this near to the real axis, relative to the shift, are found again in real arithmetic; rounding moves even double
+# ones by less.
+NEAR_REAL = 1e-4
+# Real and imaginary parts of states that depend on each other up to this share are one; the rest is rounding.
+DEPENDENT = 1e-9
+# What is left of a sum of terms by rounding, as a share of the largest.
+ROUNDING = 64 * np.finfo(float).eps
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ComplexModes:
     """Modes sorted by frequency, one of each conjugate pair.
 
-    - `eigenvalues`: `(k,)`, in 1/s.
+    - `eigenvalues`: `(k,)`, in 1/s; real ones (overdamped motions, divergence) are all there, with an imaginary part of exactly
+      zero. Zero where rounding leaves nothing else, as for rigid-body motions.
     - `shapes`: `(n, k)`, displacements of the structure, the largest entry 1.
     - `residuals`: `(k,)`, the error with which each satisfies its equation, relative to the size of the terms.
+    - `rounding`: `(k,)`, about how far rounding of the matrices moves each eigenvalue, in 1/s.
     - `strip`: in 1/s. All modes of the band with growth rates between minus this and this are there; infinite where all modes
       were computed.
     - `pencil`: the pencil that they are modes of.
@@ -42,6 +56,7 @@ class ComplexModes:
     eigenvalues: np.ndarray
     shapes: np.ndarray
     residuals: np.ndarray
+    rounding: np.ndarray
     strip: float
     pencil: Pencil
 
@@ -58,12 +73,13 @@ class ComplexModes:
     @property
     def damping_ratios(self) -> np.ndarray:
         """The share of critical damping, negative where the mode is unstable."""
-        return -self.eigenvalues.real / np.abs(self.eigenvalues)
+        size = np.abs(self.eigenvalues)
+        return -self.eigenvalues.real / np.where(size > 0, size, 1.0)
 
     @property
     def unstable(self) -> np.ndarray:
-        """Indices of the unstable modes, the fastest growing one first."""
-        growing = np.flatnonzero(self.eigenvalues.real > 1e-9 * np.abs(self.eigenvalues))
+        """Indices of the modes that grow faster than rounding explains, the fastest growing one first."""
+        growing = np.flatnonzero(self.eigenvalues.real > np.maximum(1e-9 * np.abs(self.eigenvalues), self.rounding))
         return growing[np.argsort(-self.eigenvalues.real[growing])]
 
     def to_dataset(self) -> "xr.Dataset":
@@ -86,7 +102,8 @@ class ComplexModes:
         for place in self.unstable:
             lines[place] += "  unstable"
         head = f"{len(lines)} modes, {len(self.unstable)} unstable (frequency, growth rate, damping ratio)"
-        return "\n".join([head, *lines])
+        searched = [f"  searched: growth rates between -{self.strip:.5g} and {self.strip:.5g} 1/s"]
+        return "\n".join([head, *lines, *(searched if np.isfinite(self.strip) else [])])
 
 
 def complex_modes(
@@ -128,10 +145,10 @@ def complex_modes(
         )
     else:
         values, shapes, strip = _in_band(pencil, 2 * np.pi * up_to)
-    residuals = _residuals(pencil, values, shapes)
+    residuals, rounding = _residuals(pencil, values, shapes), _rounding(pencil, values, shapes)
     shapes = shapes if motions is None else motions @ shapes
     largest = shapes[np.argmax(np.abs(shapes), axis=0), np.arange(values.size)]
-    return ComplexModes(values, shapes / largest, residuals, strip, pencil)
+    return ComplexModes(values, shapes / largest, residuals, rounding, strip, pencil)
 
 
 def _residuals(pencil: Pencil, values, shapes) -> np.ndarray:
@@ -141,6 +158,29 @@ def _residuals(pencil: Pencil, values, shapes) -> np.ndarray:
         size = sum(np.linalg.norm(term) for term in terms)
         found.append(np.linalg.norm(sum(terms)) / size if size else 0.0)
     return np.array(found)
+
+
+def _rounding(pencil: Pencil, values, shapes) -> np.ndarray:
+    """About how far each eigenvalue moves when every entry of the matrices changes by some rounding errors."""
+    sizes, powers = np.abs(shapes), np.abs(values)
+    matrices = ((powers**2, pencil.mass), (powers, pencil.damping), (1.0, pencil.stiffness))
+    terms = sum(power * np.sum(sizes * (abs(matrix) @ sizes), axis=0) for power, matrix in matrices)
+    moved = pencil.mass @ shapes
+    slope = np.sum(sizes * np.abs(2 * values * moved + pencil.damping @ shapes), axis=0)
+    bend = np.sum(sizes * np.abs(moved), axis=0)
+    # Where the slope vanishes, as at critical damping and at rest, two eigenvalues meet and move like the root of an error.
+    root = np.sqrt(slope**2 + 4 * bend * ROUNDING * terms)
+    return 2 * ROUNDING * terms / np.maximum(slope + root, np.finfo(float).tiny)
+
+
+def _without_rounding(pencil: Pencil, values, shapes) -> np.ndarray:
+    """The eigenvalues, those that cannot be told from zero or from real ones made exactly so.
+
+    Of two equal real eigenvalues rounding makes a pair, one of which would be left out.
+    """
+    error = _rounding(pencil, values, shapes)
+    values = np.where(np.abs(values.imag) <= error, values.real, values)
+    return np.where(np.abs(values) <= error, 0.0, values)
 
 
 def _all(pencil: Pencil, band: float):
@@ -155,8 +195,8 @@ def _all(pencil: Pencil, band: float):
     (top, bottom), vectors = eig(state, inertia, homogeneous_eigvals=True)  # pyright: ignore[reportAssignmentType]
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
     values, shapes = unit * top[finite] / bottom[finite], vectors[:n, finite]
-    # Rounding may give a real eigenvalue a small imaginary part of either sign.
-    values = np.where(np.abs(values.imag) < 1e-12 * np.abs(values), values.real, values)
+    # LAPACK's routine for real matrices gives exactly real eigenvalues, and exact pairs.
+    values = _without_rounding(pencil, values, shapes)
     chosen = np.flatnonzero((values.imag >= 0) & (values.imag <= band))
     chosen = chosen[np.lexsort((values.real[chosen], values.imag[chosen]))]
     return values[chosen], shapes[:, chosen], np.inf
@@ -179,11 +219,12 @@ def _in_band(pencil: Pencil, band: float):
             )
         middle, half = (low + high) / 2, (high - low) / 2
         # Not on the imaginary axis, where an undamped mode may lie, but on the side of the unstable modes.
-        shift = complex(0.01 * half, middle)
+        beside = BESIDE * half
+        shift = complex(beside, middle)
         values, shapes = near(pencil, shift, AT_ONCE)
         radius = np.max(np.abs(values - shift)) if values.size < 2 * pencil.size else np.inf
         reach = np.sqrt(1 - STRIP**2) * radius
-        strip = min(strip, STRIP * radius)
+        strip = min(strip, STRIP * radius - beside)
         if reach < half:
             gaps += [(low, middle - reach), (middle + reach, high)]
             low, high = middle - reach, middle + reach
@@ -192,19 +233,20 @@ def _in_band(pencil: Pencil, band: float):
         inside = (values.imag >= max(low - margin, 0.0)) & (values.imag <= high + margin)
         found += [(value, shape, shifts) for value, shape in zip(values[inside], shapes[:, inside].T, strict=True)]
     found.sort(key=lambda mode: (mode[0].imag, mode[0].real))
-    single = [mode for k, mode in enumerate(found) if not any(_same(mode, other) for other in found[max(k - 3, 0) : k])]
+    single = [mode for k, mode in enumerate(found) if not _found_before(mode, found[:k])]
     single = [mode for mode in single if mode[0].imag <= band]
     shapes = np.stack([mode[1] for mode in single], axis=1) if single else np.zeros((pencil.size, 0), complex)
     return np.array([mode[0] for mode in single]), shapes, strip
 
 
-def _same(a, b) -> bool:
-    """Whether two modes found from different shifts are the same."""
-    (value, shape, shift), (other, other_shape, other_shift) = a, b
-    if shift == other_shift or abs(value - other) > 1e-6 * abs(value):
+def _found_before(mode, others) -> bool:
+    """Whether a mode is one of those that another shift gave: with their eigenvalue, and a shape in the space of theirs."""
+    value, shape, shift = mode
+    alike = [other for other in others if other[2] != shift and abs(value - other[0]) <= 1e-6 * abs(value)]
+    if not alike:
         return False
-    alike = abs(np.vdot(shape, other_shape)) / (np.linalg.norm(shape) * np.linalg.norm(other_shape))
-    return alike > 0.999
+    space, _ = np.linalg.qr(np.stack([other[1] for other in alike], axis=1))
+    return bool(np.linalg.norm(space.conj().T @ shape) > 0.999 * np.linalg.norm(shape))
 
 
 def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -224,5 +266,29 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
 
     operator = LinearOperator((2 * n, 2 * n), matvec=inverted, dtype=complex)  # pyright: ignore[reportCallIssue]
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
-    values, vectors = eigs(operator, k=min(count, 2 * n - 2), v0=start)  # pyright: ignore[reportAssignmentType]
-    return shift + unit / values, vectors[:n]
+    values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)  # pyright: ignore[reportAssignmentType]
+    values = shift + unit / values
+    close = np.abs(values.imag) <= NEAR_REAL * unit
+    if np.any(close):
+        again, anew = _near_the_real_axis(inverted, shift, states[:, close])
+        again = _without_rounding(pencil, again, anew[:n])
+        values, states = np.append(values[~close], again), np.hstack([states[:, ~close], anew])
+    return values, states[:n]
+
+
+def _near_the_real_axis(inverted, shift: complex, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The eigenvalues of these states, exactly real or in exact pairs, and the states that go with them.
+
+    Complex arithmetic puts a real eigenvalue on either side of the real axis. Real and imaginary parts of the states span a
+    space that the operator maps into itself, and in a real basis of it the problem is a small one with a real matrix.
+    """
+    columns, sizes, _ = np.linalg.svd(np.hstack([states.real, states.imag]), full_matrices=False)
+    basis = columns[:, sizes > DEPENDENT * sizes[0]]
+    images = np.stack([inverted(column) for column in basis.T], axis=1)
+    small = basis.T @ images  # ω(L - s)⁻¹ of the real matrix L that is sought
+    found, shapes = np.linalg.eig((shift * np.eye(len(small)) + abs(shift) * np.linalg.inv(small)).real)
+    # A direction of rounding alone is no state of the space.
+    expected = abs(shift) / (found - shift)
+    error = np.linalg.norm(images @ shapes - basis @ shapes * expected, axis=0)
+    kept = error <= 1e-6 * np.abs(expected)
+    return found[kept], (basis @ shapes)[:, kept]
