@@ -7,6 +7,8 @@ import pytest
 from scipy import sparse
 
 import fivjax as fj
+from fivjax.linear import mode_search
+from fivjax.model import structure_checks
 
 # One model in every format: nodes 1 and 4 with two directions each, springs in N/mm, masses in t.
 LABELS = ((1, 1), (1, 2), (4, 1), (4, 2))
@@ -22,6 +24,8 @@ STIF = """** MATRIX INPUT FORMAT, one triangle
 4,2, 4,1, 2.0e+01
 4,2, 4,2, 8.0e+01
 """
+# The upper triangle, which `*MATRIX INPUT, TYPE=SYMMETRIC` may have beside the lower one.
+UPPER = "1,1, 4,1, -100.\n1,2, 4,2, -50.\n4,1, 4,2, 20.\n"
 MASS1 = "1,1, 1,1, 2e-3\n1,2, 1,2, 2e-3\n4,1, 4,1, 1e-3\n4,2, 4,2, 1e-3\n"
 COORDINATE = "1 1 300.\n2 2 250.\n3 3 100.\n4 4 80.\n1 3 -100.\n3 1 -100.\n2 4 -50.\n4 2 -50.\n3 4 20.\n4 3 20.\n"
 # *SUBSTRUCTURE MATRIX OUTPUT: column by column to the diagonal, four in a line.
@@ -84,6 +88,22 @@ OUTPUT4 = """       4       4       6       2KAA     1P,3E23.16
        5       1       1
  0.0000000000000000E+00
 """
+# A load: one column, numbered 1.
+VAX = """DMIG    VAX            0       9       2       0                       1
+DMIG*   VAX                            1               0
+*                      1               1 1.000000000D+00
+"""
+# Title; lines in all, of positions, rows and values; kind and sizes; formats. The lower triangle, column by column.
+HARWELL_BOEING = """stiffness of four degrees of freedom                                    pad
+             5             1             1             3
+RSA                        4             4             7             0
+(5I4)           (7I4)           (3D24.16)
+   1   3   5   7   8
+   1   3   2   4   3   4   4
+  3.0000000000000000D+02 -1.0000000000000000E+02  2.5000000000000000E+02
+ -5.0000000000000000E+01  1.0000000000000000+002  2.0000000000000000E+01
+  8.0000000000000000E+01
+"""
 
 
 @pytest.fixture
@@ -99,6 +119,9 @@ def folder(tmp_path):
         "pad.pch": DMIG,
         "market.mtx": MARKET,
         "pad.op4": OUTPUT4,
+        "pad.mmf": MARKET,
+        "pad.matrix": HARWELL_BOEING,
+        "full.mtx": "*MATRIX INPUT, NAME=K, TYPE=SYMMETRIC\n" + STIF + UPPER,
     }.items():
         (tmp_path / name).write_text(text)
     scipy.io.savemat(tmp_path / "pad.mat", {"K": sparse.csc_matrix(STIFFNESS), "M": MASS, "note": "by hand", "t": 1.0})
@@ -117,6 +140,9 @@ def folder(tmp_path):
         ("pad.pch", "KAAX", LABELS),
         ("market.mtx", "market", None),
         ("pad.op4", "KAA", None),
+        ("pad.mmf", "pad", None),
+        ("pad.matrix", "pad", None),
+        ("full.mtx", "full", LABELS),
         ("pad.mat", "K", None),
         ("pad.npz", "K", None),
         ("k.npy", "k", None),
@@ -193,6 +219,146 @@ def test_rotations_keep_radians():
         assert q @ found["mass"] @ q == pytest.approx(joule * time**2 * (own @ matrix @ own))
 
 
+TWICE = np.array([[1.0, 1, 1], [1, 0, 0], [1, 0, 0]])
+
+
+def test_what_is_no_mass_damping_or_stiffness_is_listed(folder):
+    """Loads and complex matrices beside the others: passed over and named; asked for, each says why it is not read."""
+    (folder / "ext.pch").write_text(DMIG + VAX + VAX.replace("VAX", "K4X").replace("9       2", "6       4"))
+    found = fj.read_matrices(folder / "ext.pch")
+    assert list(found) == ["KAAX", "MAAX"] and list(found.left_out) == ["VAX", "K4X"]
+    with pytest.raises(KeyError, match=r"line 16: matrix `VAX` has form 9"):
+        found["VAX"]
+    read = fj.read_structure(folder / "ext.pch", units="mm-t-s")
+    np.testing.assert_allclose(read.stiffness.toarray(), 1e3 * STIFFNESS, rtol=1e-14)
+    assert "Not read from `ext.pch`: `VAX`, `K4X`" in str(read.checks)
+    with pytest.raises(ValueError, match=r"`K4X` has type 4"):
+        fj.read_structure(folder / "ext.pch", units="SI", names={"damping": "K4X"})
+    np.savez(folder / "load.npz", K=STIFFNESS, P=np.ones((4, 2)), M=1j * MASS)
+    assert list(fj.read_matrices(folder / "load.npz").left_out) == ["P", "M"]
+    with pytest.raises(ValueError, match=r"matrix `M` is complex"):
+        fj.read_structure(folder / "load.npz", units="SI")
+
+
+def test_rectangular_matrices_of_output4_are_listed(folder):
+    """A matrix of two columns behind the stiffness, and a vector."""
+    pytest.importorskip("pyyeti", reason="OUTPUT4 needs pyyeti")
+    loads = OUTPUT4.split("\n", 1)[1].split("       3       1       4")[0]
+    two = (
+        "       2       4       2       2PG      1P,3E23.16\n"
+        + loads
+        + "       3       1       1\n 0.0000000000000000E+00\n"
+    )
+    (folder / "loads.op4").write_text(OUTPUT4 + two)
+    found = fj.read_matrices(folder / "loads.op4")
+    assert list(found) == ["KAA"] and "shape (4, 2)" in found.left_out["PG"]
+
+
+def test_harwell_boeing_as_scipy_writes_it(tmp_path):
+    """Another writer: SciPy's, of an unsymmetric matrix, with fields that touch."""
+    from scipy.io import hb_write
+
+    matrix = np.random.default_rng(0).normal(size=(7, 7)) * (np.arange(7) != 3)
+    hb_write(tmp_path / "a.txt", sparse.csc_array(matrix))
+    np.testing.assert_allclose(fj.read_matrices(tmp_path / "a.txt")["a"].matrix.toarray(), matrix, rtol=1e-14)
+
+
+def tied(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two chains of n masses held at their outer ends, tied end to end and to a third mass: stiffness, mass, and what ties them."""
+    ends = np.zeros((2 * n + 1, 2))
+    ends[[n - 1, n], 0] = 1e3 * np.array([1, -1])
+    ends[[n, 2 * n], 1] = 1e3 * np.array([1, -1])
+    chain = 1e6 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    chain[-1, -1] = 1e6
+    stiffness = np.zeros((2 * n + 1, 2 * n + 1))
+    stiffness[:n, :n], stiffness[n:-1, n:-1], stiffness[-1, -1] = chain, 0.5 * chain[::-1, ::-1], 3e5
+    return stiffness, np.diag(np.linspace(0.01, 0.02, 2 * n + 1)), ends
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_lagrange_multipliers_are_constraints_and_no_springs(dense, tmp_path, monkeypatch):
+    """Chains tied by multipliers at internal nodes: their modes are those of the chains with the tied nodes made one."""
+    from scipy.linalg import eigh, null_space
+
+    if not dense:
+        monkeypatch.setattr(structure_checks, "DENSE", 20)
+        monkeypatch.setattr(mode_search, "DENSE", 20)
+    n = 12
+    stiffness, mass, ends = tied(n)
+    labels = [*((node + 1, 1) for node in range(2 * n + 1)), (-1, 1), (-2, 1)]
+    whole = np.block([[stiffness, ends], [ends.T, np.zeros((2, 2))]])
+    for name, matrix in (("a_STIF1", whole), ("a_MASS1", np.pad(mass, (0, 2)))):
+        rows = zip(*np.nonzero(np.tril(matrix)), strict=True)
+        lines = (f"{labels[i][0]},1, {labels[j][0]},1, {matrix[i, j]:.17e}\n" for i, j in rows)
+        (tmp_path / f"{name}.mtx").write_text("".join(lines))
+    contact = fj.NodeContact(2, (1, 0, 0), (0, 1, 0))
+    with pytest.raises(ValueError, match=r"Node 2 has no direction 2"):
+        fj.read_structure(tmp_path / "a_STIF1.mtx", units="SI", contacts=[contact])
+    read = fj.read_structure(tmp_path / "a_STIF1.mtx", units="SI")
+    free = null_space(ends.T)
+    squares, shapes = eigh(free.T @ stiffness @ free, free.T @ mass @ free)
+    wanted = np.sqrt(squares) / (2 * np.pi)
+    np.testing.assert_allclose(read.checks.lowest_frequencies, wanted[:10], rtol=1e-8)
+    assert read.checks.multipliers == read.checks.internal == ("node -2, direction 1", "node -1, direction 1")
+    assert read.checks.negative_springs == 2 and read.checks.rigid_body_modes == 0
+    said = str(read.checks)
+    assert "2 Lagrange multipliers without mass and stiffness (node -2, direction 1; node -1, direction 1)" in said
+    assert "negative eigenvalue" not in said and "without mass." not in said and "penalty stiffness" in said
+    # The same modes with their shapes; and by complex eigenvalues.
+    _, modes = structure_checks.lowest_modes(read.stiffness, read.mass, 3)
+    across = (free @ shapes[:, :3]).T @ mass @ modes[2:]
+    np.testing.assert_allclose(np.abs(across), np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(ends.T @ modes[2:], 0, atol=1e-6 * np.abs(ends.T).max() * np.abs(modes[2:]).max())
+    pencil = fj.cea.Pencil(read.mass, read.damping, read.stiffness)
+    found = fj.cea.complex_modes(pencil, up_to=1.001 * wanted[5])
+    np.testing.assert_allclose(found.frequencies, wanted[:6], rtol=1e-7)
+    assert not len(found.unstable)
+
+
+def test_a_reduction_keeps_the_constraints_of_lagrange_multipliers(tmp_path):
+    """A contact on two masses that a multiplier ties: reduced, they are one, and no multiplier is left."""
+    stiffness, mass = np.diag([3e4, 2e4, 5e4, 1e4, 4e4, 0.0]), np.diag([1.0, 2.0, 1.5, 0.5, 1.0, 0.0])
+    stiffness[0, 2] = stiffness[2, 0] = -1e4
+    stiffness[5, [0, 3]] = stiffness[[0, 3], 5] = 1.0, -1.0
+    np.savez(tmp_path / "tied.npz", K=stiffness, M=mass)
+    labels = [(1, 1), (1, 2), (2, 1), (3, 1), (3, 2), (-1, 1)]
+    read = fj.read_structure(
+        tmp_path / "tied.npz", units="SI", labels=labels, contacts=[fj.NodeContact(1, "x", "y")], load={(3, "y"): 1.0}
+    )
+    small = fj.craig_bampton(read, up_to=1e3).structure
+    free = np.eye(5)[:, [0, 1, 2, 4]]
+    free[3, 0] = 1.0  # node 3 moves along x with node 1
+    matrices = [free.T @ matrix[:5, :5] @ free for matrix in (stiffness, mass)]
+    found, wanted = (np.linalg.eigvals(np.linalg.solve(m, k)) for k, m in ((small.stiffness, small.mass), matrices))
+    np.testing.assert_allclose(np.sort(found), np.sort(wanted), rtol=1e-9)
+    with pytest.raises(ValueError, match=r"Every coordinate needs a positive mass; that with index 5 has none"):
+        fj.Structure(mass, 0 * mass, stiffness, np.ones(6), tangential=0, normal=1)
+
+
+def test_rows_that_files_only_number(tmp_path):
+    """`FORMAT=COORDINATE` with internal rows, and a mass matrix that lacks some: aligned by number, named by number."""
+    stiffness = {(1, 1): 3e3, (2, 2): 3e3, (3, 3): 1e3, (-1, -1): 2e3, (1, -1): -1e3, (2, -1): -1e3}
+    stiffness |= {(j, i): value for (i, j), value in stiffness.items()}
+    mass = {(1, 1): 2.0, (3, 3): 1.0, (-1, -1): 0.5}
+    for name, entries in (("c_STIF1", stiffness), ("c_MASS1", mass)):
+        (tmp_path / f"{name}.mtx").write_text("".join(f"{i} {j} {value}\n" for (i, j), value in entries.items()))
+    read = fj.read_structure(tmp_path / "c_STIF1.mtx", units="SI")
+    # Row 2 without mass follows row -1: the spring between them and the ground is 1e3·3e3/… in series.
+    wanted = np.sort([1e3, *np.linalg.eigvals([[3e3 / 2, -1e3 / 2], [-1e3 / 0.5, (2e3 - 1e3**2 / 3e3) / 0.5]])])
+    np.testing.assert_allclose(read.checks.lowest_frequencies, np.sqrt(wanted) / (2 * np.pi), rtol=1e-10)
+    assert read.checks.internal == ("row -1",)
+    np.testing.assert_array_equal(fj.read_matrices(tmp_path / "c_MASS1.mtx")["c_MASS1"].rows, [-1, 1, 3])
+    labels = [(1, 1), (2, 1), (2, 2)]
+    labelled = fj.read_structure(tmp_path / "c_STIF1.mtx", units="SI", labels=labels)
+    assert labelled.labels == ((-1, 0), (1, 1), (2, 1), (2, 2))
+    assert labelled.checks.internal == ("point -1",)
+    with pytest.raises(ValueError, match=r"has 3 rows, but `labels` names 2"):
+        fj.read_structure(tmp_path / "c_STIF1.mtx", units="SI", labels=labels[:2])
+    np.save(tmp_path / "m.npy", np.eye(4))
+    with pytest.raises(ValueError, match=r"has internal rows, and the other files have not"):
+        fj.read_structure(tmp_path / "c_STIF1.mtx", units="SI", mass=tmp_path / "m.npy")
+
+
 def test_what_is_wrong_with_a_model_is_said(folder, tmp_path):
     """Held, massless, free, unsymmetric and indefinite models are read, and their checks say what they are."""
     (tmp_path / "held_STIF1.mtx").write_text(STIF.replace("3.000000000000000e+02", "1.0e+36"))
@@ -205,7 +371,18 @@ def test_what_is_wrong_with_a_model_is_said(folder, tmp_path):
         "1 rigid-body mode;": (free, np.eye(3)),
         "not symmetric": (free + np.triu(free, 1), np.eye(3)),
         "1 degree of freedom without mass": (free, np.diag([1.0, 0, 1])),
-        "stiffness matrix has 1 negative eigenvalue": (free - 0.1 * np.eye(3), np.eye(3)),
+        "stiffness matrix has 1 negative eigenvalue.": (free - 0.1 * np.eye(3), np.eye(3)),
+        "1 row with neither mass nor stiffness (row 2)": (np.diag([1.0, 0, 1]), np.diag([1.0, 0, 1])),
+        "frequencies are not known: the stiffness is singular (rows without": (
+            np.diag([1.0, 0, 1]),
+            np.diag([1.0, 0, 1]),
+        ),
+        # The constraint x = 0, twice; and once beside a negative spring.
+        "singular (constraints that follow from others, perhaps)": (TWICE, np.diag([1.0, 0, 0])),
+        "has 1 negative eigenvalue, beside one for each Lagrange multiplier": (
+            np.array([[1.0, 0, 1], [0, -2, 0], [1, 0, 0]]),
+            np.diag([1.0, 1, 0]),
+        ),
         "There is no damping": (free, np.eye(3)),
     }
     for sentence, (stiffness, mass) in cases.items():
@@ -263,7 +440,30 @@ DAMAGED = {
         r"line 6: '25O.0' is no number|line 6: '25o.0' is no number",
     ),
     "both triangles of a symmetric DMIG": ("a.pch", DMIG.replace(",4,2,20.", ",1,1,-100."), r"in both orders"),
-    "a complex DMIG": ("a.pch", DMIG.replace("6       1", "6       3"), r"type 3, but must be real"),
+    "a complex DMIG": (
+        "a.pch",
+        DMIG.replace("6       1", "6       3").replace("6       2", "6       4"),
+        r"must be real",
+    ),
+    "a rectangular DMIG": ("a.pch", VAX, r"line 1: matrix `VAX` has form 9 \(rectangular\)"),
+    "a Harwell-Boeing file of patterns": ("a.hb", HARWELL_BOEING.replace("RSA", "PSA"), r"holds a matrix of kind PSA"),
+    "a cut Harwell-Boeing file": ("a.hb", HARWELL_BOEING[:-30], r"must have 9 lines by its header, but has 8"),
+    "a Harwell-Boeing file without a number": (
+        "a.hb",
+        HARWELL_BOEING.replace("-1.0000000000000000E+02", " " * 23),
+        r"lines 7 to 9: 7 numbers expected, 6 found",
+    ),
+    "a Harwell-Boeing row that is not there": (
+        "a.hb",
+        HARWELL_BOEING.replace("   1   3   2", "   1   9   2"),
+        r"in row 9 of 4",
+    ),
+    "row zero": ("a.mtx", COORDINATE.replace("1 1 300.", "0 1 300."), r"line 1: rows and columns are numbered from 1"),
+    "triangles that differ": (
+        "a.mtx",
+        "*MATRIX INPUT\n" + STIF + "1,1, 4,1, -100.0002\n",
+        r"line 10: .* entry of node 1, direction 1 and node 4, direction 1 is -100.0002, and .* is -100 on line 5.*UNSYMM",
+    ),
     "a cut Matrix Market file": ("a.mtx", MARKET[:-9], r"cannot be read as Matrix Market"),
     "a Matrix Market file of another world": (
         "a.mtx",

@@ -1,9 +1,11 @@
 """Abaqus matrices: `*MATRIX OUTPUT` of a `*MATRIX GENERATE` step, and `*SUBSTRUCTURE MATRIX OUTPUT`.
 
 `FORMAT=MATRIX INPUT` and `FORMAT=LABELS` write rows of row node, row direction, column node, column direction and value,
-`FORMAT=COORDINATE` rows of row, column and value: no Matrix Market file, though both end in `.mtx`. A substructure is
-written as a linear `*USER ELEMENT`: its nodes in comments, their directions, and each matrix column by column, down to
-the diagonal where it is symmetric (Abaqus Keywords Reference Guide: *MATRIX INPUT, *USER ELEMENT, *MATRIX).
+`FORMAT=COORDINATE` rows of row, column and value: no Matrix Market file, though both end in `.mtx`. Negative nodes and rows
+are internal: Lagrange multipliers, and unknowns that elements have of their own. `TYPE=SYMMETRIC` gives one triangle, or both
+where they agree. A substructure is written as a linear `*USER ELEMENT`: its nodes in comments, their directions, and each
+matrix column by column, down to the diagonal where it is symmetric (Abaqus Keywords Reference Guide: *MATRIX INPUT,
+*USER ELEMENT, *MATRIX).
 """
 
 import io
@@ -13,7 +15,12 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from ..foundation.digits import apart
 from .file_matrix import FileMatrix, Label, from_entries, text_of
+
+# The two entries of a symmetric pair may differ by what a file rounds, and by what is lost in sums of much larger entries, as a
+# share of what the diagonal has.
+PRINTED, NOISE = 1e-6, 1e-9
 
 
 def matrices(path: Path) -> dict[str, FileMatrix]:
@@ -51,30 +58,71 @@ def _generated(path: Path, text: str) -> FileMatrix:
         raise ValueError(f"{place} holds no matrix entries. Write it again.")
     table = _table(place, numbers, kept)
     numbers = np.array(numbers)
-    if table.shape[1] == 3:
-        _whole(place, numbers, kept, table[:, :2])
-        size = int(table[:, :2].max())
-        found = from_entries(
-            place, _plain(table[:, 0]), _plain(table[:, 1]), table[:, 2], lines=numbers, symmetric=symmetric
+    count = 1 if table.shape[1] == 3 else 2
+    labels, values = table[:, : 2 * count], table[:, -1]
+    _whole(place, numbers, kept, labels)
+    if count == 1 and np.any(labels == 0):
+        line = numbers[np.argmax(np.any(labels == 0, axis=1))]
+        raise ValueError(
+            f"{place}, line {line}: rows and columns are numbered from 1, and internal ones from -1, but one is 0. "
+            f"Write it again."
         )
-        if found.size != size or table[:, :2].min() < 1:
-            raise ValueError(
-                f"{place}: rows and columns must be numbered from 1 without gaps, but {size} is the largest of "
-                f"{found.size}. Write it with `FORMAT=MATRIX INPUT`, which names nodes and directions."
-            )
-        return found._replace(labels=None)
-    _whole(place, numbers, kept, table[:, :4])
-    return from_entries(place, table[:, :2], table[:, 2:4], table[:, 4], lines=numbers, symmetric=symmetric)
+    rows, columns = (_labelled(part) for part in (labels[:, :count], labels[:, count:]))
+    numbers = np.array(numbers)
+    if symmetric:
+        kept, values = _one_of_each(place, rows, columns, values, numbers)
+        rows, columns, values, numbers = rows[kept], columns[kept], values[kept], numbers[kept]
+    found = from_entries(place, rows, columns, values, lines=numbers, symmetric=symmetric)
+    if count == 2:
+        return found
+    return found._replace(labels=None, rows=tuple(label.node for label in found.labels or ()))
+
+
+def _labelled(labels: np.ndarray) -> np.ndarray:
+    """Pairs of node and direction; what is only numbered has direction 0."""
+    found = labels.astype(np.int64)
+    return found if found.shape[1] == 2 else np.hstack([found, np.zeros_like(found)])
+
+
+def _one_of_each(place: str, rows, columns, values, lines) -> tuple[np.ndarray, np.ndarray]:
+    """Which entries give a symmetric matrix once, and their values, where some pairs of labels may come in both orders.
+
+    **Raises:** `ValueError` for a pair whose two entries differ.
+    """
+    table, index = np.unique(np.concatenate([rows, columns]), axis=0, return_inverse=True)
+    i, j = index.ravel()[: len(rows)], index.ravel()[len(rows) :]
+    upper, lower = np.flatnonzero(i < j), np.flatnonzero(i > j)
+    _, first, second = np.intersect1d(
+        i[upper] * len(table) + j[upper], j[lower] * len(table) + i[lower], return_indices=True
+    )
+    first, second = upper[first], lower[second]
+    own = np.zeros(len(table))
+    own[i[i == j]] = np.abs(values[i == j])
+    a, b = values[first], values[second]
+    differ = np.abs(a - b) > np.maximum(
+        PRINTED * np.maximum(np.abs(a), np.abs(b)), NOISE * np.sqrt(own[i[first]] * own[j[first]])
+    )
+    if np.any(differ):
+        k = np.argmax(differ)
+        here, there = sorted((first[k], second[k]), key=lambda entry: lines[entry])
+        one, other = apart(values[here], values[there])
+        names = [Label(int(node), int(direction)) for node, direction in table[[i[here], j[here]]]]
+        raise ValueError(
+            f"{place}, line {lines[there]}: the matrix is marked as symmetric, but the entry of {names[1]} and {names[0]} is "
+            f"{other}, and that of {names[0]} and {names[1]} is {one} on line {lines[here]}. Give one triangle, or mark it by "
+            f"`TYPE=UNSYMMETRIC`."
+        )
+    values = values.copy()
+    values[first] = 0.5 * (a + b)
+    kept = np.ones(len(values), bool)
+    kept[second] = False
+    return kept, values
 
 
 def _keyword(line: str) -> tuple[str, dict[str, str]]:
     keyword, *options = (part.strip().upper() for part in line.lstrip("* ").split(","))
     pairs = (option.partition("=") for option in options if option)
     return keyword, {name.strip(): value.strip() for name, _, value in pairs}
-
-
-def _plain(indices: np.ndarray) -> np.ndarray:
-    return np.stack([indices, np.zeros_like(indices)], axis=1)
 
 
 def _entries(line: str) -> list[str]:

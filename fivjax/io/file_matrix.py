@@ -24,11 +24,14 @@ class FileMatrix(NamedTuple):
     - `matrix`: sparse, real, square.
     - `labels`: what node and direction its rows and columns belong to; None where the file does not say.
     - `place`: the file, and the matrix in it, for sentences about it.
+    - `rows`: the numbers of its rows where the file has only those, negative for internal ones; rows without entries are not
+      there.
     """
 
     matrix: sparse.csr_array
     labels: tuple[Label, ...] | None
     place: str
+    rows: tuple[int, ...] | None = None
 
     @property
     def size(self) -> int:

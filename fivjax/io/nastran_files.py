@@ -5,6 +5,7 @@ matrix, and takes an entry that was cut off for zero.) OUTPUT4 in its many varia
 
 A DMIG matrix has a header `DMIG NAME 0 IFO TIN TOUT POLAR NCOL`, and for each column an entry `DMIG NAME GJ CJ G1 C1 A1 B1
 G2 C2 A2 B2 …`, G being nodes and C directions; A is real where TIN is 1 or 2 (MSC Nastran Quick Reference Guide: DMIG).
+A matrix that is neither mass nor damping nor stiffness, such as loads, is not read: in its place stands the reason.
 """
 
 import re
@@ -18,10 +19,10 @@ from .file_matrix import FileMatrix, Label, from_entries, text_of
 SQUARE, SYMMETRIC = 1, 6
 
 
-def dmig(path: Path) -> dict[str, FileMatrix]:
-    """The DMIG matrices of a bulk data or punch file, by name."""
+def dmig(path: Path) -> dict[str, FileMatrix | str]:
+    """The DMIG matrices of a bulk data or punch file, by name; a sentence for each that is rectangular or complex."""
     place = f"File `{path}`"
-    headers: dict[str, int] = {}
+    headers: dict[str, int | str] = {}
     entries: dict[str, list] = {}
     for line, fields in _cards(place, text_of(path)):
         here, name = f"{place}, line {line}", fields[0].upper()
@@ -32,12 +33,15 @@ def dmig(path: Path) -> dict[str, FileMatrix]:
             entries[name] = []
         elif name not in headers:
             raise ValueError(f"{here}: matrix `{name}` has no header `DMIG {name} 0 …` before it. Add it.")
-        else:
+        elif isinstance(headers[name], int):
             entries[name] += _column(here, line, fields)
     if not headers:
         raise ValueError(f"{place} holds no DMIG entries. Write it with `EXTSEOUT(DMIGPCH)` or `PARAM,EXTOUT,DMIGPCH`.")
-    found = {}
+    found: dict[str, FileMatrix | str] = {}
     for name, form in headers.items():
+        if isinstance(form, str):
+            found[name] = form
+            continue
         if not entries[name]:
             raise ValueError(f"{place}: matrix `{name}` has a header and no entries. Write it again.")
         rows, columns, values, lines = zip(*entries[name], strict=True)
@@ -52,15 +56,16 @@ def dmig(path: Path) -> dict[str, FileMatrix]:
     return found
 
 
-def _form(here: str, name: str, fields: list[str]) -> int:
+def _form(here: str, name: str, fields: list[str]) -> int | str:
+    """The form of a matrix by its header, or why it is not read."""
     form, kind = (_integer(here, field) for field in fields[2:4])
     if form not in (SQUARE, SYMMETRIC):
-        raise ValueError(
+        return (
             f"{here}: matrix `{name}` has form {form} (rectangular), but mass, damping and stiffness are square (1) or "
-            f"symmetric (6). Leave it out of the file."
+            f"symmetric (6). Name another matrix of the file."
         )
     if kind not in (1, 2):
-        raise ValueError(
+        return (
             f"{here}: matrix `{name}` has type {kind}, but must be real (1 or 2). Give structural damping as a viscous "
             f"damping matrix."
         )
@@ -161,7 +166,6 @@ def output4(path: Path) -> dict[str, FileMatrix]:
     found = {
         name.upper(): FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`, matrix `{name.upper()}`")
         for name, matrix in loaded.items()
-        if min(np.shape(matrix)) > 1
     }
     if not found:
         raise ValueError(f"File `{path}` holds no matrix. Write it again.")

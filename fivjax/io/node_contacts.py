@@ -68,7 +68,8 @@ def _along(node: int, direction, order, size: int) -> np.ndarray:
         raise ValueError(f"Node {node} cannot be found: the files name no nodes. Say which row is which with `labels`.")
     places = {label.direction: place for place, label in enumerate(order) if label.node == node}
     if not places:
-        raise ValueError(f"Node {node} is not in the matrices, which have nodes {order[0].node} to {order[-1].node}.")
+        first = next((label.node for label in order if label.node > 0), order[0].node)  # after the internal ones
+        raise ValueError(f"Node {node} is not in the matrices, which have nodes {first} to {order[-1].node}.")
     found = np.zeros(size)
     for axis, share in _components(direction).items():
         if axis not in places:

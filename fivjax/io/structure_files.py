@@ -1,7 +1,7 @@
 """Structures from the files of finite-element codes: which matrix is which, in which units, where the contacts are."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from ..foundation import arguments
 from ..model.sparse_structure import SparseStructure
 from ..model.structure_checks import check_matrices
 from .file_matrix import FileMatrix, Label
-from .matrix_files import read_matrices
+from .matrix_files import FileMatrices, read_matrices
 from .model_units import SYSTEMS, in_si
 from .node_contacts import NodeContact, contact_directions, load_direction
 
@@ -46,7 +46,8 @@ def read_structure(
         structure = fj.craig_bampton(big, up_to=3000.0).structure
 
     Formats: see `fj.read_matrices`. With an Abaqus `…_STIF1.mtx`, the files `…_MASS1.mtx` and `…_DMPV1.mtx` in the same folder
-    are read, too. Degrees of freedom that Abaqus holds (1e36 on the diagonal) are left out.
+    are read, too. Degrees of freedom that Abaqus holds (1e36 on the diagonal) are left out. Internal nodes, which have negative
+    numbers, come first; `checks` says what they are.
 
     **Arguments:**
 
@@ -83,12 +84,13 @@ def read_structure(
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     parts, remarks = _parts(Path(path), mass, damping, names)
-    order, aligned = _aligned(parts, _labels(labels))
+    order, numbers, aligned = _aligned(parts, _labels(labels))
     held = np.abs(aligned["stiffness"].diagonal()) >= HELD
     if np.any(held):
         aligned = {name: matrix[~held][:, ~held] for name, matrix in aligned.items()}
         order = None if order is None else tuple(label for label, out in zip(order, held, strict=True) if not out)
-    directions = np.ones(len(held) - held.sum(), int) if order is None else np.array([label[1] for label in order])
+        numbers = [number for number, out in zip(numbers, held, strict=True) if not out]
+    directions = np.ones(len(numbers), int) if order is None else np.array([label[1] for label in order])
     matrices = in_si(aligned, directions, units)
     for name, value in zip(("rayleigh[0]", "rayleigh[1]"), rayleigh, strict=True):
         arguments.real_number(name, value, minimum=0)
@@ -105,7 +107,11 @@ def read_structure(
         normal_directions=normal,
         labels=order,
         checks=check_matrices(
-            **matrices, directions=None if order is None else directions, fixed=int(held.sum()), remarks=remarks
+            **matrices,
+            directions=None if order is None else directions,
+            numbers=numbers,
+            fixed=int(held.sum()),
+            remarks=remarks,
         ),
     )
 
@@ -125,7 +131,7 @@ def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[st
                 )
             elif role in files and files[role] is None and other.is_file():
                 files[role] = other
-    read: dict[Path, dict[str, FileMatrix]] = {}
+    read: dict[Path, FileMatrices] = {}
     found = {}
     for role, file in files.items():
         own = Path(file) if file is not None else path
@@ -140,14 +146,24 @@ def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[st
             f"File `{path}` holds no mass matrix, but {held}. Give its file with `mass`, or its name with "
             f"`names={{'mass': …}}`."
         )
+    remarks += [
+        f"Not read from `{file.name}`: {', '.join(f'`{name}`' for name in held.left_out)} (rectangular or complex)."
+        for file, held in read.items()
+        if held.left_out
+    ]
     return found, remarks
 
 
-def _chosen(role: str, path: Path, held: dict[str, FileMatrix], name: str | None, *, alone: bool) -> FileMatrix | None:
+def _chosen(role: str, path: Path, held: FileMatrices, name: str | None, *, alone: bool) -> FileMatrix | None:
     if name is not None:
+        if name in held.left_out:
+            raise ValueError(held.left_out[name])
         if name not in held:
             raise ValueError(f"File `{path}` has no matrix `{name}`; it has: {', '.join(held)}.")
         return held[name]
+    meant = [other for other in held.left_out if other.upper() in NAMES[role]]
+    if meant and not any(other.upper() in NAMES[role] for other in held):
+        raise ValueError(held.left_out[meant[0]])
     # The only matrix of a file that was given for this role has this role, unless its name says otherwise.
     if alone and len(held) == 1:
         only = next(iter(held))
@@ -189,44 +205,78 @@ def _labels(labels) -> tuple[Label, ...] | None:
     return found
 
 
-def _aligned(parts: dict[str, FileMatrix], labels) -> tuple[tuple[Label, ...] | None, dict[str, sparse.csr_array]]:
-    """The matrices with their rows in one order; a matrix that lacks a label has zeros there."""
+def _aligned(
+    parts: dict[str, FileMatrix], labels
+) -> tuple[tuple[Label, ...] | None, list[int], dict[str, sparse.csr_array]]:
+    """Labels, the numbers of nodes (or of rows, where there are no labels), and the matrices with their rows in one order.
+
+    A matrix that lacks a label, or the number of a row, has zeros there. Internal nodes, with negative numbers, come first.
+    """
     if labels is not None:
-        for part in parts.values():
-            if part.labels is None and part.size != len(labels):
-                raise ValueError(
-                    f"{part.place} has {part.size} rows, but `labels` names {len(labels)}. Give one label a row."
-                )
-        parts = {role: part._replace(labels=part.labels or labels) for role, part in parts.items()}
-    stiffness = parts["stiffness"]
-    if any(part.labels is None for part in parts.values()):
-        for role, part in parts.items():
-            if part.labels is not None or part.size != stiffness.size:
-                raise ValueError(
-                    f"{part.place}: the {role} matrix has {part.size} rows"
-                    f"{' with labels' if part.labels else ''} and the stiffness matrix {stiffness.size}"
-                    f"{' with labels' if stiffness.labels else ''}. Give matrices of one size, or `labels`."
-                )
-        order = None
-    else:
+        parts = {
+            role: part._replace(labels=part.labels or _labels_of(part, role, labels)) for role, part in parts.items()
+        }
+    if all(part.labels is not None for part in parts.values()):
         order = tuple(sorted({label for part in parts.values() for label in part.labels or ()}))
-        places = {label: place for place, label in enumerate(order)}
-        missing = set(parts["mass"].labels or ()) - set(stiffness.labels or ())
-        if 2 * len(missing) > len(parts["mass"].labels or ()):
+        _one_model(parts)
+        return order, [label.node for label in order], _in_order(parts, order, lambda part: part.labels)
+    if all(part.rows is not None and part.labels is None for part in parts.values()):
+        rows = sorted({row for part in parts.values() for row in part.rows or ()})
+        return None, rows, _in_order(parts, rows, lambda part: part.rows)
+    stiffness = parts["stiffness"]
+    for role, part in parts.items():
+        if part.rows is not None and part.rows != tuple(range(1, part.size + 1)):
+            missing = "internal rows" if min(part.rows) < 0 else "rows without entries"
             raise ValueError(
-                f"{parts['mass'].place}: most of its nodes and directions are not in the stiffness matrix, such as "
-                f"{min(missing)}. Give files of one model."
+                f"{part.place} has {missing}, and the other files have not. Give all matrices in the same form."
             )
+        if part.labels is not None or part.size != stiffness.size:
+            raise ValueError(
+                f"{part.place}: the {role} matrix has {part.size} rows"
+                f"{' with labels' if part.labels else ''} and the stiffness matrix {stiffness.size}"
+                f"{' with labels' if stiffness.labels else ''}. Give matrices of one size, or `labels`."
+            )
+    return (
+        None,
+        list(range(1, stiffness.size + 1)),
+        _in_order(parts, range(stiffness.size), lambda part: range(part.size)),
+    )
+
+
+def _labels_of(part: FileMatrix, role: str, labels: tuple[Label, ...]) -> tuple[Label, ...]:
+    """The labels of a matrix whose file has none: one for each row, by its number where the file numbers them."""
+    if part.rows is None:
+        if part.size != len(labels):
+            raise ValueError(
+                f"{part.place} has {part.size} rows, but `labels` names {len(labels)}. Give one label a row."
+            )
+        return labels
+    last = max(part.rows)
+    if last > len(labels) or (role == "stiffness" and last < len(labels)):
+        raise ValueError(f"{part.place} has {last} rows, but `labels` names {len(labels)}. Give one label a row.")
+    return tuple(labels[row - 1] if row > 0 else Label(row, 0) for row in part.rows)
+
+
+def _one_model(parts: dict[str, FileMatrix]) -> None:
+    found, known = parts["mass"].labels or (), set(parts["stiffness"].labels or ())
+    missing = set(found) - known
+    if 2 * len(missing) > len(found):
+        raise ValueError(
+            f"{parts['mass'].place}: most of its nodes and directions are not in the stiffness matrix, such as "
+            f"{min(missing)}. Give files of one model."
+        )
+
+
+def _in_order(parts: dict[str, FileMatrix], order: Sequence, keys: Callable) -> dict[str, sparse.csr_array]:
+    places = {key: place for place, key in enumerate(order)}
     found = {}
     for role in NAMES:
         if role not in parts:
-            found[role] = sparse.csr_array(found["stiffness"].shape)
-        elif order is None:
-            found[role] = parts[role].matrix
-        else:
-            entries = parts[role].matrix.tocoo()
-            place = np.array([places[label] for label in parts[role].labels or ()])
-            found[role] = sparse.csr_array(
-                (entries.data, (place[entries.row], place[entries.col])), shape=(len(order), len(order))
-            )
-    return order, found
+            found[role] = sparse.csr_array((len(places), len(places)))
+            continue
+        entries = parts[role].matrix.tocoo()
+        place = np.array([places[key] for key in keys(parts[role])])
+        found[role] = sparse.csr_array(
+            (entries.data, (place[entries.row], place[entries.col])), shape=(len(places), len(places))
+        )
+    return found

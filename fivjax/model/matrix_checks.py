@@ -37,13 +37,24 @@ def check_matrix(name: str, matrix, *, definite: bool) -> None:
     if definite and lowest <= 0:
         raise ValueError(
             f"Argument `{name}` must be positive definite, but its smallest eigenvalue (diagonal scaled to one) is "
-            f"{lowest:.3g}. Every coordinate needs a positive mass."
+            f"{lowest:.3g}. Every coordinate needs a positive mass{_without(diagonal)}."
         )
     if lowest < -1e-9:
         raise ValueError(
             f"Argument `{name}` must be positive semi-definite, but its smallest eigenvalue (diagonal scaled to one) "
             f"is {lowest:.3g}. Negative springs or dampers are not modelled."
         )
+
+
+def _without(diagonal: np.ndarray) -> str:
+    """Which rows have no mass, and what takes them."""
+    rows = np.flatnonzero(diagonal <= 0)
+    if not rows.size:
+        return ""
+    return (
+        f"; that with index {', '.join(map(str, rows[:5]))}{', …' if rows.size > 5 else ''} has none. Eliminate coordinates "
+        f"without mass and Lagrange multipliers, as `fj.craig_bampton` does with what `fj.read_structure` read"
+    )
 
 
 def check_shapes(n: int, **matrices) -> None:

@@ -115,15 +115,16 @@ def craig_bampton(
     columns = [np.eye(structure.size)[:, outer]]
     squares = np.zeros(0)
     if inner.size:
-        squares, modes = _modes_up_to(held, mass[inner][:, inner], up_to)
         try:
+            squares, modes = _modes_up_to(held, mass[inner][:, inner], up_to)
             factors = splu(held)
-        except RuntimeError:
+        except (RuntimeError, np.linalg.LinAlgError):
             factors = None
         if factors is None or np.any(squares < 1e-9 * np.max(squares, initial=0.0)):
+            tied = ", or a Lagrange multiplier ties nothing but them" if structure.checks.multipliers else ""
             raise ValueError(
-                "With its contacts held, the structure still has a part that moves freely, so that static shapes do not "
-                "exist. Hold it in the finite-element model, or name nodes of that part with `keep`."
+                f"With its contacts held, the structure still has a part that moves freely{tied}, so that static shapes do not "
+                f"exist. Hold it in the finite-element model, or name nodes of that part with `keep`."
             )
         columns[0][inner] = -factors.solve(stiffness[inner][:, outer].toarray())
         shape = factors.solve(structure.load_direction[inner])

@@ -1,6 +1,9 @@
 """What can be checked of matrices that came from somewhere else: symmetry, definiteness, rigid-body modes, mass."""
 
+import contextlib
 import dataclasses
+import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,6 +13,10 @@ ROUNDING = 1e-6
 RIGID = 1e-6
 # How many of the lowest modes are computed: six rigid-body modes and a few elastic ones.
 LOWEST = 10
+# How many rows a sentence names.
+NAMED = 5
+# Up to this size matrices are dense.
+DENSE = 400
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +27,12 @@ class StructureChecks:
     - `negative_masses`, `negative_springs`: how many eigenvalues of the mass and of the stiffness matrix are negative; None
       where this could not be found, because the matrix is not symmetric.
     - `massless`: how many degrees of freedom have no mass.
-    - `rigid_body_modes`, `lowest_frequencies` (Hz): of the structure without damping and contact; None as above.
+    - `multipliers`: the rows of Lagrange multipliers, by name: without mass, and without positive stiffness on the diagonal.
+      Each makes one eigenvalue of the stiffness matrix negative.
+    - `internal`: the rows of internal nodes, by name; files give them negative numbers.
+    - `loose`: the rows, by name, in which neither mass nor stiffness has an entry.
+    - `rigid_body_modes`, `lowest_frequencies` (Hz): of the structure without damping and contact; None as above, and where the
+      stiffness is singular whatever mass is added.
     - `total_mass`: in kg along x, y and z; None where no labels say which rows belong to which direction.
     - `fixed`: how many degrees of freedom the file marks as held, which were left out.
     - `remarks`: what else is worth a look, one sentence each.
@@ -35,6 +47,9 @@ class StructureChecks:
     total_mass: tuple[float, float, float] | None
     fixed: int = 0
     remarks: tuple[str, ...] = ()
+    multipliers: tuple[str, ...] = ()
+    internal: tuple[str, ...] = ()
+    loose: tuple[str, ...] = ()
 
     @property
     def symmetric(self) -> bool:
@@ -58,16 +73,23 @@ class StructureChecks:
                 found.append(f"The {name} matrix is not symmetric: entries differ by {value:.2g} of the largest one.")
         found = found or ["The matrices are symmetric."]
         for name, count in {"mass": self.negative_masses, "stiffness": self.negative_springs}.items():
-            if count:
-                found.append(f"The {name} matrix has {_of(count, 'negative eigenvalue')}.")
+            unexplained = (count or 0) - (len(self.multipliers) if name == "stiffness" else 0)
+            if unexplained > 0:
+                beside = ", beside one for each Lagrange multiplier" if unexplained < (count or 0) else ""
+                found.append(f"The {name} matrix has {_of(unexplained, 'negative eigenvalue')}{beside}.")
         if self.negative_masses == 0 and self.negative_springs == 0:
             found.append("Mass and stiffness have no negative eigenvalues.")
-        if self.massless:
-            found.append(f"{_of(self.massless, 'degree of freedom', 'degrees of freedom')} without mass.".capitalize())
+        found += self._about_rows
+        massless = self.massless - len(self.multipliers) - len(self.loose)
+        if massless > 0:
+            found.append(f"{_of(massless, 'degree of freedom', 'degrees of freedom')} without mass.".capitalize())
         if self.lowest_frequencies is not None:
-            elastic = self.lowest_frequencies[self.rigid_body_modes or 0 :]
+            elastic = [f for f in self.lowest_frequencies if f > np.sqrt(RIGID) * max(self.lowest_frequencies)]
             first = f"; the first elastic one is at {elastic[0]:.6g} Hz" if elastic else ""
             found.append(f"{_of(self.rigid_body_modes or 0, 'rigid-body mode')}{first}.")
+        elif self.symmetric:
+            why = "rows without entries" if self.loose else "constraints that follow from others, perhaps"
+            found.append(f"Rigid-body modes and frequencies are not known: the stiffness is singular ({why}).")
         if self.total_mass is None:
             found.append("The total mass is not known: nothing says which rows are translations along which direction.")
         else:
@@ -77,36 +99,86 @@ class StructureChecks:
             found.append(f"{_of(self.fixed, 'held degree of freedom', 'held degrees of freedom')} left out.")
         return [*found, *self.remarks]
 
+    @property
+    def _about_rows(self) -> list[str]:
+        found = []
+        if self.internal:
+            found.append(
+                f"{_of(len(self.internal), 'row')} of internal nodes, which have negative numbers ({_named(self.internal)}): "
+                f"unknowns that elements or constraints have of their own."
+            )
+        if self.multipliers:
+            found.append(
+                f"{_of(len(self.multipliers), 'Lagrange multiplier')} without mass and stiffness "
+                f"({_named(self.multipliers)}). Each holds a constraint, such as a tie or a contact, and makes one eigenvalue "
+                f"of the stiffness negative, which is no instability. `fj.craig_bampton` and `fj.cea.complex_modes` keep the "
+                f"constraints. For matrices without multipliers, export the model with penalty stiffness in their place, or a "
+                f"substructure that retains the contact nodes."
+            )
+        if self.loose:
+            found.append(
+                f"{_of(len(self.loose), 'row')} with neither mass nor stiffness ({_named(self.loose)}). Hold such degrees of "
+                f"freedom in the finite-element model, or leave them out."
+            )
+        return found
+
 
 def _of(count: int, one: str, many: str = "") -> str:
     return f"{count} {one if count == 1 else many or one + 's'}"
 
 
-def check_matrices(mass, damping, stiffness, directions, *, fixed: int = 0, remarks=()) -> StructureChecks:
-    """The checks of sparse matrices. `directions`: one for each row, 1 to 3 for translations along x, y, z; or None."""
+def _named(rows: tuple[str, ...]) -> str:
+    more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
+    return "; ".join(rows[:NAMED]) + more
+
+
+def check_matrices(
+    mass, damping, stiffness, directions, *, numbers: Sequence[int] | None = None, fixed: int = 0, remarks=()
+) -> StructureChecks:
+    """The checks of sparse matrices.
+
+    `directions`: one for each row, 1 to 3 for translations along x, y, z; or None. `numbers`: of the rows' nodes, or of the
+    rows where directions are not known; negative for internal ones.
+    """
     matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
     asymmetry = {name: _asymmetry(matrix) for name, matrix in matrices.items()}
-    massless = int(np.sum(np.diff(mass.tocsr().indptr) == 0))
+    massless, empty = (abs(matrix).sum(axis=1) == 0 for matrix in (mass, stiffness))
+    loose = massless & empty
+    multipliers = massless & ~empty & (stiffness.diagonal() <= 0)
     both = max(asymmetry["mass"], asymmetry["stiffness"]) <= ROUNDING
     frequencies = rigid = None
-    if both:
-        values = lowest_eigenvalues(stiffness, mass, LOWEST)
-        rigid = int(np.sum(np.abs(values) <= RIGID * np.abs(values).max(initial=0.0)))
-        frequencies = tuple(float(f) for f in np.sqrt(np.maximum(values, 0.0)) / (2 * np.pi))
+    if both and not np.any(loose):
+        with contextlib.suppress(np.linalg.LinAlgError):
+            values = lowest_eigenvalues(stiffness, mass, LOWEST)
+            rigid = int(np.sum(np.abs(values) <= RIGID * np.abs(values).max(initial=0.0)))
+            frequencies = tuple(float(f) for f in np.sqrt(np.maximum(values, 0.0)) / (2 * np.pi))
     total = None
     if directions is not None:
         along = [(np.asarray(directions) == axis).astype(float) for axis in (1, 2, 3)]
         total = tuple(float(ones @ (mass @ ones)) for ones in along)
+    own = np.arange(1, len(massless) + 1) if numbers is None else np.asarray(numbers)
+
+    def named(which) -> tuple[str, ...]:
+        kinds = np.full(len(own), -1) if directions is None else np.asarray(directions)
+        words = {-1: "row {}", 0: "point {}"}
+        return tuple(
+            words.get(int(kinds[k]), f"node {{}}, direction {kinds[k]}").format(own[k])
+            for k in np.flatnonzero(which)
+        )
+
     return StructureChecks(
         asymmetry=asymmetry,
         negative_masses=negative_eigenvalues(mass) if asymmetry["mass"] <= ROUNDING else None,
-        negative_springs=negative_eigenvalues(stiffness) if asymmetry["stiffness"] <= ROUNDING else None,
-        massless=massless,
+        negative_springs=negative_eigenvalues(stiffness, multipliers) if asymmetry["stiffness"] <= ROUNDING else None,
+        massless=int(np.sum(massless)),
         rigid_body_modes=rigid,
         lowest_frequencies=frequencies,
         total_mass=total,
         fixed=fixed,
         remarks=tuple(remarks),
+        multipliers=named(multipliers),
+        internal=named(own < 0),
+        loose=named(loose),
     )
 
 
@@ -115,10 +187,11 @@ def _asymmetry(matrix) -> float:
     return float(abs(matrix - matrix.T).max() / largest) if largest else 0.0
 
 
-def negative_eigenvalues(matrix) -> int | None:
+def negative_eigenvalues(matrix, multipliers=None) -> int | None:
     """How many eigenvalues of a symmetric sparse matrix are negative beyond rounding; None where this cannot be found.
 
-    By Sylvester's law of inertia there are as many as negative pivots in a symmetric elimination.
+    By Sylvester's law of inertia there are as many as negative pivots in a symmetric elimination. `multipliers` marks the rows
+    of Lagrange multipliers: each makes one, also where its constraint follows from others.
     """
     from scipy import sparse
     from scipy.sparse.linalg import splu
@@ -128,8 +201,10 @@ def negative_eigenvalues(matrix) -> int | None:
     # With the diagonal scaled to one, rounding is the same in every row.
     diagonal = np.abs(matrix.diagonal())
     scale = sparse.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
-    shifted = (scale @ matrix @ scale + 1e-9 * sparse.eye_array(matrix.shape[0])).tocsc()
-    if matrix.shape[0] <= 400:
+    # Shifted to the side where each kind of row belongs, it has pivots in any order (Vanderbei, SIAM J. Optim. 5, 1995).
+    shift = 1e-9 * np.where(np.zeros(len(diagonal), bool) if multipliers is None else multipliers, -1.0, 1.0)
+    shifted = (scale @ matrix @ scale + sparse.diags_array(shift)).tocsc()
+    if matrix.shape[0] <= DENSE:
         return int(np.sum(np.linalg.eigvalsh(shifted.toarray()) < 0))
     try:
         # Pivots on the diagonal, in an order that keeps symmetry: then it is L D Lᵀ.
@@ -147,9 +222,13 @@ def lowest_eigenvalues(stiffness, mass, count: int) -> np.ndarray:
 
 
 def lowest_modes(stiffness, mass, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest eigenvalues ω² of K v = ω² M v and their mass-normalised modes (columns), sorted."""
-    from scipy.linalg import eigh
-    from scipy.sparse.linalg import eigsh
+    """The lowest eigenvalues ω² of K v = ω² M v and their mass-normalised modes (columns), sorted.
+
+    K may be indefinite, as Lagrange multipliers make it.
+
+    **Raises:** `LinAlgError` where K + σM is singular for every σ, and where M has negative eigenvalues.
+    """
+    from scipy.sparse.linalg import ArpackError, eigsh, splu
 
     n = stiffness.shape[0]
     # Stiffness over mass of each degree of freedom, as a measure of ω².
@@ -158,21 +237,61 @@ def lowest_modes(stiffness, mass, count: int) -> tuple[np.ndarray, np.ndarray]:
     squares = squares[np.isfinite(squares) & (squares > 0)]
     if not squares.size:
         return np.zeros(0), np.zeros((n, 0))
-    if n <= 400:
-        small = 1e-3 * squares.min()
-        # ν = 1/(ω² + σ) is finite where mass is not: massless degrees of freedom have ν = 0.
-        shifted = stiffness.toarray() + small * mass.toarray()
-        try:
-            values, modes = eigh(mass.toarray(), shifted)
-        except np.linalg.LinAlgError:
-            return np.zeros(0), np.zeros((n, 0))
-        real = values > 1e-14 * values.max()
-        squares, modes = 1 / values[real] - small, modes[:, real] / np.sqrt(values[real])
-        order = np.argsort(squares)[:count]
-        return squares[order], modes[:, order]
-    # A negative shift keeps K + σM definite where rigid-body modes make K singular.
-    shift = -1e-3 * squares.min()
+    # A shift keeps K + σM definite where rigid-body modes make K singular.
+    small = 1e-3 * squares.min()
+    if n <= DENSE:
+        return _of_dense(stiffness.toarray(), mass.toarray(), small, count)
     start = np.random.default_rng(0).standard_normal(n)
-    values, modes = eigsh(stiffness.tocsc(), min(count, n - 1), mass.tocsc(), sigma=shift, which="LM", v0=start)
+    try:
+        values, modes = eigsh(stiffness.tocsc(), min(count, n - 1), mass.tocsc(), sigma=-small, which="LM", v0=start)
+    except (RuntimeError, ArpackError) as error:
+        raise np.linalg.LinAlgError(str(error)) from None
     order = np.argsort(values)
-    return values[order], modes[:, order]
+    values, modes = values[order], modes[:, order]
+    if np.any(mass.diagonal() == 0):
+        # A component without mass has no part in the iteration's scalar product; one step more makes it follow the others.
+        modes = splu((stiffness + small * mass).tocsc()).solve(mass @ modes) * (values + small)
+    return values, modes
+
+
+def _of_dense(stiffness: np.ndarray, mass: np.ndarray, small: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.linalg import eigh
+
+    # ν = 1/(ω² + σ) is finite where mass is not: massless degrees of freedom have ν = 0.
+    shifted = stiffness + small * mass
+    try:
+        values, modes = eigh(mass, shifted)
+        real = values > 1e-14 * values.max()
+        modes = modes[:, real] / np.sqrt(values[real])
+    except np.linalg.LinAlgError:
+        values, modes = _of_indefinite(shifted, mass)
+        real = np.abs(values) > 1e-12 * np.abs(values).max(initial=0.0)
+        modes = modes[:, real]
+    squares = 1 / values[real] - small
+    order = np.argsort(squares)[:count]
+    return squares[order], modes[:, order]
+
+
+def _of_indefinite(shifted: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """ν and mass-normalised modes of M v = ν (K + σM) v, from the symmetric Lᵀ(K + σM)⁻¹L with M = L Lᵀ.
+
+    **Raises:** `LinAlgError` where K + σM is singular, or M has negative eigenvalues.
+    """
+    from scipy.linalg import LinAlgWarning, eigh, solve
+
+    diagonal = np.sqrt(np.maximum(mass.diagonal(), 0.0))
+    unit = np.where(diagonal > 0, diagonal, 1.0)
+    sizes, turn = eigh(mass / unit / unit[:, None])
+    if sizes[0] < -1e-9:
+        raise np.linalg.LinAlgError("The mass matrix has a negative eigenvalue.")
+    kept = sizes > 1e-12
+    root = unit[:, None] * turn[:, kept] * np.sqrt(sizes[kept])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", LinAlgWarning)
+        try:
+            solved = solve(shifted, root, assume_a="sym")
+        except LinAlgWarning as warning:
+            raise np.linalg.LinAlgError(str(warning)) from None
+    values, turn = eigh(0.5 * (root.T @ solved + solved.T @ root))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return values, solved @ turn / values

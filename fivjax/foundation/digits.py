@@ -1,0 +1,16 @@
+"""Numbers in sentences, with as many digits as it takes to tell them apart."""
+
+# What `:g` prints.
+ORDINARY = 6
+# With these, different numbers in double precision look different.
+MOST = 17
+
+
+def apart(*values: float, digits: int = ORDINARY) -> tuple[str, ...]:
+    """The numbers as text, those that differ looking different: "1.70809" and "1.7080901", not "1.70809" twice."""
+    numbers = [float(value) for value in values]
+    for count in range(digits, MOST + 1):
+        texts = tuple(f"{number:.{count}g}" for number in numbers)
+        if len(set(texts)) >= len({number for number in numbers if number == number}):
+            break
+    return texts

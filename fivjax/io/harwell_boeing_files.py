@@ -1,0 +1,117 @@
+"""Harwell–Boeing files, as Ansys writes them with `HBMAT`: assembled matrices by columns.
+
+Four lines of header, and a fifth where there are right-hand sides: a title; the numbers of lines that follow, in all and by
+part; the kind of matrix with its rows, columns and entries; the Fortran formats of the parts. Then for each column the position
+of its first entry, the row of each entry, and the values (Duff, Grimes and Lewis, Users' Guide for the Harwell-Boeing Sparse
+Matrix Collection, 1992). Of a symmetric matrix the file has one triangle.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from .file_matrix import FileMatrix, text_of
+
+# How much of a file tells whether it is one.
+HEAD = 400
+
+
+class _Header(NamedTuple):
+    lines: tuple[int, int, int]  # of the columns' positions, of the rows, and of the values
+    kind: str
+    shape: tuple[int, int]
+    entries: int
+    formats: tuple[tuple[int, int], ...]  # fields in a line, and characters in a field, of each part
+    length: int  # of the header, in lines
+
+
+def begins_like_harwell_boeing(head: str) -> bool:
+    """Whether a file that begins so has a Harwell–Boeing header: numbers in its second line, and a kind in its third."""
+    lines = head.split("\n")
+    return (
+        len(lines) > 3
+        and re.fullmatch(r"\s*(\d+\s+){2,4}\d+\s*", lines[1]) is not None
+        and re.match(r"\s*[RCP][SUHZR][AE]\s+\d+\s+\d+\s+\d+", lines[2], re.IGNORECASE) is not None
+    )
+
+
+def matrix(path: Path) -> dict[str, FileMatrix | str]:
+    """The matrix of a Harwell–Boeing file by the file's name; in place of a complex one, a sentence that says so."""
+    place, lines = f"File `{path}`", text_of(path).splitlines()
+    header = _header(place, lines)
+    if header.kind[0] == "C":
+        return {path.stem: f"{place} holds a complex matrix. Write the real stiffness, mass or damping."}
+    rows, columns = header.shape
+    ends = np.cumsum([header.length, *header.lines])
+    if ends[-1] > len(lines):
+        raise ValueError(f"{place} must have {ends[-1]} lines by its header, but has {len(lines)}. Write it again.")
+    wanted = (columns + 1, header.entries, header.entries)
+    positions, places, values = (
+        _numbers(place, lines, ends[part], ends[part + 1], *header.formats[part], kind, wanted[part])
+        for part, kind in enumerate((int, int, float))
+    )
+    starts = positions - 1
+    if starts[0] != 0 or starts[-1] != header.entries or np.any(np.diff(starts) < 0):
+        raise ValueError(
+            f"{place}: the positions of its columns must go from 1 up to {header.entries + 1}. Write it again."
+        )
+    if np.any((places < 1) | (places > rows)):
+        wrong = places[(places < 1) | (places > rows)][0]
+        raise ValueError(f"{place} has an entry in row {wrong} of {rows}. Write it again.")
+    found = sparse.csc_array((values, places - 1, starts), shape=header.shape).tocoo()
+    i, j, data = found.row, found.col, found.data
+    if header.kind[1] == "S":
+        if np.any(i < j) and np.any(i > j):
+            raise ValueError(
+                f"{place} is said to be symmetric, but has entries on both sides of the diagonal. Write it again."
+            )
+        off = i != j
+        i, j, data = np.append(i, j[off]), np.append(j, i[off]), np.append(data, data[off])
+    return {path.stem: FileMatrix(sparse.csr_array((data, (i, j)), shape=header.shape), None, place)}
+
+
+def _header(place: str, lines: list[str]) -> _Header:
+    counts, (kind, *sizes) = [int(word) for word in lines[1].split()], lines[2].split()
+    kind = kind.upper()
+    rows, columns, entries = (int(word) for word in sizes[:3])
+    if kind[2] == "E" or kind[0] == "P" or kind[1] in "HZ":
+        raise ValueError(
+            f"{place} holds a matrix of kind {kind}, but must hold an assembled one with values: RSA, RUA or RRA. Write it so."
+        )
+    formats = re.findall(r"\(([^()]*)\)", lines[3])[:3]
+    fields = [re.search(r"(\d*)[IEDFG](\d+)", text.upper().split("P")[-1]) for text in formats]
+    if len(fields) < 3 or None in fields:
+        raise ValueError(
+            f"{place}, line 4: three Fortran formats expected, such as `(8I10) (8I10) (3E25.16)`. Write it again."
+        )
+    return _Header(
+        lines=(counts[1], counts[2], counts[3]),
+        kind=kind,
+        shape=(rows, columns),
+        entries=entries,
+        formats=tuple((int(field[1] or 1), int(field[2])) for field in fields if field),
+        length=5 if len(counts) > 4 and counts[4] > 0 else 4,
+    )
+
+
+def _numbers(
+    place, lines: list[str], first: int, last: int, count: int, width: int, kind: type, wanted: int
+) -> np.ndarray:
+    """The numbers of some lines, in `count` fields of one width."""
+    words = " ".join(lines[first:last]).upper().replace("D", "E").split()
+    if len(words) != wanted:  # fields that touch each other
+        fields = (line[k * width : (k + 1) * width] for line in lines[first:last] for k in range(count))
+        words = [field.upper().replace("D", "E").strip() for field in fields if field.strip()]
+    if len(words) != wanted:
+        raise ValueError(
+            f"{place}, lines {first + 1} to {last}: {wanted} numbers expected, {len(words)} found. Write it again."
+        )
+    # Fortran leaves out the E before an exponent of three digits.
+    words = words if kind is int else [re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", word) for word in words]
+    try:
+        return np.array([kind(word) for word in words], np.int64 if kind is int else np.float64)
+    except ValueError as error:
+        raise ValueError(f"{place}, lines {first + 1} to {last}: {error}. Write it again.") from None
