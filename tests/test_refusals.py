@@ -18,6 +18,7 @@ from refusing import EngineReached, refused, refused_on_the_command_line, untouc
 
 import fivjax as fj
 from fivjax import cli
+from fivjax.foundation import arguments, digits
 from fivjax.io import files
 
 
@@ -562,3 +563,54 @@ def test_a_saddle_about_unstable_sliding_is_refused(paper_scene):
     """Where sliding is unstable no boundary surrounds it; the search used to end minutes later, and to suspect a torus."""
     with refused(ValueError, "sliding", "unstable"):
         fj.saddle_cycle(paper_scene.replace(mu=0.3))
+
+
+NEXT = math.nextafter(0.2, 1.0)
+
+
+class Swinging(fj.AbstractLoad):
+    """A load of 1 N that swings by a billionth of it."""
+
+    force: float = 1.0
+
+    @property
+    def jumps(self):
+        return np.zeros(0)
+
+    @property
+    def final(self):
+        return self.force
+
+    def __call__(self, t):
+        return self.force + 1e-9 * jax.numpy.sin(t)
+
+
+@pytest.mark.parametrize(
+    "refused_call",
+    [
+        lambda scene: fj.bistability_map(scene, mu=[NEXT, 0.2]),
+        lambda scene: fj.ExponentialDecay(mu_static=0.2, mu_dynamic=NEXT),
+        lambda scene: fj.continue_cycle(scene.replace(mu=NEXT), "mu", bounds=(0.1, 0.2)),
+        lambda scene: fj.Structure(
+            np.eye(2), np.eye(2), [[1.0, 0.2], [0.2 + 1e-8, 1.0]], [0, -1], tangential=0, normal=1
+        ),
+        lambda scene: fj.Scene(scene.structure, scene.friction, 3.0, Swinging()),
+        lambda scene: fj.simulate(scene, 0.1, dt_save=1e-4, method=fj.WhereSwitched(dt=1e-4 * (1 + 1e-7))),
+        lambda scene: arguments.real_number("share", 1 + 1e-12, maximum=1.0),
+    ],
+)
+def test_two_numbers_that_differ_look_different(refused_call, paper_scene):
+    """However near a value lies to what it was compared with, the sentence shows which is the larger."""
+    with pytest.raises(ValueError, match="must") as caught:
+        refused_call(paper_scene)
+    numbers = [float(text) for text in re.findall(r"(?<![\w.])\d+\.?\d*(?:e-?\d+)?(?![\w])", str(caught.value))]
+    near = [(a, b) for a in numbers for b in numbers if a != b and abs(a - b) < 1e-6 * abs(a)]
+    assert near, str(caught.value)
+
+
+def test_as_many_digits_as_it_takes():
+    assert digits.apart(1.70809, 1.70809 + 1e-12) == ("1.70809", "1.708090000001")
+    assert digits.apart(0.2, NEXT) == ("0.20000000000000001", "0.20000000000000004")
+    assert digits.apart(100.0, 100.0, 3.5) == ("100", "100", "3.5")
+    assert digits.apart(math.nan, math.inf, 1e-30) == ("nan", "inf", "1e-30")
+    assert digits.apart(1 / 3, 1 / 3 + 1e-8, digits=9) == ("0.333333333", "0.333333343")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 from ..model.scene import Scene
 
 # Parameters that may be negative; all others are positive.
@@ -53,8 +54,9 @@ class FreeParameters(eqx.Module):
             value = float(known[name])
             low, high = _bound(name, bounds.get(name))
             if not low < value < high:
+                least, most, own = apart(low, high, value)
                 raise ValueError(
-                    f"Parameter `{name}` must start inside its bounds ({low:g}, {high:g}), but is {value:g} in the scene. "
+                    f"Parameter `{name}` must start inside its bounds ({least}, {most}), but is {own} in the scene. "
                     f"Widen `bounds`, or start elsewhere with `scene.replace`."
                 )
             lower.append(low)

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import tyro
 
+from ..foundation.digits import apart
+
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     """The name and values of an axis from `NAME=FROM:TO:COUNT`.
@@ -24,7 +26,7 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"Axis `{name}` must be finite, but goes from {low:g} to {high:g}.")
     if points > 1 and not high > low:
-        raise ValueError(f"Axis `{name}` must go up, but goes from {low:g} to {high:g}.")
+        raise ValueError(f"Axis `{name}` must go up, but goes from {' to '.join(apart(low, high))}.")
     if name == "theta":
         for end in (low, high):
             check_angle(f"Axis `{name}`", end)

@@ -14,6 +14,7 @@ import numpy as np
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
@@ -101,8 +102,9 @@ def continue_cycle(
     low, high = _checked_bounds(bounds)
     value = float(final.parameters[parameter])
     if not low <= value <= high:
+        own, lower, upper = apart(value, low, high)
         raise ValueError(
-            f"Argument `bounds` must hold the scene's own {parameter}, {value:g}, but is ({low:g}, {high:g}). "
+            f"Argument `bounds` must hold the scene's own {parameter}, {own}, but is ({lower}, {upper}). "
             f"Widen it, or start elsewhere with `scene.replace`."
         )
     arguments.whole_number("points", points, minimum=2)

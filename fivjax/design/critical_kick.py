@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
 from ..linear.design import DesignOutcome
 from ..maps.critical_derivatives import differentiable
@@ -65,12 +66,14 @@ class RaisedCriticalKick(NamedTuple):
     def __str__(self) -> str:
         low, high = self.after_bracket
         changes = ", ".join(
-            f"{name} {old:.6g} -> {new:.6g} ({100 * (new / old - 1):+.2f} %)"
+            f"{name} {' -> '.join(apart(old, new))} ({100 * (new / old - 1):+.2f} %)"
             for name, (old, new) in self.changes.items()
         )
+        before, after, target = apart(self.before, self.after, self.target)
+        low, high = apart(low, high)
         text = (
-            f"{self.outcome.value.capitalize()}: p_crit {self.before:.6g} -> {self.after:.6g} (target {self.target:.6g}) "
-            f"with {changes}; bracketed anew: {low:.6g} slides, {high:.6g} leads to a limit cycle."
+            f"{self.outcome.value.capitalize()}: p_crit {before} -> {after} (target {target}) "
+            f"with {changes}; bracketed anew: {low} slides, {high} leads to a limit cycle."
         )
         return f"{text} {self.why}" if self.why else text
 
@@ -139,9 +142,8 @@ def raise_critical_perturbation(
         )
     target = (1 + by) * first.p
     if target >= p_range[1]:
-        raise ValueError(
-            f"Argument `p_range` must hold the target {target:g}, but ends at {p_range[1]:g}. Raise its upper end."
-        )
+        aim, end = apart(target, p_range[1])
+        raise ValueError(f"Argument `p_range` must hold the target {aim}, but ends at {end}. Raise its upper end.")
     aim, taken, why = target * (1 + 0.5 * MET), 1, ""
     while taken < steps:
         ahead = smallest_change(here.slopes, aim - here.p + here.slopes @ here.r, low, high) - here.r

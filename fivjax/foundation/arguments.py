@@ -10,6 +10,7 @@ from collections.abc import Iterable
 import jax
 import numpy as np
 
+from .digits import apart
 from .precision import is_known
 
 # Energies are products of two or three numbers that users give; they must be finite, too.
@@ -37,13 +38,16 @@ def real_number(
             f"{number:g}."
         )
     if minimum is not None and number < minimum:
-        rule = "non-negative" if minimum == 0 else f"at least {minimum:g}"
-        raise ValueError(f"Argument `{name}` must be {rule}, but is {number:g}.")
+        shown, bound = apart(number, minimum)
+        rule = "non-negative" if minimum == 0 else f"at least {bound}"
+        raise ValueError(f"Argument `{name}` must be {rule}, but is {shown}.")
     if above is not None and number <= above:
-        rule = "positive" if above == 0 else f"above {above:g}"
-        raise ValueError(f"Argument `{name}` must be {rule}, but is {number:g}.")
+        shown, bound = apart(number, above)
+        rule = "positive" if above == 0 else f"above {bound}"
+        raise ValueError(f"Argument `{name}` must be {rule}, but is {shown}.")
     if maximum is not None and number > maximum:
-        raise ValueError(f"Argument `{name}` must be at most {maximum:g}, but is {number:g}.")
+        shown, bound = apart(number, maximum)
+        raise ValueError(f"Argument `{name}` must be at most {bound}, but is {shown}.")
 
 
 def whole_number(name: str, value, *, minimum: int) -> None:
@@ -89,8 +93,9 @@ def axis(name: str, values) -> np.ndarray:
     steps = np.diff(array)
     if np.any(steps <= 0):
         at = int(np.argmax(steps <= 0))
+        before, after = apart(*array[at : at + 2])
         raise ValueError(
-            f"Axis `{name}` must be strictly increasing, but goes from {array[at]:g} to {array[at + 1]:g} "
+            f"Axis `{name}` must be strictly increasing, but goes from {before} to {after} "
             f"(values {at} and {at + 1}). Sort it and drop repeats, for instance with `numpy.unique`."
         )
     return array

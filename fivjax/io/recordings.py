@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 
 REGIMES = ("sliding", "kick", "limit cycle")
 # Time stamps are often rounded to few digits; steps that differ by more than this share of a step are uneven.
@@ -193,8 +194,9 @@ def _instants(t, count: int) -> np.ndarray:
     off = np.abs(steps - step)
     if off.max() > UNEVEN * step:
         at = int(np.argmax(off))
+        own, mean = apart(steps[at], step)
         raise ValueError(
-            f"Argument `t` must be evenly spaced, but its step is {steps[at]:g} s after sample {at} and {step:g} s on "
+            f"Argument `t` must be evenly spaced, but its step is {own} s after sample {at} and {mean} s on "
             f"average. Interpolate the signals, or cut the recording at the gap."
         )
     return array
@@ -219,7 +221,7 @@ def _offset(offset) -> tuple[float, float]:
         raise ValueError(f"Argument `offset` must be one number or a range of two, but has shape {array.shape}.")
     low, high = (float(array), float(array)) if array.ndim == 0 else map(float, array)
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        raise ValueError(f"Argument `offset` must be finite and go up, but is ({low:g}, {high:g}).")
+        raise ValueError(f"Argument `offset` must be finite and go up, but is ({', '.join(apart(low, high))}).")
     return low, high
 
 

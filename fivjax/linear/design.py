@@ -14,6 +14,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision, real
 from ..io.datasets import labelled
 from ..model.structure import Structure
@@ -55,8 +56,8 @@ class Design(eqx.Module):
 
     def __str__(self) -> str:
         changes = ", ".join(f"{name} = {value:.6g}" for name, value in self.parameters.items())
-        aim = "" if self.target is None else f" (target {self.target:g})"
-        moved = f"{self.quantity} {self.before:.6g} -> {self.after:.6g}{aim}"
+        before, after, *target = apart(self.before, self.after, *([] if self.target is None else [self.target]))
+        moved = f"{self.quantity} {before} -> {after}" + (f" (target {target[0]})" if target else "")
         return f"{self.outcome.value.capitalize()}: {moved} with {changes}."
 
     __repr__ = __str__

@@ -19,6 +19,7 @@ import numpy as np
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..model.load import Pulse
@@ -59,9 +60,10 @@ class SmallestKick(NamedTuple):
         return (self.certified - 1.0) / (self.p - 1.0)
 
     def __str__(self) -> str:
+        found, certified = apart(self.p, self.certified, digits=9)
         return (
-            f"smallest kick found: p = {self.p:.9g} for {self.duration:.6g} s leads to a limit cycle\n"
-            f"certified: every kick with p below {self.certified:.9g} slides for ever\n"
+            f"smallest kick found: p = {found} for {self.duration:.6g} s leads to a limit cycle\n"
+            f"certified: every kick with p below {certified} slides for ever\n"
             f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
         )
 

@@ -16,6 +16,7 @@ from jax.experimental.jet import jet
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision, is_known, real
 from .printing import as_call
 
@@ -67,9 +68,10 @@ class AbstractFriction(eqx.Module):
         def refuse(wrong, rule: str):
             if np.any(wrong):
                 at = int(np.argmax(wrong))
+                found, highest = apart(mu[at], static)
                 raise ValueError(
-                    f"The friction law `{name}` must {rule}, but is {mu[at]:g} at a slip speed of {SPEEDS[at]:g} m/s, with "
-                    f"`static` {static:g}. See `fivjax.AbstractFriction` for what a law promises."
+                    f"The friction law `{name}` must {rule}, but is {found} at a slip speed of {SPEEDS[at]:g} m/s, with "
+                    f"`static` {highest}. See `fivjax.AbstractFriction` for what a law promises."
                 )
 
         refuse(~np.isfinite(mu) | ~np.isfinite(static), "be finite at every slip speed")
@@ -206,7 +208,8 @@ class ExponentialDecay(AbstractFriction):
 
 def _check_order(high_name: str, high, low_name: str, low) -> None:
     if is_known(high) and is_known(low) and float(high) < float(low):
+        larger, smaller = apart(high, low)
         raise ValueError(
-            f"Argument `{high_name}` must be at least `{low_name}`, but is {float(high):g} and `{low_name}` is "
-            f"{float(low):g}. A contact that slips more easily while it sticks would chatter without end; are the two swapped?"
+            f"Argument `{high_name}` must be at least `{low_name}`, but is {larger} and `{low_name}` is "
+            f"{smaller}. A contact that slips more easily while it sticks would chatter without end; are the two swapped?"
         )

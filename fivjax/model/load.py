@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision, is_known, real
 from .printing import as_call
 
@@ -67,16 +68,17 @@ class AbstractLoad(eqx.Module):
         ]
         for values, (begin, end) in zip(between, pairwise(ends), strict=True):
             if begin < end and not np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
+                least, most = apart(min(values), max(values))
+                earlier, later = apart(begin, end)
                 raise ValueError(
-                    f"The load `{name}` must be constant between its jumps, but goes from {values[0]:g} N to {values[-1]:g} N "
-                    f"between {begin:g} s and {end:g} s."
+                    f"The load `{name}` must be constant between its jumps, but is between {least} N and {most} N from "
+                    f"{earlier} s to {later} s."
                 )
         for what, promised, found in (("force", force, between[0][1]), ("final", final, between[-1][1])):
             if not np.isclose(found, float(promised), rtol=1e-12, atol=0):
                 when = "before its first jump" if what == "force" else "after its last jump"
-                raise ValueError(
-                    f"The load `{name}` must be `{what}` {when}, but is {found:g} N instead of {float(promised):g} N."
-                )
+                is_, wanted = apart(found, promised)
+                raise ValueError(f"The load `{name}` must be `{what}` {when}, but is {is_} N instead of {wanted} N.")
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))

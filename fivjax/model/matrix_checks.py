@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..foundation import arguments
+from ..foundation.digits import apart
 from ..foundation.precision import is_known
 
 
@@ -25,9 +26,10 @@ def check_matrix(name: str, matrix, *, definite: bool) -> None:
     asymmetry = np.abs(array - array.T)
     if np.any(asymmetry > 1e-9 * np.abs(array).max()):
         i, j = np.unravel_index(np.argmax(asymmetry), array.shape)
+        above, below = apart(array[i, j], array[j, i])
         raise ValueError(
-            f"Argument `{name}` must be symmetric, but entry ({i}, {j}) is {array[i, j]:g} and entry ({j}, {i}) is "
-            f"{array[j, i]:g}. Friction does not belong here: give the symmetric matrix of the free structure."
+            f"Argument `{name}` must be symmetric, but entry ({i}, {j}) is {above} and entry ({j}, {i}) is "
+            f"{below}. Friction does not belong here: give the symmetric matrix of the free structure."
         )
     # Checked after scaling the diagonal to one, so that masses of very different size do not look indefinite.
     diagonal = np.diag(array)

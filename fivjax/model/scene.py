@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.digits import apart
 from ..foundation.linear_solve import solve
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
@@ -290,7 +291,8 @@ def refuse_painleve(scene: Scene) -> None:
     if is_known(largest):
         limit = painleve_friction(scene.structure)
         if is_known(limit) and float(largest) >= limit:
+            friction, limit = apart(largest, limit, digits=4)
             raise ValueError(
-                f"The contact problem has no unique solution at friction {float(largest):g}: Painlevé's limit of this "
-                f"structure is {float(limit):.4g}. Lower the friction or the coupling in the mass matrix."
+                f"The contact problem has no unique solution at friction {friction}: Painlevé's limit of this "
+                f"structure is {limit}. Lower the friction or the coupling in the mass matrix."
             )

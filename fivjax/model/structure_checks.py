@@ -162,8 +162,7 @@ def check_matrices(
         kinds = np.full(len(own), -1) if directions is None else np.asarray(directions)
         words = {-1: "row {}", 0: "point {}"}
         return tuple(
-            words.get(int(kinds[k]), f"node {{}}, direction {kinds[k]}").format(own[k])
-            for k in np.flatnonzero(which)
+            words.get(int(kinds[k]), f"node {{}}, direction {kinds[k]}").format(own[k]) for k in np.flatnonzero(which)
         )
 
     return StructureChecks(

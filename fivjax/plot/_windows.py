@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..foundation.digits import apart
 from ..simulation.energy import Energy
 from ..simulation.trajectory import Trajectory
 from .contact_status import shade_status
@@ -27,9 +28,10 @@ def inside(run: Trajectory, window: Window) -> slice:
     check_run(run)
     start, end = np.searchsorted(run.t, window[0]), np.searchsorted(run.t, window[1], side="right")
     if end - start < 2:
+        first, last, begin, stop = apart(*window, run.t[0], run.t[-1])
         raise ValueError(
-            f"A window must hold several instants of the run, but {window[0]:g} to {window[1]:g} s holds {end - start}; "
-            f"the run goes from {run.t[0]:g} to {run.t[-1]:g} s."
+            f"A window must hold several instants of the run, but {first} to {last} s holds {end - start}; the run goes from "
+            f"{begin} to {stop} s."
         )
     return slice(int(start), int(end))
 

@@ -15,6 +15,7 @@ from .. import contact as physics
 from ..contact import Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
+from ..foundation.digits import apart
 from ..foundation.linear_solve import solve
 from ..foundation.precision import (
     Returned,
@@ -192,8 +193,9 @@ def simulate(
     arguments.truth("energy", energy)
     arguments.one_of("derivatives", derivatives, MODES)
     if not method.chooses_its_steps and dt_save < method.dt * (1 - 1e-9):
+        saved, step = apart(dt_save, method.dt)
         raise ValueError(
-            f"Argument `dt_save` must be at least the method's step, but is {dt_save:g} s and `dt` is {method.dt:g} s. Steps "
+            f"Argument `dt_save` must be at least the method's step, but is {saved} s and `dt` is {step} s. Steps "
             f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
         )
     refuse_painleve(scene)
