@@ -94,27 +94,3 @@ def test_modes_along_friction_and_what_has_no_steady_sliding():
     lifted = fj.Scene(upwards, fj.Coulomb(0.2), 3.0, fj.ConstantLoad(100.0))
     with pytest.raises(ValueError, match="There is no steady sliding: the normal forces would be"):
         fj.cea.growth_rate(lifted)
-
-
-def test_the_command_line_takes_a_structure_from_a_file(tmp_path, monkeypatch, capsys):
-    """`fivjax cea --structure` reads, reduces and analyses; what it refuses it calls by its options."""
-    from fivjax import cli
-
-    with (tmp_path / "row_STIF1.mtx").open("w") as stiffness, (tmp_path / "row_MASS1.mtx").open("w") as mass:
-        for place in range(1, 7):
-            for direction, rate in ((1, 4e4), (2, 1e4)):
-                stiffness.write(f"{place},{direction}, {place},{direction}, {2 * rate}\n")
-                mass.write(f"{place},{direction}, {place},{direction}, 1e-5\n")
-            stiffness.write(f"{place},2, {place},1, 100.0\n")
-    monkeypatch.chdir(tmp_path)
-    call = ["cea", "--structure", "row_STIF1.mtx", "--contact", "3:x:-y", "--x", "mu=0:0.4:3", "--up-to", "1e6"]
-    monkeypatch.setattr("sys.argv", ["fivjax", *call, "--units", "mm-t-s"])
-    assert cli.main() in (None, 0)
-    said = capsys.readouterr().out
-    assert "Total mass: 0.06 kg along x" in said
-    assert "critical friction: never unstable" in said
-    assert (tmp_path / "cea.nc").is_file()
-    assert (tmp_path / "cea.png").is_file()
-    monkeypatch.setattr("sys.argv", ["fivjax", *call, "--overwrite"])
-    assert cli.main() != 0
-    assert "Option `--units` must be one of" in capsys.readouterr().err

@@ -12,6 +12,7 @@ import fivjax as fj
 from .options import SceneOptions
 from .outputs import Overwrite, output_paths, say
 from .parsing import axis, bound, pair
+from .structure_options import StructureOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,28 +24,20 @@ class Cea:
     out: Path = Path("cea")
     """files to write, without suffix"""
     overwrite: Overwrite = False
-    structure: Path | None = None
-    """file of a finite-element code with the structure, instead of the oscillator; formats: see `fj.read_structure`"""
-    units: str | None = None
-    """units of that file, such as mm-t-s"""
-    contact: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NODE:ALONG:AWAY[:AGAINST] …")] = ()
-    """its contacts, such as `17:x:-z`, or `17:x:-z:903` against another node"""
-    up_to: float = 3000.0
-    """frequency up to which its modes are kept (Hz)"""
-    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    scene: tyro.conf.OmitArgPrefixes[StructureOptions] = dataclasses.field(default_factory=StructureOptions)
 
     def run(self) -> None:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
-        if self.structure is not None:
-            self._of_file(self.structure, data, picture)
+        along = dict([axis(self.x, least=2)])  # with a single value there would be no lines to draw
+        direction = 1 if self.scene.belt_speed >= 0 else -1
+        if self.scene.structure is not None:
+            self._of_file(along, direction, data, picture)
             return
         scene = self.scene.scene()
-        # With a single value there would be no lines to draw.
-        dataset = fj.cea.modes(scene, **dict([axis(self.x, least=2)]))
+        dataset = fj.cea.modes(scene, **along)
         fj.save(dataset, data)
         fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
         say(data, picture)
-        direction = 1 if self.scene.belt_speed >= 0 else -1
         limit = fj.cea.stability_limit(scene.structure, direction=direction)
         if limit.outcome is fj.cea.StabilityOutcome.FOUND:
             print(f"  critical friction {float(limit.mu):.10g} at {float(limit.frequency):.2f} Hz")
@@ -52,31 +45,24 @@ class Cea:
         else:
             print(f"  {limit}")
 
-    def _of_file(self, path: Path, data: Path, picture: Path) -> None:
-        try:
-            big = fj.read_structure(path, units=self.units, contacts=[node_contact(text) for text in self.contact])
-            reduction = fj.craig_bampton(big, self.up_to)
-        except ValueError as error:
-            sentence = str(error).replace("Argument `units`", "Option `--units`")
-            raise ValueError(sentence.replace("Give `contacts` to `read_structure`", "Give `--contact`")) from None
-        print(big.checks, reduction, sep="\n")
-        direction = 1 if self.scene.belt_speed >= 0 else -1
-        dataset = fj.cea.modes(reduction.structure, direction=direction, **dict([axis(self.x, least=2)]))
+    def _of_file(self, along: dict, direction: int, data: Path, picture: Path) -> None:
+        """Modes of a structure from files; a load is needed only where the modes depend on it."""
+        if self.scene.load:
+            scene = self.scene.scene()
+            structure, dataset = scene.structure, fj.cea.modes(scene, **along)
+        elif self.scene.mu_static is not None or set(along) != {"mu"}:
+            raise ValueError(
+                "Option `--load` is missing: without it modes can be followed over constant friction only, `--x mu=…`."
+            )
+        else:
+            structure = self.scene.reduced()
+            dataset = fj.cea.modes(structure, direction=direction, **along)
         fj.save(dataset, data)
         fj.save_figure(fj.plot.linear.eigenvalues(dataset), picture)
         say(data, picture)
-        limit = fj.cea.stability_limit(reduction.structure, direction=direction)
+        limit = fj.cea.stability_limit(structure, direction=direction)
         found = f" {float(limit.mu):.6g} at {float(limit.frequency):.2f} Hz" if limit.mu < float("inf") else ""
         print(f"  critical friction: {limit.outcome.value}{found}")
-
-
-def node_contact(text: str) -> "fj.NodeContact":
-    """A contact from `17:x:-z` or `17:x:-z:903`."""
-    parts = text.split(":")
-    if len(parts) not in (3, 4) or not all(parts[place].isdecimal() for place in (0, 3)[: len(parts) - 2]):
-        raise ValueError(f"Option `--contact` must be NODE:ALONG:AWAY or NODE:ALONG:AWAY:AGAINST, but is {text!r}.")
-    along, away = (int(part) if part.isdecimal() else part for part in parts[1:3])
-    return fj.NodeContact(int(parts[0]), along, away, int(parts[3]) if len(parts) == 4 else None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,9 @@ import tyro
 
 import fivjax as fj
 
-from .options import SceneOptions
 from .outputs import Failure, Overwrite, output_paths, say
 from .parsing import axis, bound
+from .structure_options import StructureOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,18 +28,18 @@ class Branch:
     out: Path = Path("branch")
     """files to write, without suffix"""
     overwrite: Overwrite = False
-    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    scene: tyro.conf.OmitArgPrefixes[StructureOptions] = dataclasses.field(default_factory=StructureOptions)
 
     def run(self) -> None:
         import numpy as np
 
         name, bounds = bound(self.over)
-        scene = self.scene.scene()
         other, values = (None, [None]) if self.each is None else axis(self.each)
         endings = [".nc"] if other is None else [f"-{k + 1}.nc" for k in range(len(values))]
         endings += [] if self.map is None else ["-map.nc"]
         *data, picture = output_paths(self.out, self.overwrite, *endings, ".png")
         upwards = None if self.map is None else axis(self.map)
+        scene = self.scene.scene()
         branches = {}
         for value in values:
             label = "" if other is None else f"{other} = {value:g}"

@@ -7,8 +7,8 @@ import tyro
 
 import fivjax as fj
 
-from .options import SceneOptions
 from .outputs import Failure, Overwrite, output_paths, say
+from .structure_options import StructureOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Cycle:
     out: Path = Path("cycle")
     """files to write, without suffix"""
     overwrite: Overwrite = False
-    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    scene: tyro.conf.OmitArgPrefixes[StructureOptions] = dataclasses.field(default_factory=StructureOptions)
 
     def run(self) -> None:
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")

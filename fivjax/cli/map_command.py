@@ -9,9 +9,10 @@ import tyro
 
 import fivjax as fj
 
-from .options import MethodOptions, SceneOptions
+from .options import MethodOptions
 from .outputs import Failure, Interrupted, Overwrite, output_paths, say
 from .parsing import axis, number
+from .structure_options import StructureOptions
 from .workers import workers_of
 
 
@@ -58,7 +59,7 @@ class Map:
     """number of worker processes; unless given, threads of this process"""
     dask: str | None = None
     """address of a Dask scheduler whose workers run the jobs, such as tcp://10.0.0.1:8786"""
-    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    scene: tyro.conf.OmitArgPrefixes[StructureOptions] = dataclasses.field(default_factory=StructureOptions)
     method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
 
     def run(self) -> None:
@@ -72,7 +73,6 @@ class Map:
             raise ValueError(f"Option `--resume` must name a folder that ends in .zarr, but is `{folder}`.")
         going_on = asked and (folder or unfinished).exists()
         data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
-        scene, method = self.scene.scene(), self.method.stepper()
         axes = dict(map(axis, (self.x, self.y)))
         if len(axes) != 2:
             raise ValueError(f"A map needs two different parameters, but --x and --y are both {next(iter(axes))}.")
@@ -84,6 +84,7 @@ class Map:
             raise ValueError(
                 f"An interrupted map is kept in `{unfinished}`. Go on with it by `--resume`, or delete the file to begin anew."
             )
+        scene, method = self.scene.scene(), self.method.stepper()
         try:
             with warnings.catch_warnings(), workers_of(self.workers, self.dask) as executor:
                 # The message printed below says more.

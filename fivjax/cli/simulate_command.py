@@ -8,8 +8,9 @@ import tyro
 
 import fivjax as fj
 
-from .options import MethodOptions, SceneOptions
+from .options import MethodOptions
 from .outputs import Overwrite, output_paths, say
+from .structure_options import StructureOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Simulate:
     out: Path = Path("response")
     """files to write, without suffix"""
     overwrite: Overwrite = False
-    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=SceneOptions)
+    scene: tyro.conf.OmitArgPrefixes[StructureOptions] = dataclasses.field(default_factory=StructureOptions)
     method: tyro.conf.OmitArgPrefixes[MethodOptions] = dataclasses.field(default_factory=MethodOptions)
 
     def run(self) -> None:

@@ -1,13 +1,17 @@
 """Contacts and loads of a finite-element model, by node and direction."""
 
+import csv
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from ..foundation import arguments
-from .file_matrix import Label
+from .file_matrix import Label, text_of
 
+# Columns of a file of contacts; the last one may be missing.
+COLUMNS = ("node", "along", "away", "against")
 AXES = {"x": 1, "y": 2, "z": 3}
 
 
@@ -32,6 +36,66 @@ class NodeContact:
     tangential: str | int | Sequence[float]
     normal: str | int | Sequence[float]
     against: int | None = None
+
+
+def read_contacts(path: str | Path) -> list[NodeContact]:
+    """Contacts from a file with the columns `node`, `along` and `away`, and perhaps `against`, by commas or semicolons.
+
+    Directions are written as x, -z, a number from 1 to 6, or three numbers separated by blanks. Where `against` is empty, the
+    node touches the belt. Lines that begin with # are passed over.
+
+    **Raises:** `ValueError` with the line that cannot be used.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"File `{path}` of contacts does not exist.")
+    lines = [
+        (number, line)
+        for number, line in enumerate(text_of(Path(path)).lstrip("\ufeff").splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        raise ValueError(f"File `{path}` of contacts is empty. Its columns are node, along, away, and perhaps against.")
+    delimiter = ";" if ";" in lines[0][1] else ","
+    (first, *header), *rows = (
+        (number, *(field.strip() for field in next(csv.reader([line], delimiter=delimiter)))) for number, line in lines
+    )
+    names = [str(name).lower() for name in header]
+    if len(set(names)) < len(names) or not set(COLUMNS[:3]) <= set(names) <= set(COLUMNS):
+        raise ValueError(
+            f"File `{path}`, line {first}: the columns must be node, along, away, and perhaps against, but are "
+            f"{', '.join(names)}."
+        )
+    if not rows:
+        raise ValueError(f"File `{path}` holds no contact. Write one in each line below the names of the columns.")
+    return [_contact(f"File `{path}`, line {number}", names, fields) for number, *fields in rows]
+
+
+def _contact(here: str, names: list[str], fields: list) -> NodeContact:
+    if len(fields) != len(names):
+        raise ValueError(
+            f"{here}: {len(names)} fields expected ({', '.join(names)}), {len(fields)} found. Mend the line."
+        )
+    row = dict(zip(names, map(str, fields), strict=True))
+    nodes, directions = {}, {}
+    for name in ("node", "against"):
+        text = row.get(name, "")
+        if not text.isdecimal() and (text or name == "node"):
+            raise ValueError(f"{here}: `{name}` must be the number of a node, but is {text!r}. Mend the line.")
+        nodes[name] = int(text) if text else None
+    for name in ("along", "away"):
+        parts = row[name].split()
+        try:
+            found = (
+                tuple(map(float, parts)) if len(parts) > 1 else int(parts[0]) if row[name].isdecimal() else row[name]
+            )
+            _components(found)
+        except ValueError:
+            raise ValueError(
+                f"{here}: `{name}` must be a direction such as x, -z, 2 or three numbers separated by blanks, but is "
+                f"{row[name]!r}. Mend the line."
+            ) from None
+        directions[name] = found
+    return NodeContact(nodes["node"], directions["along"], directions["away"], nodes["against"])
 
 
 def contact_directions(

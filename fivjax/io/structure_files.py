@@ -13,7 +13,7 @@ from ..model.structure_checks import check_matrices
 from .file_matrix import FileMatrix, Label
 from .matrix_files import FileMatrices, read_matrices
 from .model_units import SYSTEMS, in_si
-from .node_contacts import NodeContact, contact_directions, load_direction
+from .node_contacts import NodeContact, contact_directions, load_direction, read_contacts
 
 # Common names of the matrices in files that hold several, in capitals.
 NAMES = {
@@ -35,7 +35,7 @@ def read_structure(
     damping: str | Path | None = None,
     names: Mapping[str, str] | None = None,
     labels: Sequence[tuple[int, int]] | str | Path | None = None,
-    contacts: Sequence[NodeContact] = (),
+    contacts: Sequence[NodeContact] | str | Path = (),
     load: Mapping[tuple[int, int | str], float] | None = None,
     rayleigh: tuple[float, float] = (0.0, 0.0),
 ) -> SparseStructure:
@@ -58,7 +58,7 @@ def read_structure(
     - `names`: the names of the matrices in files that hold several: `{"stiffness": "KAA", "mass": "MAA"}`.
     - `labels`: node and direction of each row where the files do not say (OUTPUT4, Matrix Market, MATLAB, NumPy): pairs, or a
       text file with two columns.
-    - `contacts`: see `fj.NodeContact`.
+    - `contacts`: see `fj.NodeContact`; or a file with the columns node, along, away (directions) and perhaps against (a node).
     - `load`: share of a positive load by node and direction: `{(903, "z"): -1.0}`, without unit.
     - `rayleigh`: damping that is added as a·M + b·K, a in 1/s and b in s.
 
@@ -83,6 +83,7 @@ def read_structure(
     unknown = [role for role in names if role not in NAMES]
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
+    contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
     parts, remarks = _parts(Path(path), mass, damping, names)
     order, numbers, aligned = _aligned(parts, _labels(labels))
     held = np.abs(aligned["stiffness"].diagonal()) >= HELD
