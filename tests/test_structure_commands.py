@@ -169,12 +169,10 @@ def test_contacts_as_spreadsheets_write_them(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_command_of_the_page_runs(folder, monkeypatch, capsys):
-    """Map, cycle and branch at a smaller size."""
+@pytest.mark.parametrize(("command", "smaller"), [("simulate", []), ("map", ["--x", "mu=0.2:0.4:2", "--y", "p=1:2:2"])])
+def test_commands_of_the_page_run(command, smaller, folder, monkeypatch, capsys):
+    """From files to a written result, the map at a smaller size."""
     monkeypatch.undo()
     monkeypatch.chdir(folder)
     monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
-    smaller = {"map": ["--x", "mu=0.2:0.4:2", "--y", "p=1:2:2"], "branch": ["--points", "3"]}
-    for line in COMMANDS:
-        command = line.split()[1]
-        assert cli.main([*words(command), *smaller.get(command, [])]) in (0, 1), capsys.readouterr()
+    assert cli.main([*words(command), *smaller]) == 0, capsys.readouterr()
