@@ -45,8 +45,8 @@ def characteristic_residual(
 
     residual = [jnp.where(found, jax.vmap(determinant)(poles), 0.0)]
     measured = {}
-    for k, (quantity, coordinate) in enumerate(channels):
-        measured.setdefault(coordinate, shapes[:, k] / (poles**2 if quantity == "acceleration" else poles))
+    for k, channel in enumerate(channels):
+        measured.setdefault(channel.coordinate, shapes[:, k] / poles**channel.derivative)
     if set(keep) <= set(measured):
         shape = jnp.stack([measured[coordinate] for coordinate in keep], axis=1)
         shape = shape / jnp.linalg.norm(shape, axis=1, keepdims=True)

@@ -1,167 +1,204 @@
-"""A measured limit cycle beside that of a scene: frequency, harmonics, and fractions of time in the statuses.
+"""A measured limit cycle beside that of a scene: one period's waveform, the frequency, and fractions of time in the statuses.
 
-Those of the recording are fitted to all of its samples, with errors from its noise (`harmonics`); those of the scene are exact,
-from one closed period (`shooting`).
+The recording is folded into one period (`folding`). The scene's cycle is closed (`shooting`), and sampled at the same phases in the
+way in which the recording was: at points, by averages, or through a low-pass. Far from the answer only the first harmonics are
+compared, which do not depend on where the recording begins.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Complex, Float
 
-from ..io.recordings import Averaged, Channel, Recording, averaged
+from ..io.low_pass import bandwidth
+from ..io.recordings import Channel, Recording
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from .harmonics import beating, fitted_harmonics, taper, without_lines
-from .misfit import AbstractMisfit, Compared, sliding_frequencies
-from .noise import noise_of_means
-from .shooting import Cycle, around, settled, unclosed
+from .folding import folded
+from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, sliding_frequencies
+from .noise import LEAST_NOISE
+from .samples import Sampled
+from .shooting import Around, Cycle, around, settled, unclosed, waveform
 
-MOST_HARMONICS = 8
-# The smallest and the largest number of blocks per period: many, because contact after a landing may be short.
-CYCLE_BLOCKS = (28, 48)
-# The number of periods that is enough to resolve the lines of the spectrum.
-CYCLE_PERIODS = 30
 # Units of residuals for rough guesses: of the frequency, relative; of lines, as shares of the largest; of fractions of time.
 ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
-# Errors by aliasing of high lines: in the fitted lines, relative to the largest; and in the frequency, relative.
-FOLDED, FOLDED_FREQUENCY = 1e-4, 1e-7
 # A vibration beats if the sidebands of its fundamental are larger than this, relative to it.
 BEATS = 0.01
+# Phases farther apart than this (turns) do not show a waveform.
+MOST_APART = 1 / 24
+# Samples this many times as far from an event as the next sample are left out, too: the event may move a little during a fit.
+BESIDE = 2.0
+# The most harmonics that a low-pass lets through.
+MOST_THROUGH = 64
 
 
 class CycleMisfit(AbstractMisfit):
-    """A limit cycle, compared by its harmonics and, if they were measured, its fractions of time in the statuses."""
+    """A limit cycle, compared by one period of its waveform and, if they were measured, its fractions of time in the statuses."""
 
     means: Float[Array, "B k"]
-    sigma: Float[Array, " k"]
+    sigma: Float[Array, "B k"]
+    t: Float[Array, " B"]  # of one period
+    kept: Float[Array, "B k"]
     known: dict[str, Array]
-    measured: Float[Array, " h"]
-    whitening: Float[Array, "h h"]
-    fractions: Float[
-        Array, "2 2"
-    ]  # sticking, detached; value and standard deviation, which is infinite if not measured
+    phases: Float[Array, " B"]  # turns
+    times: Float[Array, " B"]  # s after the middle of the recording
+    apart: Float[Array, " B"]  # to the farther neighbour, turns
+    frequency: Float[Array, ""]  # measured, Hz
+    measured: Complex[Array, "h k"]  # its first lines
+    # Sticking, detached; value and standard deviation, which is infinite if not measured.
+    fractions: Float[Array, "2 2"]
     method: AbstractStepper
-    width: Float[Array, ""]  # of a block, s
-    fundamental: Float[Array, "2"]  # measured, of the first channel, at the first block's middle: cosine and sine
-    harmonic_part: Float[Array, "B k"]  # the harmonics in the measured means
+    interval: Float[Array, ""]  # from sample to sample, s
+    response: Complex[Array, " m"] | None  # of the filter, for each line
+    sampled: Sampled
     beating: Float[Array, ""]  # relative size of the sidebands
-    count: int = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
-    projected: int = eqx.field(static=True, default=0)
+    # The shift in time that is left between the phases of the fundamentals, measured and predicted.
+    unknowns: int = eqx.field(static=True, default=1)
 
     @property
-    def frequency(self) -> Float[Array, ""]:
-        """The measured frequency, in Hz."""
-        return self.measured[0]
+    def projected(self) -> int:
+        """The zeros of the sensors."""
+        return len(self.channels)
+
+    @property
+    def numbers(self):
+        return jnp.sum(self.kept) + jnp.sum(jnp.isfinite(self.fractions[:, 1]))
+
+    @property
+    def rows(self) -> int:
+        """The number of rough residuals, which come first; the first is that of the frequency."""
+        return 2 * self.measured.size + 2
 
     def settled(self, scene: Scene) -> Cycle:
         """A guess of the limit cycle on which the scene settles."""
         return settled(scene.replace(**self.known), self.method, self.frequency)
 
-    def compared(self, scene, own: Cycle, share):
-        scene = scene.replace(**self.known)
-        after = around(scene, self.method, own, self.count)
-        lines = self._averaged(after.lines, own.period)
-        found = _referred(1 / own.period, lines)
+    def compared(self, scene, own, share):
+        scene, (cycle, shift) = scene.replace(**self.known), own
+        count = self.measured.shape[0] if self.response is None else self.response.shape[0]
+        after = around(scene, self.method, cycle, count)
+        lines = self._observed(after, cycle.period)
         times = self.fractions[:, 0] - after.fractions
-        exactly = jnp.concatenate([self.whitening @ (self.measured - found), times / self.fractions[:, 1]])
-        size = self.measured[1]
-        error = jnp.full(found.shape, ROUGH_LINES * size).at[0].set(ROUGH_FREQUENCY * self.measured[0])
-        rough = times / jnp.maximum(self.fractions[:, 1], ROUGH_FRACTIONS)
-        roughly = jnp.concatenate([(self.measured - found) / error, rough])
-        residual = jnp.where(share < 1, roughly, exactly)
-        return Compared(residual, self._in_time(lines, own.period), unclosed(scene, own, after), after.contact)
+        rough = self._roughly(1 / cycle.period, lines[: len(self.measured)])
+        rough = jnp.concatenate([rough, times / jnp.maximum(self.fractions[:, 1], ROUGH_FRACTIONS)])
+        # Where in its period the scene is at each of the measured phases.
+        shifted = jnp.angle(self.measured[0, 0]) - jnp.angle(lines[0, 0])
+        turns = self.phases + self.times * (1 / cycle.period - self.frequency)
+        turns = turns + shifted / (2 * jnp.pi) + OFFSET_UNIT * shift[0] / cycle.period
+        nothing = jnp.zeros_like(self.means), jnp.zeros(self.means.shape, bool)
+        model, touched = jax.lax.cond(share < 1, lambda: nothing, lambda: self._waveform(scene, cycle, lines, turns))
+        left = self.means - model
+        weight = self.kept / self.sigma**2
+        zeros = jnp.sum(weight * left, axis=0) / jnp.maximum(jnp.sum(weight, axis=0), 1e-300)
+        exact = jnp.concatenate([times / self.fractions[:, 1], (self.kept * (left - zeros) / self.sigma).ravel()])
+        residual = jnp.concatenate([jnp.where(share < 1, rough, 0.0), jnp.where(share < 1, 0.0, exact)])
+        return Compared(residual, model + zeros, touched, unclosed(scene, cycle, after), after.contact)
 
-    def _averaged(self, lines, period):
-        """Fourier coefficients of the channels' means over blocks."""
-        orders = jnp.arange(1, self.count + 1)
-        columns = []
-        for quantity, coordinate in self.channels:
-            rate = 2j * jnp.pi * orders / period if quantity == "acceleration" else 1.0
-            columns.append(rate * lines[:, coordinate] * jnp.sinc(orders * self.width / period))
-        return jnp.stack(columns, axis=1)
+    def _observed(self, after: Around, period):
+        """Fourier coefficients of the channels as they are sampled."""
+        orders = jnp.arange(1, after.lines.shape[0] + 1)
+        rate, columns = 2j * jnp.pi * orders / period, []
+        for channel in self.channels:
+            line = after.lines[:, channel.coordinate] * rate ** (channel.derivative - 1)
+            if channel.derivative == 2 and not (self.sampled.filtered or self.sampled.averages):
+                line = line - after.impulses[:, channel.coordinate]
+            columns.append(line)
+        lines = jnp.stack(columns, axis=1)
+        if self.sampled.averages:
+            lines = lines * jnp.sinc(orders * self.interval / period)[:, None]
+        return lines if self.response is None else lines * self.response[:, None]
 
-    def _in_time(self, lines, period):
-        """The waveform of these coefficients over the blocks of the recording, in phase with it."""
-        orders = jnp.arange(1, self.count + 1)
-        phase = jnp.angle(self.fundamental[0] - 1j * self.fundamental[1]) - jnp.angle(lines[0, 0])
-        turns = 2 * jnp.pi * self.width / period * jnp.arange(self.means.shape[0])[:, None] + phase
-        return (jnp.exp(1j * turns * orders) @ lines).real
+    def _roughly(self, frequency, lines):
+        found, wanted = _referred(lines), _referred(self.measured)
+        size = jnp.abs(self.measured[0, 0])
+        step = (self.frequency - frequency) / (ROUGH_FREQUENCY * self.frequency)
+        apart = (wanted - found) / (ROUGH_LINES * size)
+        return jnp.concatenate([step[None], apart.real.ravel(), apart.imag.ravel()[1:]])
+
+    def _waveform(self, scene, cycle: Cycle, lines, turns):
+        """The channels at these turns, as they are sampled; and where they would jump if an event moved."""
+        if self.response is not None:
+            orders = jnp.arange(1, lines.shape[0] + 1)
+            waves = jnp.exp(2j * jnp.pi * turns[:, None] * orders)
+            return (waves @ lines).real, jnp.zeros(self.means.shape, bool)
+        if not self.sampled.averages:
+            found = waveform(scene, self.method, cycle, _in_period(turns) * cycle.period, self.channels)
+            return found.values, self._touched(found.from_changes, found.from_landings, cycle)
+        # An average is a change of what it is the derivative of; that of a displacement is Simpson's, whose error is of fourth
+        # order in the interval.
+        half = 0.5 * self.interval / cycle.period
+        around = _in_period(jnp.concatenate([turns - half, turns, turns + half]))
+        below = tuple(Channel(QUANTITY_BELOW[c.quantity], c.coordinate) for c in self.channels)
+        found = waveform(scene, self.method, cycle, around * cycle.period, below)
+        before, middle, later = jnp.split(found.values, 3)
+        columns = [
+            (later[:, k] - before[:, k]) / self.interval
+            if channel.derivative
+            else (before[:, k] + 4 * middle[:, k] + later[:, k]) / 6
+            for k, channel in enumerate(self.channels)
+        ]
+        ends = [jnp.minimum(*jnp.split(part, 3, axis=1)[::2]) for part in (found.from_changes, found.from_landings)]
+        return jnp.stack(columns, axis=1), self._touched(*ends, cycle)
+
+    def _touched(self, changes, landings, cycle: Cycle) -> Bool[Array, "B k"]:
+        reach = BESIDE * self.apart * cycle.period
+        accelerations, velocities = self.sampled.jumping(self.channels)
+        near = [jnp.any(part < reach, axis=0)[:, None] for part in (changes, landings)]
+        return (near[0] & accelerations) | (near[1] & velocities)
 
 
-def _referred(frequency, found):
-    """`harmonics.referred`, written so that JAX can differentiate it."""
-    size = jnp.sqrt(found[0, 0].real ** 2 + found[0, 0].imag ** 2)
-    turned = found * (found[0, 0].conj() / size) ** jnp.arange(1, found.shape[0] + 1)[:, None]
-    rest = turned.ravel()[1:]
-    return jnp.concatenate([jnp.stack([frequency, size]), rest.real, rest.imag])
+# What each quantity is the derivative of.
+QUANTITY_BELOW = {"acceleration": "velocity", "velocity": "displacement", "displacement": "displacement"}
 
 
-def misfit_of_cycle(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> CycleMisfit:
-    """A recording of a limit cycle, averaged over blocks, ready to be compared."""
-    width = float(blocks.edges[1] - blocks.edges[0])
-    sigma = noise_of_means(recording, blocks)
-    lowest, highest = _searched(scene, recording)
-    frequency = fitted_harmonics(blocks.means, width, 1, lowest, highest, sigma).frequency
-    count = int(np.clip(0.3 / (width * frequency), 1, MOST_HARMONICS))
-    lowest, highest = 0.6 * frequency, 1.6 * frequency
-    frequency = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma).frequency
-    left, lines = without_lines(blocks.means, width, frequency, count)
-    if recording.noise is None:
-        # With few samples per period, differences contain signal; then the residuals of the harmonics are the better bound.
-        sigma = np.minimum(sigma, np.sqrt(np.sum(left**2, axis=0) / max(len(left) - 2 * count - 1, 1)))
-    measured = fitted_harmonics(blocks.means, width, count, lowest, highest, sigma)
+def _in_period(turns):
+    """Whole turns are taken away; rounding may leave one."""
+    rest = turns - jax.lax.stop_gradient(jnp.floor(turns))
+    return jnp.where(rest >= 1, rest - 1, rest)
+
+
+def _referred(lines: Complex[Array, "h k"]) -> Complex[Array, "h k"]:
+    """The lines for a time origin at which the first channel's fundamental has phase zero."""
+    size = jnp.sqrt(lines[0, 0].real ** 2 + lines[0, 0].imag ** 2)
+    return lines * (lines[0, 0].conj() / size) ** jnp.arange(1, lines.shape[0] + 1)[:, None]
+
+
+def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene) -> CycleMisfit:
+    """A recording of a limit cycle, folded into one period, ready to be compared."""
+    modes, interval = sliding_frequencies(scene, recording), 1 / recording.rate
+    # Around the sliding modes, because a guess with a spring wrong by 30 % has a frequency wrong by 16 %.
+    fold = folded(recording.values, recording.rate, 0.6 * modes.min(), 1.6 * modes.max(), recording.noise)
+    noise = np.maximum(fold.noise, LEAST_NOISE * recording.values.std(axis=0) + 1e-300)
     fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
-    of_samples = sigma * np.sqrt(blocks.per_block)
-    folded = np.full(len(measured.values), FOLDED * measured.values[1])
-    folded[0] = FOLDED_FREQUENCY * measured.frequency
+    response = None
+    if recording.filter is not None:
+        highest = bandwidth(recording.filter, MOST_THROUGH * fold.frequency)
+        count = int(np.clip(np.ceil(highest / fold.frequency), len(fold.lines), MOST_THROUGH))
+        response = jnp.asarray(recording.filter(fold.frequency * np.arange(1, count + 1)), complex)
     return CycleMisfit(
-        means=jnp.asarray(blocks.means),
-        sigma=jnp.asarray(sigma),
+        means=jnp.asarray(fold.means),
+        sigma=jnp.asarray(noise / np.sqrt(fold.counts)[:, None]),
+        t=jnp.asarray(fold.phases / fold.frequency),
+        kept=jnp.ones(fold.means.shape),
         known={name: jnp.asarray(value) for name, value in recording.known.items()},
-        measured=jnp.asarray(measured.values),
-        whitening=jnp.asarray(np.linalg.inv(np.linalg.cholesky(measured.covariance + np.diag(folded**2)))),
+        phases=jnp.asarray(fold.phases),
+        times=jnp.asarray(fold.times),
+        apart=jnp.asarray(fold.apart),
+        frequency=jnp.asarray(fold.frequency),
+        measured=jnp.asarray(fold.lines),
         fractions=jnp.asarray(fractions),
         method=method,
-        width=jnp.asarray(width),
-        fundamental=jnp.asarray([lines[0, 0].real, -lines[0, 0].imag]),
-        harmonic_part=jnp.asarray(blocks.means - left - (blocks.means - left).mean(axis=0)),
-        beating=jnp.asarray(beating(recording.values, 1 / recording.rate, frequency, of_samples)),
-        count=count,
+        interval=jnp.asarray(interval),
+        response=response,
+        sampled=_way(recording, interval),
+        beating=jnp.asarray(fold.sidebands),
         channels=recording.channels,
     )
 
 
-def cycle_rate(recording: Recording, scene: Scene) -> float:
-    """Blocks per second for a limit cycle: a number per period for which aliases of averaging lie between its lines."""
-    blocks = averaged(recording, 16 * sliding_frequencies(scene, recording).max())
-    width = float(blocks.edges[1] - blocks.edges[0])
-    frequency = fitted_harmonics(
-        blocks.means, width, 1, *_searched(scene, recording), noise_of_means(recording, blocks)
-    ).frequency
-    samples = recording.rate / frequency
-    choices = np.arange(max(1, int(samples / CYCLE_BLOCKS[1])), max(2, int(samples / CYCLE_BLOCKS[0]) + 1))
-    return recording.rate / float(choices[np.argmin([_folded(samples / choice) for choice in choices])])
-
-
-def _folded(per_period: float) -> float:
-    """How much of the lines around each multiple of the block rate appears in the fitted lines, in units of a flat spectrum.
-
-    Averaging over r blocks per period leaves, in the line h, a share h/(m r) of the lines near m times the block rate; the
-    taper suppresses aliases far enough from the line.
-    """
-    m = np.arange(1, 13)
-    aside = np.abs(m * per_period - np.round(m * per_period)) * CYCLE_PERIODS
-    t = np.linspace(0, 1, 401)
-    weight = taper(len(t))
-    seen = np.abs(np.exp(2j * np.pi * np.outer(aside, t)) @ weight) / weight.sum()
-    return float(np.sum(seen * MOST_HARMONICS / (m * per_period)))
-
-
-def _searched(scene: Scene, recording: Recording) -> tuple[float, float]:
-    """The range (Hz) in which the fundamental is sought: around the sliding modes, because a guess with a spring wrong by 30 %
-    has a frequency wrong by 16 %.
-    """
-    modes = sliding_frequencies(scene, recording)
-    return 0.6 * modes.min(), 1.6 * modes.max()
+def _way(recording: Recording, interval: float) -> Sampled:
+    """How single samples are taken; the filter is applied to lines."""
+    averages, none = recording.sampling == "averages", None if recording.filter is None else jnp.zeros(1, complex)
+    return Sampled(jnp.zeros(()), jnp.asarray(interval), none, None, 1, 1, averages)

@@ -9,27 +9,27 @@ number. If the residuals are not noise (`goodness_of_fit`), no parameter has a s
 
 from collections.abc import Iterable, Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import following, stage, tick
-from ..io.recordings import Averaged, Recording, averaged
+from ..io.recordings import SHORTEST, Averaged, Recording, averaged
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, refuse_vector_contacts, sliding_equilibrium
 from ..model.sliding import contact_coordinates
+from ..simulation.start import start_state
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .conclusion import concluded, not_tried
-from .cycle_misfit import BEATS, cycle_rate, misfit_of_cycle
+from .cycle_misfit import BEATS, MOST_APART, misfit_of_cycle
 from .initial_guesses import latin_hypercube, near_frequencies
 from .parameters import FreeParameters, refuse_one_for_each_contact
 from .problem import Problem
 from .result import Calibration, FitOutcome
 from .search import Search
 from .time_offsets import slid_throughout
-from .waveform_misfit import misfit_of_waveform
+from .waveform_misfit import misfit_of_waveform, starts_unknown
 
 # The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
 SCREENED = 32
@@ -67,8 +67,8 @@ def calibrate(
     - `starts`: the number of first guesses: the scene's own, and others within `spread` (relative) around it, drawn with
       `seed`. For limit cycles there are at least 32, with sliding modes at the measured frequency.
     - `rate`: recordings are averaged over so many blocks per second before they are compared; unless given, 16 per period of
-      the scene's highest sliding mode, or 28 to 48 per period of a limit cycle. The model is averaged exactly over the same
-      blocks.
+      the scene's highest sliding mode. The model is sampled as the recording was, and averaged over the same blocks. Limit
+      cycles are not: they are folded into one period.
     - `identifiable_within`: the largest standard deviation, relative to the parameter, for which it counts as identifiable.
     - `method`: how to step, `EventExact()` unless given. Gradients of `WhereSwitched` are wrong after contact events.
 
@@ -108,22 +108,24 @@ def calibrate(
     if rate is not None:
         arguments.real_number("rate", rate, above=0)
 
-    blocks = [_blocks(scene, recording, k, rate, len(parameters.names)) for k, recording in enumerate(recordings)]
-    moved = tuple(r.regime == "kick" and r.offset[0] < r.offset[1] for r in recordings)
-    references = jnp.array([r.offset[0] for r in recordings])
+    blocks = [
+        None if recording.regime == "limit cycle" else _blocks(scene, recording, k, rate, len(parameters.names))
+        for k, recording in enumerate(recordings)
+    ]
     cycles = all(r.regime == "limit cycle" for r in recordings)
     kicked = any(r.regime == "kick" for r in recordings)
+    slides = scene.friction.constant and not any(r.y0 is not None or starts_unknown(scene, r) for r in recordings)
     # A response to a kick is first assumed to slide all the time, which is fast to compute and checked afterwards.
-    for uneventful in (True, False) if kicked and scene.friction.constant else (False,):
+    for uneventful in (True, False) if kicked and slides else (False,):
         misfits = tuple(
-            misfit_of_cycle(r, b, method, scene)
-            if r.regime == "limit cycle"
-            else misfit_of_waveform(r, b, method, scene, uneventful)
+            misfit_of_cycle(r, method, scene) if b is None else misfit_of_waveform(r, b, method, scene, uneventful)
             for r, b in zip(recordings, blocks, strict=True)
         )
-        problem = Problem(scene, parameters, misfits, references, moved)
+        problem = Problem(scene, parameters, misfits)
+        if any(np.max(cycle.apart) > MOST_APART for cycle in problem.cycles):
+            return not_tried(problem, recordings, FitOutcome.TOO_SLOW)
         if any(cycle.beating > BEATS for cycle in problem.cycles):
-            return not_tried(problem, recordings, blocks, FitOutcome.BEATS)
+            return not_tried(problem, recordings, FitOutcome.BEATS)
         if cycles:
             frequencies = [float(cycle.frequency) for cycle in problem.cycles]
             half = max(int(starts), SCREENED) // 2
@@ -138,7 +140,7 @@ def calibrate(
             for number, words in enumerate(search.run()):
                 tick(min(number, 1))
                 stage(words)
-        result = concluded(search, blocks, float(identifiable_within))
+        result = concluded(search, float(identifiable_within))
         # If there is no signal, contact events do not explain it any better.
         if not uneventful or result.outcome is FitOutcome.NO_SIGNAL:
             break
@@ -150,7 +152,8 @@ def calibrate(
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:
     """Recording k averaged over blocks; refused if there are too few."""
-    own = _rate(scene, recording) if rate is None else rate
+    modes = np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix))
+    own = BLOCKS_PER_PERIOD * float(np.abs(modes.imag).max()) / (2 * np.pi) if rate is None else rate
     if round(recording.rate / own) > len(recording.t):
         raise ValueError(
             f"Recording {k} is too short: not one block at {own:g} per second. Raise `rate`, or record for longer."
@@ -162,13 +165,6 @@ def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, para
             f"{parameters} parameters. Raise `rate`, or record for longer."
         )
     return block
-
-
-def _rate(scene: Scene, recording: Recording) -> float:
-    """Blocks per second that resolve the scene's vibrations."""
-    frequencies = np.abs(np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix)).imag) / (2 * np.pi)
-    rate = BLOCKS_PER_PERIOD * float(frequencies.max())
-    return cycle_rate(recording, scene) if recording.regime == "limit cycle" else rate
 
 
 def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
@@ -194,4 +190,10 @@ def _check_recording(scene: Scene, recording: Recording, k: int) -> None:
             raise ValueError(
                 f"Recording {k} has a channel `{channel}`: the normal coordinate does not move while sliding."
             )
-    sliding_equilibrium(scene.replace(**recording.known))
+    own = scene.replace(**recording.known)
+    if recording.regime == "limit cycle" and len(recording.t) < 2 * SHORTEST:
+        raise ValueError(f"Recording {k} is too short: {len(recording.t)} samples of a limit cycle. Record for longer.")
+    if recording.y0 is not None:
+        start_state(own, recording.y0)
+    elif not starts_unknown(own, recording):
+        sliding_equilibrium(own)

@@ -4,6 +4,7 @@ A wrong model shows in at least one of them. Both are compared with their own sc
 standard deviation of sqrt(2/N), a correlation of N of them one of 1/sqrt(N). So long recordings reveal small errors of a model.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -40,14 +41,16 @@ class WhatIsLeft(NamedTuple):
         return ", ".join(said)
 
 
-def what_is_left(squares: float, freedom: int, waveforms: list[Float[np.ndarray, "B k"]], stated: bool) -> WhatIsLeft:
-    """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings
-    that are compared by their waveform; `stated`: whether the noise was given.
+def what_is_left(
+    squares: float, freedom: int, waveforms: Iterable[Iterable[Float[np.ndarray, " B"]]], stated: bool
+) -> WhatIsLeft:
+    """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings, one
+    for each channel; `stated`: whether the noise was given.
     """
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
-    found = [_likeness(column) for left in waveforms for column in left.T]
+    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
     return WhatIsLeft(
         misfit=misfit,
@@ -58,10 +61,10 @@ def what_is_left(squares: float, freedom: int, waveforms: list[Float[np.ndarray,
     )
 
 
-def exceeds_noise(means: Float[np.ndarray, "B k"], sigma: Float[np.ndarray, " k"]) -> bool:
+def exceeds_noise(means: Float[np.ndarray, "B k"], sigma: Float[np.ndarray, "*B k"]) -> bool:
     """Whether a recording is more than white noise of this size around a constant."""
     scaled = (means - means.mean(axis=0)) / sigma
-    found = what_is_left(float(np.sum(scaled**2)), scaled.size - scaled.shape[1], [scaled], stated=False)
+    found = what_is_left(float(np.sum(scaled**2)), scaled.size - scaled.shape[1], [scaled.T], stated=False)
     return not found.is_noise
 
 

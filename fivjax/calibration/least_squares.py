@@ -42,6 +42,7 @@ class Minimum(NamedTuple):
     at: Evaluated
     arrived: bool
     evaluations: int
+    left_out: Any = None  # what was not compared
 
 
 def minimise(

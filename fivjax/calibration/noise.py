@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..io.recordings import Averaged, Recording
-from .harmonics import taper
 
 # The share of spectral lines that counts as quiet: the lowest quarter; and the power of white noise at its upper end, relative
 # to the mean.
@@ -34,9 +33,14 @@ def noise_of_means(recording: Recording, blocks: Averaged) -> Float[np.ndarray, 
     return np.maximum(sigma / np.sqrt(blocks.per_block), least)
 
 
+def taper(count: int) -> Float[np.ndarray, " count"]:
+    """A weight over evenly spaced instants whose spectrum falls off fast: below a thousandth from the fourth line on."""
+    return np.hanning(count) ** 2
+
+
 def estimated_noise(samples: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " k"]:
     """Standard deviations of single samples by channel, estimated from the recording."""
-    return np.maximum(np.minimum(_between_samples(samples), _between_lines(samples)), _rounding(samples))
+    return np.maximum(np.minimum(_between_samples(samples), _between_lines(samples)), rounding(samples))
 
 
 def _between_samples(samples):
@@ -52,7 +56,7 @@ def _between_lines(samples):
     return np.sqrt(np.quantile(power[1:], QUIET, axis=0) / QUIET_POWER)
 
 
-def _rounding(samples):
+def rounding(samples):
     """The rounding of a sensor or file with few digits: samples on a grid have errors of up to half its step."""
     steps = [np.diff(np.unique(column)) for column in samples.T]
     return np.array([step.min() / np.sqrt(12.0) if step.size else 0.0 for step in steps])

@@ -5,13 +5,14 @@ mode; it serves every guess, every step and every fit with arrays of the same sh
 (`cycle_closing`).
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
@@ -19,7 +20,7 @@ from ..model.scene import Scene
 from .cycle_closing import corrected, is_closed, predicted
 from .cycle_misfit import CycleMisfit
 from .least_squares import Evaluated
-from .misfit import OFFSET_UNIT, AbstractMisfit
+from .misfit import AbstractMisfit
 from .parameters import FreeParameters
 from .shooting import Cycle, first_tangential
 
@@ -37,21 +38,36 @@ class Problem(eqx.Module):
     scene: Scene
     parameters: FreeParameters
     misfits: tuple[AbstractMisfit, ...]
-    references: Float[Array, " r"]  # time offsets from which the unknown ones are measured, s
-    moved: tuple[bool, ...] = eqx.field(static=True)  # which recordings have an unknown offset
 
     @property
     def size(self) -> int:
-        """The number of free parameters; unknown time offsets come after them."""
+        """The number of free parameters; the recordings' own unknowns come after them."""
         return len(self.parameters.names)
 
-    def offsets(self, x) -> list:
-        """Time offsets of all recordings, in s."""
-        found, at = [], self.size
-        for k, moved in enumerate(self.moved):
-            found.append(self.references[k] + OFFSET_UNIT * x[at] if moved else self.references[k])
-            at += moved
-        return found
+    @property
+    def places(self) -> list[slice]:
+        """Where each recording's own unknowns are."""
+        ends = np.cumsum([self.size, *(m.unknowns for m in self.misfits)])
+        return [slice(int(begin), int(end)) for begin, end in pairwise(ends)]
+
+    def own(self, x) -> list:
+        """What the own unknowns say of each recording."""
+        return [m.own(x[place]) for m, place in zip(self.misfits, self.places, strict=True)]
+
+    def first(self, u: np.ndarray) -> np.ndarray:
+        """A point with these parameters, and first values of the recordings' own unknowns."""
+        scene = self.at(jnp.asarray(u))
+        return np.concatenate([u, *(m.first(scene) for m in self.misfits)])
+
+    def without(self, touched: list[np.ndarray]) -> "Problem":
+        """The problem without blocks that are next to a jump."""
+        kept = [jnp.asarray(~np.asarray(part), float) for part in touched]
+        return eqx.tree_at(lambda own: [m.kept for m in own.misfits], self, kept)
+
+    @property
+    def numbers(self) -> float:
+        """The number of measured numbers that are compared."""
+        return float(sum(float(m.numbers) for m in self.misfits))
 
     def at(self, u) -> Scene:
         """The scene with these parameters."""
@@ -65,7 +81,7 @@ class Problem(eqx.Module):
     @property
     def frequency_rows(self) -> list[int]:
         """Indices of the residuals of the frequencies, if all recordings are of limit cycles."""
-        lengths = [m.measured.shape[0] + m.fractions.shape[0] for m in self.cycles]
+        lengths = [m.rows + 2 + m.means.size for m in self.cycles]
         return [sum(lengths[:k]) for k in range(len(lengths))]
 
     def coarse(self, u: np.ndarray, u0: np.ndarray) -> Evaluated:
@@ -108,6 +124,7 @@ class About(NamedTuple):
     follow: tuple[Float[Array, "state j"], ...]  # derivatives of each cycle's unknowns by the parameters
     systems: tuple[Float[Array, "state state"], ...]  # derivatives of each cycle's closing equations by its unknowns
     models: list[Float[Array, "B k"]]
+    touched: list[Bool[Array, "B k"]]
 
 
 class _Compared(NamedTuple):
@@ -123,10 +140,10 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
     tangential = problem.tangential
 
     def beside(unknowns):
-        x, own = unknowns[:size], list(problem.offsets(unknowns[:size]))
+        x, own = unknowns[:size], problem.own(unknowns[:size])
         places = [k for k, m in enumerate(problem.misfits) if isinstance(m, CycleMisfit)]
         for i, k in enumerate(places):
-            own[k] = cycles[i].at(unknowns[size + i * count : size + (i + 1) * count], tangential)
+            own[k] = cycles[i].at(unknowns[size + i * count : size + (i + 1) * count], tangential), own[k]
         scene = problem.at(x[: problem.size])
         found = [m.compared(scene, o, share) for m, o in zip(problem.misfits, own, strict=True)]
         # Far from the answer, the harmonics of a limit cycle may not determine all parameters.
@@ -134,10 +151,11 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
         residual = jnp.concatenate([*(one.residual for one in found), towards])
         unclosed = [found[k].unclosed for k in places]
         contacts = [found[k].contact for k in places]
-        return jnp.concatenate([residual, *unclosed]), (residual, unclosed, contacts, [one.model for one in found])
+        seen = [one.model for one in found], [one.touched for one in found]
+        return jnp.concatenate([residual, *unclosed]), (residual, unclosed, contacts, seen)
 
     unknowns = jnp.concatenate([x, *(cycle.unknowns(tangential) for cycle in cycles)])
-    slopes, (residual, unclosed, contacts, models) = jax.jacfwd(beside, has_aux=True)(unknowns)
+    slopes, (residual, unclosed, contacts, seen) = jax.jacfwd(beside, has_aux=True)(unknowns)
     rows = residual.shape[0]
     jacobian, correction = slopes[:rows, :size], jnp.zeros(())
     better, follow, systems = [], [], []
@@ -154,7 +172,7 @@ def _compared(problem: Problem, x: Float[Array, " j"], x0, share, cycles: tuple[
         closer, moved = corrected(problem.scene.structure, cycle, -solved[:, -1], gap, contact)
         better.append(closer)
         correction = jnp.maximum(correction, moved)
-    about = About(x, tuple(better), tuple(follow), tuple(systems), models)
+    about = About(x, tuple(better), tuple(follow), tuple(systems), *seen)
     return _Compared(residual, jacobian, correction, about)
 
 

@@ -32,6 +32,10 @@ class FitOutcome(enum.StrEnum):
         "not fitted: a recording of a limit cycle does not repeat, it beats or has not settled, so it has no harmonics to "
         "compare; record it later or with a slower belt, or record how it starts, as a kick or as sliding"
     )
+    TOO_SLOW = (
+        "not fitted: sampled too slowly for the contact's events, whose instants then decide what most samples are; record at a "
+        "higher rate, or through an anti-alias filter and name it with `filter`"
+    )
     UNSTABLE = (
         "not stable: the limit cycle that fits best would not last in this scene, so it is not what was measured; start "
         "closer, or free what differs from the scene"
@@ -60,7 +64,9 @@ class Calibration(eqx.Module):
     ]  # of the Jacobian, in units of the noise per relative change of a parameter; including time offsets
     offsets: tuple[tuple[float, float] | None, ...]  # value and standard deviation, s; None for recordings without one
     recordings: tuple[Recording, ...]
-    t: tuple[np.ndarray, ...]  # middle of the blocks, s after the recording's first sample
+    t: tuple[
+        np.ndarray, ...
+    ]  # middle of the blocks, s after the recording's first sample; of a cycle, s within its period
     measured: tuple[np.ndarray, ...]  # block means, (B, k)
     fitted: tuple[np.ndarray, ...]
     noise: tuple[np.ndarray, ...]  # standard deviation of a block mean, by channel
@@ -154,7 +160,7 @@ class Calibration(eqx.Module):
             dataset = dataset.assign_coords(
                 {dims[0]: self.t[k], dims[1]: [str(channel) for channel in recording.channels]}
             )
-            dataset[f"measured_{k}"].attrs["regime"] = recording.regime
+            dataset[f"measured_{k}"].attrs.update(regime=recording.regime, sampling=recording.sampling)
         dataset = labelled(dataset, self.scene)
         dataset.attrs.update(outcome=str(self.outcome), misfit=self.misfit, what_is_left=str(self.left))
         return dataset

@@ -5,8 +5,10 @@
 3. The waveform is fitted over growing windows, from the best few guesses.
 4. The best fit is tried again some periods earlier and later.
 
+Every fit leaves out what is next to a jump of the motion that it starts from; where it ends with others, it goes on without those.
+
 If all recordings are of limit cycles, guesses that have a limit cycle are first brought to the measured frequency. Then the
-harmonics are fitted, first roughly and then to the noise, from one guess after the other until the residuals are noise.
+harmonics are fitted roughly and then the waveform, from one guess after the other until the residuals are noise.
 """
 
 from collections.abc import Iterator
@@ -21,6 +23,7 @@ from .goodness_of_fit import what_is_left
 from .least_squares import Minimum, minimise
 from .problem import About, Problem
 from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_aside
+from .waveform_misfit import KickMisfit
 
 # Number of guesses that go on from the coarse residuals to the waveform.
 KEPT = 4
@@ -33,6 +36,8 @@ WINDOWS = (0.15, 0.4, 1.0)
 # parallel modes leaves a thousandth.
 EARLY_TOLERANCE, FINAL_TOLERANCE = 0.1, 1e-2
 MOST_EVALUATIONS = 60
+# The least share of a recording that a fit compares: where more is next to jumps, the rate is too low for the contact's events.
+LEAST_KEPT = 0.5
 # A candidate is given up after a window if its sum of squares, relative to the best, is larger than this.
 HOPELESSLY_WORSE = 25.0
 
@@ -78,7 +83,7 @@ class Search:
         A scene far from the answer may have no limit cycle, and no derivative leads to one.
         """
         found: list[tuple[float, Candidate]] = []
-        for guess in self.guesses:
+        for guess in map(self.problem.first, self.guesses):
             x, about = guess, None
             for _ in range(1 + FREQUENCY_STEPS):
                 at = self.problem.compared(x, guess, WINDOWS[0], about)
@@ -92,16 +97,18 @@ class Search:
         found.sort(key=lambda one: one[0])
         kept = _distinct([one.x for _, one in found], ALIKE_CYCLES)[:MOST_IN_TURN]
         # If no guess has a limit cycle, the fit ends with the scene's own parameters and an outcome that says so.
-        return [one for _, one in found if any(one.x is x for x in kept)] or [Candidate(self.guesses[0], None)]
+        return [one for _, one in found if any(one.x is x for x in kept)] or [
+            Candidate(self.problem.first(self.guesses[0]), None)
+        ]
 
     def _fitted_in_turn(self, candidates: list[Candidate]) -> None:
         """Fit from one candidate after the other until the residuals are noise."""
         for k, candidate in enumerate(candidates):
             rough = self.fit_from(candidate, WINDOWS[0], EARLY_TOLERANCE)
             found = self.fit_from(Candidate(rough.x, rough.at.about))
-            if k == 0 or found.at.cost < self.best.at.cost:
+            if k == 0 or self.cost(found) < self.cost(self.best):
                 self.best = found
-            squares, freedom = found.at.cost, max(found.at.residual.size - 2 * found.x.size, 1)
+            squares, freedom = found.at.cost, max(self.compared_numbers(found) - found.x.size, 1)
             if found.arrived and not what_is_left(squares, freedom, [], stated=False).larger:
                 break
 
@@ -115,53 +122,82 @@ class Search:
             )
             self.evaluations += found[-1].evaluations
         best_first = [one.x for one in sorted(found, key=lambda one: one.at.cost)]
-        return [Candidate(x, None) for x in _distinct([*best_first, *self.guesses])[:KEPT]]
+        return [Candidate(self.problem.first(x), None) for x in _distinct([*best_first, *self.guesses])[:KEPT]]
 
     def _with_offsets(self, candidates: list[Candidate]) -> list[Candidate]:
         """The candidates with the time offsets at which each agrees best, over the whole recording or its beginning."""
-        moved = [k for k, one in enumerate(self.problem.moved) if one]
+        moved = self.moved
         if not moved:
             return candidates
         chosen = [one.x for one in candidates[: KEPT_WITH_OFFSETS // len(WINDOWS)]]
-        offsets = [best_offsets(self.problem, k, self.recordings[k].offset, chosen, WINDOWS) for k in moved]
-        # (candidate, window, recording)
-        every = np.stack(offsets, axis=-1)
-        return [
-            Candidate(np.concatenate([x, every[i, j]]), None) for i, x in enumerate(chosen) for j in range(len(WINDOWS))
-        ]
+        points = [x[: self.problem.size] for x in chosen]
+        offsets = {k: best_offsets(self.problem, k, self.recordings[k].offset, points, WINDOWS) for k in moved}
+        found = []
+        for i, x in enumerate(chosen):
+            for j in range(len(WINDOWS)):
+                begin = x.copy()
+                for k in moved:
+                    begin[self.problem.places[k]] = offsets[k][i, j]
+                found.append(Candidate(begin, None))
+        return found
 
     def _fitted(self, candidates: list[Candidate], share: float) -> list[Candidate]:
         """Fits from all candidates, the best first; `best` is that of the last call."""
         tolerance = EARLY_TOLERANCE if share < WINDOWS[-1] else FINAL_TOLERANCE
         found = [self.fit_from(one, share, tolerance) for one in candidates]
-        found.sort(key=lambda one: one.at.cost)
+        found.sort(key=self.cost)
         self.best = found[0]
-        good = [one for one in found if one.at.cost <= HOPELESSLY_WORSE * self.best.at.cost]
+        good = [one for one in found if self.cost(one) <= HOPELESSLY_WORSE * self.cost(self.best)]
         kept = _distinct([one.x for one in good])
         return [Candidate(one.x, one.at.about) for one in good if any(one.x is x for x in kept)]
 
     def _other_periods(self) -> None:
-        for k in [k for k, one in enumerate(self.problem.moved) if one]:
-            place = self.problem.size + int(np.sum(self.problem.moved[:k]))
+        for k in self.moved:
+            place = self.problem.places[k].start
             for _ in range(MOST_ROUNDS):
                 before = self.best
                 tried, half = periods_aside(self.problem, k, self.recordings[k].offset, before.x)
-                self.best = min([before, *(self.fit_from(Candidate(x, None)) for x in tried)], key=lambda m: m.at.cost)
+                self.best = min([before, *(self.fit_from(Candidate(x, None)) for x in tried)], key=self.cost)
                 if abs(self.best.x[place] - before.x[place]) <= half:
                     break
 
+    @property
+    def moved(self) -> list[int]:
+        """The recordings whose time offset is unknown."""
+        return [
+            k for k, m in enumerate(self.problem.misfits) if isinstance(m, KickMisfit) and m.unknowns and not m.free
+        ]
+
     def fit_from(self, candidate: Candidate, share: float = WINDOWS[-1], tolerance: float = FINAL_TOLERANCE) -> Minimum:
-        """The minimum that one candidate leads to."""
-        x0 = candidate.x
-        found = minimise(
-            lambda x, about: self.problem.compared(x, x0, share, about),
-            x0,
-            candidate.about,
-            tolerance,
-            MOST_EVALUATIONS,
-        )
-        self.evaluations += found.evaluations
-        return found
+        """The minimum that one candidate leads to, without what is next to a jump there."""
+        x0, about = candidate
+        at = self.problem.compared(x0, x0, share, about)
+        self.evaluations += 1
+        found, left_out = Minimum(x0, at, False, 1), at.about.touched
+        for _ in range(MOST_ROUNDS):
+            problem = self.problem.without(left_out)
+            found = minimise(
+                lambda x, about, problem=problem: problem.compared(x, x0, share, about),
+                found.x,
+                found.at.about,
+                tolerance,
+                MOST_EVALUATIONS,
+            )
+            self.evaluations += found.evaluations
+            now = found.at.about.touched
+            if not any(np.any(np.asarray(new) & ~np.asarray(old)) for new, old in zip(now, left_out, strict=True)):
+                break
+            left_out = now
+        return found._replace(left_out=left_out)
+
+    def compared_numbers(self, found: Minimum) -> float:
+        """The number of measured numbers that a fit compared."""
+        return self.problem.without(found.left_out).numbers
+
+    def cost(self, found: Minimum) -> float:
+        """The sum of squares of a fit, as if nothing had been left out: with half of everything left out, none is good."""
+        share = self.compared_numbers(found) / self.problem.numbers
+        return found.at.cost / share if share > LEAST_KEPT else np.inf
 
     @property
     def growth(self) -> float:

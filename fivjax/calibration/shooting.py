@@ -10,7 +10,8 @@ same equation gives the derivatives, over a single period. (In the derivative of
 thousands of degrees.)
 
 Fourier coefficients are integrals over exactly one period. Where the contact closes, velocities jump and accelerations are
-impulses; the coefficients of an acceleration follow from those of its velocity by differentiation.
+impulses; the coefficients of an acceleration follow from those of its velocity by differentiation. Samples at points in time see
+no impulse, so its share is known apart.
 """
 
 from typing import NamedTuple
@@ -22,12 +23,14 @@ from jaxtyping import Array, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..contact.coordinates import at_places
+from ..io.recordings import Channel
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.base import AbstractStepper, Within
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import for_derivatives
+from .inside import channels_inside, jumps
 
 # A motion is followed for so many periods before it counts as nearly periodic.
 SETTLING_PERIODS = 80
@@ -35,6 +38,8 @@ SETTLING_PERIODS = 80
 LOOKS = 48
 # The shortest and the longest period tried, relative to the expected one.
 SHORTEST, LONGEST = 0.6, 1.7
+# The most contact events in a period beside which samples can be told.
+MOST_EVENTS = 64
 
 
 class Cycle(NamedTuple):
@@ -60,6 +65,7 @@ class Around(NamedTuple):
     y: State  # at the end of the period
     contact: Contact
     lines: Complex[Array, "count n"]  # of the velocities: v(t) = Re sum of c_h exp(2πi h t / period), m/s
+    impulses: Complex[Array, "count n"]  # the part of the accelerations' lines that is impulses, m/s²
     fractions: Float[Array, "2"]  # of time, sticking and detached
 
 
@@ -109,18 +115,72 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
     method, codes = for_derivatives(method, mechanics), jnp.array([Status.STICK, Status.DETACH])
 
     def add(total, segment: Segment):
-        lines, spent = total
+        lines, impulses, spent = total
         within = method.within(mechanics, segment.contact, load, segment.y, segment.after.h)
         # With several contacts, those of the first; fractions in a recording are refused then.
         status = segment.contact.status[0] if mechanics.several else segment.contact.status
         spent = spent + jnp.where(status == codes, segment.after.h, 0.0)
-        return lines + _integrals(within, segment.t, cycle.period, count), spent
+        n = scene.structure.size
+        jump = (segment.after.y - segment.after.end)[n:]
+        turns = 2 * jnp.pi * jnp.arange(1, count + 1) * ((segment.t + segment.after.h) / cycle.period)
+        impulses = impulses + jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)[..., None] * jump
+        return lines + _integrals(within, segment.t, cycle.period, count), impulses, spent
 
-    total = (jnp.zeros((count, 2, scene.structure.size)), jnp.zeros(2))
+    zeros = jnp.zeros((count, 2, scene.structure.size))
+    total = (zeros, zeros, jnp.zeros(2))
     after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
-    lines, spent = after.total
-    lines = (2 / cycle.period) * (lines[:, 0] - 1j * lines[:, 1])
-    return Around(jnp.where(after.enough, after.y, jnp.nan), after.contact, lines, spent / cycle.period)
+    *sums, spent = after.total
+    lines, impulses = ((2 / cycle.period) * (part[:, 0] - 1j * part[:, 1]) for part in sums)
+    return Around(jnp.where(after.enough, after.y, jnp.nan), after.contact, lines, impulses, spent / cycle.period)
+
+
+class Waveform(NamedTuple):
+    """A cycle at instants of its period, and how far in time each is from the contact's events."""
+
+    values: Float[Array, "q k"]
+    from_changes: Float[
+        Array, "e q"
+    ]  # to each of the first events in which a contact changes its mode, s; infinite if none
+    from_landings: Float[Array, "e q"]  # to those of them in which one lands
+
+
+def waveform(
+    scene: Scene,
+    method: AbstractStepper,
+    cycle: Cycle,
+    instants: Float[Array, " q"],
+    channels: tuple[Channel, ...],
+) -> Waveform:
+    """Channels of a cycle at instants between 0 and its period (s), in any order. Differentiable in forward mode."""
+    mechanics, load = Mechanics(scene), scene.load.final
+    method = for_derivatives(method, mechanics)
+
+    def add(total, segment: Segment):
+        values, seen, changes, landings = total
+        here = (instants >= segment.t) & (instants < segment.t + segment.after.h)
+        times = jnp.where(here, instants - segment.t, 0.0)
+        found = channels_inside(method, mechanics, segment, times, channels)
+        values = jnp.where(here[:, None], found, values)
+        changed, landed = jumps(segment)
+        end = jax.lax.stop_gradient(segment.t + segment.after.h)
+        place = jnp.where(changed, seen, MOST_EVENTS)
+        changes = changes.at[place].set(end, mode="drop")
+        landings = landings.at[place].set(jnp.where(landed, end, jnp.inf), mode="drop")
+        return values, seen + changed, changes, landings
+
+    none = jnp.full(MOST_EVENTS, jnp.inf)
+    total = (jnp.zeros((len(instants), len(channels))), jnp.zeros((), jnp.int32), none, none)
+    after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
+    values, seen, *events = after.total
+    # With more events than can be noted, nothing is known.
+    values = jnp.where(after.enough & (seen <= MOST_EVENTS), values, jnp.nan)
+    half = 0.5 * cycle.period
+
+    def away(event):
+        found = jnp.abs(jnp.mod(jax.lax.stop_gradient(instants) - event + half, cycle.period) - half)
+        return jnp.where(jnp.isfinite(event), found, jnp.inf)
+
+    return Waveform(values, *(jax.lax.stop_gradient(jax.vmap(away)(part)) for part in events))
 
 
 def unclosed(scene: Scene, cycle: Cycle, after: Around) -> State:

@@ -9,6 +9,7 @@ from .initial_guesses import state_matrices
 from .least_squares import Minimum
 from .misfit import OFFSET_UNIT
 from .problem import Problem
+from .samples import Sampled
 from .waveform_misfit import KickMisfit
 
 # Candidates with time offsets that are tried: two, with three offsets each.
@@ -24,16 +25,21 @@ def best_offsets(
 ) -> Float[np.ndarray, "candidate window"]:
     """For each point and window the offset at which recording k agrees best, in the units of the problem."""
     mine, (low, high) = problem.misfits[k], bounds
+    assert isinstance(mine, KickMisfit)
     edges, means, sigma = map(np.asarray, (mine.edges, mine.means, mine.sigma))
     step = (edges[1] - edges[0]) / OFFSETS_PER_BLOCK
     shifts = int(np.ceil((high - low) / step)) + 1
-    instants = low + edges[0] + step * np.arange(shifts + OFFSETS_PER_BLOCK * len(means))
+    # Averages over parts of blocks, whatever the samples are: to look for an offset they are close enough.
+    parts = shifts - 1 + OFFSETS_PER_BLOCK * len(means)
+    finer = Sampled(jnp.zeros(()), jnp.asarray(step), None, None, parts, 1, True)
     ends = [max(1, int(share * len(means))) - 1 for share in windows[::-1]]
     cost = np.empty((len(points), len(windows), shifts))
     for i, point in enumerate(points):
-        found = np.asarray(_integrals(problem, k, jnp.asarray(point), jnp.asarray(instants)))
+        found = np.asarray(_responses(problem, k, jnp.asarray(point), finer, jnp.asarray(low)))
+        sums = np.concatenate([np.zeros((1, found.shape[1])), np.cumsum(found, axis=0)])
+        over = (sums[OFFSETS_PER_BLOCK:] - sums[:-OFFSETS_PER_BLOCK]) / OFFSETS_PER_BLOCK
         for shift in range(shifts):
-            model = np.diff(found[shift::OFFSETS_PER_BLOCK][: len(edges)], axis=0) / (edges[1] - edges[0])
+            model = over[shift::OFFSETS_PER_BLOCK][: len(means)]
             cost[i, :, shift] = np.cumsum(np.sum(((means - model) / sigma) ** 2, axis=1))[ends]
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=-1)
     return np.minimum(step * best, high - low) / OFFSET_UNIT
@@ -46,32 +52,32 @@ def periods_aside(
 
     A vibration is similar to itself a period later, so these may be better minima.
     """
-    place = problem.size + int(np.sum(problem.moved[:k]))
+    place = problem.places[k].start
     period = _period(problem, x[: problem.size]) / OFFSET_UNIT
     shifted = np.tile(x, (len(WHOLE_PERIODS), 1))
     shifted[:, place] += period * np.array(WHOLE_PERIODS)
-    offsets = problem.references[k] + OFFSET_UNIT * shifted[:, place]
+    offsets = bounds[0] + OFFSET_UNIT * shifted[:, place]
     return list(shifted[(bounds[0] <= offsets) & (offsets <= bounds[1])]), 0.5 * period
 
 
 def slid_throughout(problem: Problem, best: Minimum) -> bool:
-    """Whether the fitted responses are the same when contact events are taken into account."""
+    """Whether no contact event happens in the fitted responses, which are then what was fitted."""
     for k, mine in enumerate(problem.misfits):
-        if isinstance(mine, KickMisfit):
-            instants = mine.edges + problem.offsets(best.x)[k]
-            u = jnp.asarray(best.x[: problem.size])
-            width = float(mine.edges[1] - mine.edges[0])
-            integrals: np.ndarray = np.asarray(_integrals(problem, k, u, instants, eventful=True))
-            found = np.diff(integrals, axis=0) / width
-            # A tolerance for rounding; the effect of an event is much larger.
-            if not np.allclose(found, best.at.about.models[k], rtol=0, atol=1e-6 * np.ptp(found)):
-                return False
+        if isinstance(mine, KickMisfit) and _has_events(problem, k, jnp.asarray(best.x)):
+            return False
     return True
 
 
 @compiled
-def _integrals(problem: Problem, which: int, u: Float[Array, " k"], instants: Float[Array, " b"], eventful=False):
-    return problem.misfits[which].integrals(problem.at(u), instants, eventful)
+def _responses(problem: Problem, which: int, u: Float[Array, " k"], sampled: Sampled, begin: Float[Array, ""]):
+    mine = problem.misfits[which]
+    return mine.response(problem.at(u), (begin, None), sampled, mine.uneventful).means
+
+
+@compiled
+def _has_events(problem: Problem, which: int, x: Float[Array, " j"]):
+    mine, own = problem.misfits[which], problem.own(x)[which]
+    return jnp.any(mine.response(problem.at(x[: problem.size]), own, mine.sampled, False).contacts)
 
 
 def _period(problem: Problem, u: Float[np.ndarray, " k"]) -> float:

@@ -1,26 +1,33 @@
 """Comparison of a small motion, or of the response to a kick, with a recording, block by block."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
+from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
 from ..foundation.matrix_factors import exponential, orthonormal_columns
 from ..io.recordings import Averaged, Channel, Recording
 from ..linear.linearisation import linear_sliding
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene
 from ..model.sliding import free_in_sliding
-from ..simulation.rows import states_at
-from ..steppers.base import MOST_ADVANCES, AbstractStepper
+from ..simulation.start import start_state
+from ..steppers.base import AbstractStepper
 from .characteristic import characteristic_residual
-from .misfit import AbstractMisfit, Compared, finite, window
+from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, finite, window
 from .mode_poles import strongest_poles
 from .noise import noise_of_means
+from .responses import Response, powers, sliding_throughout, through_events
+from .samples import Sampled, sampled
 
 # The least share of the signal's energy that poles must explain to count as those of a small motion.
 LEAST_EXPLAINED = 0.7
+# The share of a recording from whose beginning an unknown start is guessed.
+BEGINNING = 0.15
 
 
 class AbstractWaveformMisfit(AbstractMisfit):
@@ -28,7 +35,10 @@ class AbstractWaveformMisfit(AbstractMisfit):
 
     edges: Float[Array, " edge"]
     means: Float[Array, "B k"]
-    sigma: Float[Array, " k"]
+    sigma: Float[Array, "B k"]
+    t: Float[Array, " B"]
+    kept: Float[Array, "B k"]
+    sampled: Sampled
     known: dict[str, Array]
     poles: Complex[Array, " j"]
     shapes: Complex[Array, "j k"]
@@ -37,105 +47,120 @@ class AbstractWaveformMisfit(AbstractMisfit):
     def coarse(self, scene):
         return characteristic_residual(scene.replace(**self.known), self.poles, self.shapes, self.channels)
 
+    def _weight(self, share):
+        return window(self.edges, share)[:, None] * self.kept / self.sigma
+
 
 class SlidingMisfit(AbstractWaveformMisfit):
     """A small motion about steady sliding. It is a sum of the sliding modes, whose unknown amplitudes are found by linear least
-    squares inside the residual (variable projection; Golub and Pereyra 1973)."""
+    squares inside the residual (variable projection; Golub and Pereyra 1973), with the unknown zero of a displacement."""
 
     projected: int = eqx.field(static=True)
+    unknowns: int = eqx.field(static=True, default=0)
 
     def compared(self, scene, own, share):
-        weight = window(self.edges, share)[:, None] / self.sigma
-        waves, target = self._waves(scene), weight * self.means
+        weight = self._weight(share)
+        waves, target = self.waves(scene.replace(**self.known)), weight * self.means
         q, r = orthonormal_columns((weight[..., None] * waves).reshape(-1, waves.shape[-1]))
         target = target.ravel()
         amplitudes = solve(r, q.T @ target)
-        return Compared(finite(target - q @ (q.T @ target)), waves @ amplitudes, jnp.zeros(0), None)
+        never = jnp.zeros(self.means.shape, bool)
+        return Compared(finite(target - q @ (q.T @ target)), waves @ amplitudes, never, jnp.zeros(0), None)
 
-    def _waves(self, scene) -> Float[Array, "B k m"]:
-        """Block means for each unit initial state, scaled to the same size."""
-        scene = scene.replace(**self.known)
-        matrix = linear_sliding(scene).matrix
-        m = matrix.shape[0] // 2
-        width = self.edges[1] - self.edges[0]
-        states = _powers(exponential(width * matrix), self.edges.shape[0])
-        keep = free_in_sliding(scene.structure).tolist()
-        columns = []
-        for quantity, coordinate in self.channels:
-            row = keep.index(coordinate) + (m if quantity == "acceleration" else 0)
-            columns.append((states[1:, row] - states[:-1, row]) / width)
-        waves = jnp.stack(columns, axis=1)
+    def waves(self, scene) -> Float[Array, "B k m"]:
+        """Blocks for each unit initial state, scaled to the same size; then a constant for each displacement."""
+        waves = free_waves(scene, linear_sliding(scene).matrix, self.sampled, self.channels)
         # Responses to displacements and to velocities differ by a factor of the frequency, which would worsen the conditioning.
-        return waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
+        waves = waves / jnp.sqrt(jnp.mean(jax.lax.stop_gradient(waves) ** 2, axis=(0, 1)))
+        return jnp.concatenate([waves, zeros_of_displacements(self.channels, len(self.means))], axis=2)
 
 
 class KickMisfit(AbstractWaveformMisfit):
-    """The response to the scene's own load, from steady sliding, through every contact event."""
+    """The response to the scene's own load, from steady sliding or another state, through every contact event."""
 
     method: AbstractStepper
+    reference: Float[Array, ""]  # the time offset, or the one from which an unknown one is measured, s
+    y0: Float[Array, " state"] | None  # the state at time 0, None for steady sliding; zeros where it is not known
+    scale: Float[Array, " m"] | None  # units of an unknown state
+    free: tuple[int, ...] = eqx.field(static=True)  # the places in a state that are unknown
     # Whether contact events are excluded: then matrix exponentials are enough, and a hundred times as fast.
     uneventful: bool = eqx.field(static=True)
+    unknowns: int = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
 
+    def own(self, x):
+        """The time offset (s) and the state at time 0, None for steady sliding."""
+        if self.free:
+            return self.reference, self.y0.at[jnp.array(self.free)].set(self.scale * x)
+        return (self.reference + OFFSET_UNIT * x[0] if self.unknowns else self.reference), self.y0
+
     def compared(self, scene, own, share):
-        weight = window(self.edges, share)[:, None] / self.sigma
-        model = jnp.diff(self.integrals(scene, self.edges + own), axis=0) / (self.edges[1] - self.edges[0])
-        return Compared(finite(weight * (self.means - model)).ravel(), model, jnp.zeros(0), None)
+        model, touched = self.predicted(scene, own)
+        residual = finite(self._weight(share) * (self.means - model)).ravel()
+        return Compared(residual, model, touched, jnp.zeros(0), None)
 
-    def integrals(self, scene: Scene, instants: Float[Array, " i"], eventful: bool = False) -> Float[Array, "i k"]:
-        """The integrals of the channels (velocities or displacements) at evenly spaced instants of the simulation (s)."""
-        respond = _sliding_throughout if self.uneventful and not eventful else _through_events
-        y = respond(scene.replace(**self.known), self.method, instants)
-        return _integrals(y, self.channels)
+    def predicted(self, scene: Scene, own) -> tuple[Float[Array, "B k"], Bool[Array, "B k"]]:
+        """The blocks' means, and which are next to an instant at which they jump."""
+        response = self.response(scene, own, self.sampled, self.uneventful)
+        accelerations, velocities = self.sampled.jumping(self.channels)
+        model = self.sampled.of_blocks(response.means)
+        if self.sampled.filtered:
+            return model, jnp.zeros(model.shape, bool)
+        touched = (response.contacts | response.loads)[:, None] & accelerations
+        return model, touched | (response.landings[:, None] & velocities)
+
+    def response(self, scene: Scene, own, sampled: Sampled, uneventful: bool) -> Response:
+        """The response as `sampled`, with or without contact events."""
+        scene, (offset, y0) = scene.replace(**self.known), own
+        begin = offset + self.edges[0]
+        if uneventful:
+            return sliding_throughout(scene, sampled, begin, self.channels)
+        return through_events(scene, self.method, y0, sampled, begin, self.channels)
+
+    def first(self, scene: Scene) -> Float[np.ndarray, " u"]:
+        """Where to start for the recording's own unknowns: for a state, with the free motion without friction that is closest to
+        the beginning of the recording."""
+        if not self.free:
+            return np.zeros(self.unknowns)
+        return np.asarray(_closest_start(scene.replace(**self.known), self)) / np.asarray(self.scale)
 
 
-def _through_events(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
-    """States at instants of the simulation (s); before its start, the state of steady sliding."""
-    q, _ = steady_sliding(scene, scene.load.force)
-    y0 = jnp.concatenate([q, jnp.zeros_like(q)])
-    instants = jnp.concatenate([jnp.zeros(1), jnp.maximum(instants, 0.0)])
-    y, *_ = states_at(scene, method, y0, instants, MOST_ADVANCES, derivatives="forward")
-    return y[1:]
-
-
-def _sliding_throughout(scene: Scene, method: AbstractStepper, instants: Float[Array, " i"]) -> Float[Array, "i state"]:
-    """The same for constant friction, if no contact ever stops sliding: exact, from one jump of the load to the next."""
-    n, matrix = scene.structure.size, linear_sliding(scene).matrix
+def free_waves(scene: Scene, matrix, sampled: Sampled, channels: tuple[Channel, ...]) -> Float[Array, "B k m"]:
+    """Blocks of the free motion with this state matrix, for each unit initial state."""
+    m = matrix.shape[0] // 2
+    states = powers(exponential(sampled.width * matrix), sampled.count) @ _inside(matrix, sampled)
+    rates = jnp.concatenate([states, matrix[m:] @ states], axis=1)
     keep = free_in_sliding(scene.structure).tolist()
-    steps = _powers(exponential((instants[1] - instants[0]) * matrix), instants.shape[0])
-
-    def equilibrium(force):
-        q, _ = steady_sliding(scene, force)
-        return jnp.concatenate([q[jnp.array(keep)], jnp.zeros(len(keep))])
-
-    rest = equilibrium(scene.load.force)
-    begin, z = jnp.zeros(()), rest
-    found = jnp.broadcast_to(rest, (instants.shape[0], len(rest)))
-    jumps = scene.load.jumps
-    for k in range(jumps.shape[0]):
-        z = rest + exponential((jumps[k] - begin) * matrix) @ (z - rest)
-        begin = jumps[k]
-        until = jumps[k + 1] if k + 1 < jumps.shape[0] else jnp.inf
-        middle = begin + jnp.minimum(0.5 * (until - begin), 1.0)
-        rest = equilibrium(scene.load(middle))
-        moving = steps @ (exponential((instants[0] - begin) * matrix) @ (z - rest)) + rest
-        found = jnp.where((instants >= begin)[:, None], moving, found)
-    columns = jnp.array([*keep, *(n + i for i in keep)])
-    return jnp.zeros((instants.shape[0], 2 * n)).at[:, columns].set(found)
+    columns = [keep.index(channel.coordinate) + m * channel.derivative for channel in channels]
+    return sampled.of_blocks(rates[:, jnp.array(columns)])
 
 
-def _integrals(y, channels: tuple[Channel, ...]):
-    n = y.shape[1] // 2
-    return y[:, jnp.array([coordinate + (n if quantity == "acceleration" else 0) for quantity, coordinate in channels])]
+def zeros_of_displacements(channels: tuple[Channel, ...], blocks: int) -> Float[Array, "B k d"]:
+    """A constant for each channel of a displacement, whose sensor's zero is not known."""
+    places = [k for k, channel in enumerate(channels) if channel.derivative == 0]
+    return jnp.broadcast_to(jnp.eye(len(channels))[:, np.array(places, int)], (blocks, len(channels), len(places)))
 
 
-def _powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
-    """I, step, step², …: by doubling, so that a long recording takes only a few products of many matrices."""
-    powers, next_one = jnp.eye(step.shape[0])[None], step
-    while powers.shape[0] < count:
-        powers = jnp.concatenate([powers, powers @ next_one])
-        next_one = next_one @ next_one
-    return powers[:count]
+def _inside(matrix, sampled: Sampled) -> Float[Array, "m m"]:
+    """The mean of a block's samples, for each unit state at its beginning."""
+    size = matrix.shape[0]
+    if sampled.averages:
+        both = jnp.zeros((2 * size, 2 * size)).at[:size, :size].set(matrix).at[:size, size:].set(jnp.eye(size))
+        return exponential(sampled.width * both)[:size, size:] / sampled.width
+    step = sampled.width / sampled.per_block
+    each = powers(exponential(step * matrix), sampled.per_block) @ exponential(0.5 * step * matrix)
+    return jnp.mean(each, axis=0)
+
+
+@compiled
+def _closest_start(scene: Scene, mine: KickMisfit) -> Float[Array, " u"]:
+    linear = linear_sliding(scene)
+    waves = free_waves(scene, linear.frictionless, mine.sampled, mine.channels)
+    # Friction at a standstill shifts the position about which it vibrates.
+    waves = jnp.concatenate([waves, zeros_of_displacements(mine.channels, len(mine.means))], axis=2)
+    weight = window(mine.edges, jnp.asarray(BEGINNING))[:, None] / mine.sigma
+    found = jnp.linalg.lstsq((weight[..., None] * waves).reshape(-1, waves.shape[-1]), (weight * mine.means).ravel())[0]
+    return linear.equilibrium[jnp.array(mine.free)] + found[: len(mine.free)]
 
 
 def misfit_of_waveform(
@@ -147,6 +172,8 @@ def misfit_of_waveform(
     width = blocks.edges[1] - blocks.edges[0]
     # The response to a kick may be a small motion again towards its end.
     tail = blocks.means if recording.regime == "sliding" else blocks.means[len(blocks.means) // 3 :]
+    displacements = [k for k, channel in enumerate(recording.channels) if channel.derivative == 0]
+    tail = tail - np.where(np.isin(np.arange(tail.shape[1]), displacements), tail.mean(axis=0), 0.0)
     modes = scene.structure.size - len(scene.structure.contacts)
     found = strongest_poles(tail, width, modes, sigma)
     # Padded to the largest number of poles, so that all recordings of this length share compiled programs.
@@ -157,12 +184,43 @@ def misfit_of_waveform(
     common: dict = {
         "edges": jnp.asarray(blocks.edges),
         "means": jnp.asarray(blocks.means),
-        "sigma": jnp.asarray(sigma),
+        "sigma": jnp.asarray(np.broadcast_to(sigma, blocks.means.shape)),
+        "t": jnp.asarray(0.5 * (blocks.edges[1:] + blocks.edges[:-1])),
+        "kept": jnp.ones(blocks.means.shape),
+        "sampled": sampled(recording, blocks),
         "known": known,
         "poles": jnp.asarray(values),
         "shapes": jnp.asarray(shapes),
         "channels": recording.channels,
     }
     if recording.regime == "sliding":
-        return SlidingMisfit(**common, projected=2 * modes)
-    return KickMisfit(**common, method=method, uneventful=uneventful)
+        return SlidingMisfit(**common, projected=2 * modes + len(displacements))
+    return _kick(recording, method, scene.replace(**recording.known), uneventful, common)
+
+
+def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventful: bool, common: dict) -> KickMisfit:
+    low, high = recording.offset
+    kick = KickMisfit(
+        **common,
+        method=method,
+        reference=jnp.asarray(low),
+        y0=None if recording.y0 is None else start_state(scene, recording.y0),
+        scale=None,
+        free=(),
+        uneventful=uneventful,
+        unknowns=int(low < high),
+    )
+    if not starts_unknown(scene, recording):
+        return kick
+    n, keep = scene.structure.size, free_in_sliding(scene.structure)
+    free = tuple(int(place) for place in (*keep, *(n + keep)))
+    parts = (jnp.zeros(2 * n), jnp.ones(len(free)), jnp.zeros(()))
+    kick = dataclasses.replace(kick, y0=parts[0], scale=parts[1], reference=parts[2], free=free, unknowns=len(free))
+    guess = np.abs(kick.first(scene).reshape(2, -1)).max(axis=1)
+    scale = jnp.asarray(np.repeat(np.where(guess > 0, guess, 1.0), len(keep)))
+    return dataclasses.replace(kick, scale=scale)
+
+
+def starts_unknown(scene: Scene, recording: Recording) -> bool:
+    """Whether a run has no known start: on a belt at rest nothing slides steadily."""
+    return recording.regime == "kick" and recording.y0 is None and bool(np.any(np.asarray(scene.belt_speed) == 0))

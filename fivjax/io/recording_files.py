@@ -22,6 +22,7 @@ UNITS = {
         "g": 9.80665,
     },
     "velocity": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "cm": 1e-2},
 }
 
 

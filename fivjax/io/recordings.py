@@ -1,10 +1,8 @@
 """Recordings: measured signals with their time base, and what is known of the run they came from.
 
-A recording is read from a file (`recording_files`) or made from arrays (`Recording`), and averaged over blocks of samples
-before it is compared with a model (`averaged`). Over a block a mean acceleration is a change of velocity and a mean
-velocity a change of displacement, so the model is averaged *exactly*, whatever jumps inside the block. Picking single
-samples would not do: where the contact changes, accelerations jump, and a sum over picked samples has the wrong
-derivative.
+A recording is read from a file (`recording_files`) or made from arrays (`Recording`). It says how it was sampled: at points
+in time, as an accelerometer's converter does, by averages over the time from one sample to the next, or either after a
+low-pass. A model is sampled in the same way before the two are compared, so nothing that a sample is not is fitted to it.
 """
 
 import math
@@ -18,18 +16,28 @@ from jaxtyping import Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
+from .low_pass import FrequencyResponse, frequency_response
 
 REGIMES = ("sliding", "kick", "limit cycle")
+SAMPLINGS = ("points", "averages")
+# Quantities of a channel, in the order of their derivatives by time; and how a channel's name may begin.
+QUANTITIES = ("displacement", "velocity", "acceleration")
+SHORT = {"d": "displacement", "v": "velocity", "a": "acceleration"}
 # Time stamps are often rounded to few digits; steps that differ by more than this share of a step are uneven.
 UNEVEN = 0.05
 SHORTEST = 16
 
 
 class Channel(NamedTuple):
-    """One measured signal: "acceleration" or "velocity" of one coordinate of the structure."""
+    """One measured signal: "displacement", "velocity" or "acceleration" of one coordinate of the structure."""
 
     quantity: str
     coordinate: int
+
+    @property
+    def derivative(self) -> int:
+        """Which derivative of the displacement by time it is: 0, 1 or 2."""
+        return QUANTITIES.index(self.quantity)
 
     def __str__(self) -> str:
         return f"{self.quantity} {self.coordinate}"
@@ -43,13 +51,20 @@ class Recording(eqx.Module):
     **Arguments:**
 
     - `t`: `(T,)` instants in s, evenly spaced, or one number: the sampling rate in Hz.
-    - `signals`: `(T,)` arrays by channel, "acceleration i" (m/s²) or "velocity i" (m/s) of coordinate i.
+    - `signals`: `(T,)` arrays by channel, "displacement i" (m), "velocity i" (m/s) or "acceleration i" (m/s²) of coordinate i.
     - `regime`: what was recorded.
       "sliding": a small motion about steady sliding, growing or decaying, whatever set it off.
-      "kick": the response to the scene's own load from steady sliding; any contact events.
+      "kick": the response to the scene's own load from steady sliding, or from `y0`; any contact events.
       "limit cycle": a vibration that keeps its amplitude.
+    - `sampling`: what a sample is. "points": the value at its instant, as analogue-to-digital converters take it. "averages":
+      the mean over the time from half a step before its instant to half a step after.
+    - `filter`: the low-pass before the sampler: a pair of cut-off (Hz) and order of a Butterworth filter, or a function that
+      gives the complex factor for each frequency (Hz, an array). Unless given, the sensor passes everything.
+    - `y0`: for a kick, the state at the simulation's start, as for `simulate`. Unless given it is steady sliding; on a belt at
+      rest, where nothing slides steadily, it is unknown and fitted, and the recording begins with the simulation.
     - `offset`: for a kick, the time of the simulation (s) at which the recording's first sample lies, as one number if known,
-      else as the range to search: (0, 0.5) unless given. A recording that begins before the simulation has a negative offset.
+      else as the range to search: (0, 0.5) unless given, or 0 with `y0`. A recording that begins before the simulation has a
+      negative offset.
     - `noise`: standard deviation of one sample, by channel or one number for all. Unless given, white noise is assumed and
       estimated from the differences between neighbouring samples or from the quiet part of the spectrum.
     - `sticking`, `detached`: for a limit cycle, the measured fraction of time in this status, as a pair: the value and its
@@ -68,6 +83,9 @@ class Recording(eqx.Module):
     values: Float[np.ndarray, "T k"]
     channels: tuple[Channel, ...] = eqx.field(static=True)
     regime: str = eqx.field(static=True)
+    sampling: str = eqx.field(static=True)
+    filter: FrequencyResponse | None = eqx.field(static=True)
+    y0: Float[np.ndarray, " state"] | None
     offset: tuple[float, float]
     noise: Float[np.ndarray, " k"] | None
     sticking: tuple[float, float] | None
@@ -84,7 +102,10 @@ class Recording(eqx.Module):
         t,
         signals: Mapping,
         regime: str = "kick",
+        sampling: str = "points",
         *,
+        filter=None,
+        y0=None,
         offset=None,
         noise: Mapping | float | None = None,
         sticking: tuple[float, float] | None = None,
@@ -92,6 +113,7 @@ class Recording(eqx.Module):
         **known,
     ):
         arguments.one_of("regime", regime, REGIMES)
+        arguments.one_of("sampling", sampling, SAMPLINGS)
         if not isinstance(signals, Mapping) or not signals:
             raise TypeError(
                 f"Argument `signals` must map channels to arrays, such as {{'acceleration 0': a}}, but is "
@@ -109,13 +131,20 @@ class Recording(eqx.Module):
         self.t = _instants(t, count)
         self.channels = tuple(by_channel)
         self.values = np.stack(list(by_channel.values()), axis=1)
-        self.regime = regime
-        if offset is not None and regime != "kick":
+        self.regime, self.sampling, self.filter = regime, sampling, frequency_response(filter)
+        for name, value in (("offset", offset), ("y0", y0)):
+            if value is not None and regime != "kick":
+                raise ValueError(
+                    f'Argument `{name}` is for the regime "kick": in the regime "{regime}" no instant of the simulation is '
+                    f"special. Leave it out."
+                )
+        self.y0 = None if y0 is None else _state(y0)
+        self.offset = _offset(offset if offset is not None else (0.0, 0.5) if y0 is None else 0.0)
+        if y0 is not None and self.offset[0] < 0:
             raise ValueError(
-                f'Argument `offset` is for the regime "kick": in the regime "{regime}" no instant of the simulation is '
-                f"special. Leave it out."
+                f"Argument `offset` must not be negative with `y0`, which is the state at time 0, but is "
+                f"{self.offset[0]:g}."
             )
-        self.offset = _offset((0.0, 0.5) if offset is None else offset)
         self.noise = None if noise is None else _noise(noise, self.channels)
         self.sticking, self.detached = _fraction("sticking", sticking, regime), _fraction("detached", detached, regime)
         for name, value in known.items():
@@ -156,19 +185,20 @@ def averaged(recording: Recording, rate: float) -> Averaged:
 
 
 def channel(name) -> Channel:
-    """The channel of a name such as "acceleration 0", "velocity 1", "a0" or "v_1".
+    """The channel of a name such as "acceleration 0", "velocity 1", "a0", "v_1" or "d 2".
 
     **Raises:** `ValueError` for any other name.
     """
     if isinstance(name, Channel):
         return name
-    match = re.fullmatch(r"\s*(acceleration|velocity|acc|vel|a|v)[\s_]*(\d+)\s*", str(name), re.IGNORECASE)
+    words = "displacement|velocity|acceleration|disp|vel|acc|d|v|a"
+    match = re.fullmatch(rf"\s*({words})[\s_]*(\d+)\s*", str(name), re.IGNORECASE)
     if not match:
         raise ValueError(
-            f"A channel must read `acceleration i` or `velocity i` with the coordinate's number, such as "
+            f"A channel must read `acceleration i`, `velocity i` or `displacement i` with the coordinate's number, such as "
             f"`acceleration 0`, but reads {str(name)!r}."
         )
-    return Channel("acceleration" if match[1].lower().startswith("a") else "velocity", int(match[2]))
+    return Channel(SHORT[match[1][0].lower()], int(match[2]))
 
 
 def _signal(name: str, values) -> np.ndarray:
@@ -213,6 +243,12 @@ def _noise(noise, channels: tuple[Channel, ...]) -> Float[np.ndarray, " k"]:
     if missing:
         raise ValueError(f"Argument `noise` must name every channel, but {missing[0]} is missing.")
     return np.array([by_channel[one] for one in channels])
+
+
+def _state(y0) -> Float[np.ndarray, " state"]:
+    """A state as one array; `calibrate` checks it beside the scene."""
+    parts = y0 if isinstance(y0, tuple | list) and len(y0) == 2 else (y0,)
+    return np.concatenate([arguments.numeric_array("y0", part).astype(np.float64).ravel() for part in parts])
 
 
 def _offset(offset) -> tuple[float, float]:

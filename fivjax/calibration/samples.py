@@ -1,0 +1,103 @@
+"""How the samples of a recording follow from a motion: points or averages, through a low-pass if there is one.
+
+A waveform is predicted block by block. A block holds samples; points are taken at their instants, averages between them, so
+both are exact however few there are. Through a low-pass the motion is first averaged over steps much finer than the filter's
+bandwidth, which keeps impulses and jumps whole, then filtered in the spectrum, and sampled.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+from jaxtyping import Array, Complex, Float, Int
+
+from ..io.low_pass import bandwidth, memory
+from ..io.recordings import Averaged, Channel, Recording
+
+# Fine steps per period of the highest frequency that a filter lets through.
+FINE = 16
+# The most fine steps for one sample.
+FINEST = 64
+
+
+class Through(NamedTuple):
+    """A low-pass on a grid of fine steps, from before the first block to after the last, so that it may ring."""
+
+    count: int
+    lead: float  # the beginning of the grid, s after that of the first block
+    step: float  # s
+    response: Complex[np.ndarray, " f"]  # for means over fine steps
+    picked: Int[np.ndarray, "B p"]  # the fine steps in whose middles the samples are
+
+
+class Sampled(eqx.Module):
+    """What is predicted of a motion for the blocks of one recording."""
+
+    lead: Float[Array, ""]
+    width: Float[Array, ""]  # of a predicted block, s
+    response: Complex[Array, " f"] | None
+    picked: Int[Array, "B p"] | None
+    count: int = eqx.field(static=True)  # of predicted blocks
+    per_block: int = eqx.field(static=True)  # points in each
+    averages: bool = eqx.field(static=True)
+
+    @property
+    def filtered(self) -> bool:
+        """Whether there is a filter, through which nothing jumps."""
+        return self.response is not None
+
+    def edges(self, begin: Float[Array, ""]) -> Float[Array, " edge"]:
+        """The ends of the predicted blocks, for a recording whose first block begins at `begin` (s)."""
+        return begin + self.lead + self.width * jnp.arange(self.count + 1)
+
+    def of_blocks(self, predicted: Float[Array, "b *k"]) -> Float[Array, "B *k"]:
+        """Means over the recording's blocks of samples, from those over the predicted blocks."""
+        if self.response is None or self.picked is None:
+            return predicted
+        spectrum = jnp.fft.rfft(predicted, axis=0)
+        response = self.response.reshape(-1, *[1] * (predicted.ndim - 1))
+        return jnp.mean(jnp.fft.irfft(spectrum * response, self.count, axis=0)[self.picked], axis=1)
+
+    def jumping(self, channels: tuple[Channel, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Which channels' samples jump where the event that they are near moves past one: with accelerations, with velocities."""
+        derivatives = np.array([channel.derivative for channel in channels]) - self.averages
+        return (derivatives >= 2) & (not self.filtered), (derivatives >= 1) & (not self.filtered)
+
+
+def sampled(recording: Recording, blocks: Averaged) -> Sampled:
+    """How a recording's blocks are predicted."""
+    count, width = len(blocks.means), float(blocks.edges[1] - blocks.edges[0])
+    averages = recording.sampling == "averages"
+    if recording.filter is None:
+        return Sampled(jnp.zeros(()), jnp.asarray(width), None, None, count, blocks.per_block, averages)
+    grid = _through(recording, blocks)
+    return Sampled(
+        jnp.asarray(grid.lead),
+        jnp.asarray(grid.step),
+        jnp.asarray(grid.response),
+        jnp.asarray(grid.picked),
+        grid.count,
+        1,
+        True,
+    )
+
+
+def _through(recording: Recording, blocks: Averaged) -> Through:
+    response, interval = recording.filter, 1 / recording.rate
+    assert response is not None
+    passed = bandwidth(response, FINEST * recording.rate / FINE)
+    # An odd number, so that the samples' instants are middles of fine steps.
+    finer = 2 * int(np.clip(np.ceil(FINE * passed * interval), 1, FINEST) // 2) + 1
+    step = interval / finer
+    ringing = int(np.ceil(memory(response, step) / step))
+    samples = len(blocks.means) * blocks.per_block
+    count = scipy.fft.next_fast_len(2 * ringing + samples * finer, real=True)
+    frequencies = np.fft.rfftfreq(count, step)
+    # A mean over a fine step is itself a low-pass, which is undone.
+    factor = response(frequencies) / np.sinc(frequencies * step)
+    if recording.sampling == "averages":
+        factor = factor * np.sinc(frequencies * interval)
+    middles = ringing + finer // 2 + finer * np.arange(samples)
+    return Through(count, -ringing * step, step, factor, middles.reshape(len(blocks.means), blocks.per_block))
