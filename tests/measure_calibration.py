@@ -1,10 +1,12 @@
 """Errors of recovered parameters, and the time of a calibration: `python tests/measure_calibration.py`.
 
-    python tests/measure_calibration.py [recovery] [quiet] [cost] [--draws=100] [--case="limit cycle"] [--free=3]
+    python tests/measure_calibration.py [recovery] [points] [quiet] [cost] [--draws=100] [--case="limit cycle"] [--free=3] [--rate=1000]
 
-Each word picks one study; `--case` and `--free` one of the recordings and one number of free parameters. Every draw has its
+Each word picks one study; `--case`, `--free` and `--rate` one of the recordings, of the numbers of free parameters and of the
+rates. Every draw has its
 own noise (1 to 5 % of the signal) and its own start, 30 % off in every free parameter; recordings of 25 kHz, 0.8 to 1 s;
-kicks at an unknown time; limit cycles with measured fractions of time sticking and detached, good to 0.005.
+kicks at an unknown time; limit cycles with measured fractions of time sticking and detached, good to 0.005. Those are of averages
+over the time between samples; `points` are values at instants, without a filter, at 0.5 to 20 kHz, 1 s, 2 % noise, starts 10 % off.
 """
 
 import sys
@@ -12,7 +14,7 @@ import time
 from collections import Counter
 
 import numpy as np
-from recordings import CASES, FREE, case, noisy, off, paper, recording, times
+from recordings import CASES, FREE, case, noisy, off, paper, points, recording, times
 from tqdm import tqdm
 
 import fivjax as fj
@@ -63,6 +65,47 @@ def recovery(total, only_case=None, only_free=None):
             draws(name, count, total)
 
 
+RATES = (500, 1000, 4000, 20_000)
+# Scene, the state that it starts from, and the range of the first sample's time (s).
+OF_POINTS = {
+    "limit cycle": (dict(mu=0.3, belt_speed=1.0), True, (2.0, 2.5)),
+    "decaying response": (dict(mu=0.2, p=1.2), False, (0.01, 0.15)),
+}
+
+
+def points_at(only_case=None, only_rate=None, total=20):
+    """Accelerations at instants, at rates from too few samples for a contact event to many: do the 95 % intervals hold the truth?"""
+    names = FREE[3]
+    for name in OF_POINTS if only_case is None else (only_case,):
+        changes, cycle, (earliest, latest) = OF_POINTS[name]
+        scene = paper(**changes)
+        y0 = (fj.sliding_equilibrium(scene), [-0.9 * float(scene.belt_speed), 0.0, 0.0]) if cycle else None
+        # One run at 20 kHz, from which every recording takes its samples.
+        accelerations = points(scene, 0.0, round(20_000 * (latest + 1.0)) + 1, 20_000.0, y0)
+        truth = np.array([float(scene.parameters[n]) for n in names])
+        for rate in RATES if only_rate is None else (int(only_rate),):
+            held, scores, outcomes, costs = np.zeros(len(names), int), [], Counter(), []
+            for draw in tqdm(range(total), desc=f"{name}, {rate} Hz", disable=None):
+                first = int(np.random.default_rng(3000 + draw).integers(20_000 * earliest, 20_000 * latest))
+                samples = noisy(accelerations[first :: 20_000 // rate][:rate], 0.02, draw)
+                regime, about = ("limit cycle", {}) if cycle else ("kick", {"offset": (0.0, 0.2)})
+                data = recording(samples, regime, "points", float(rate), **about)
+                begin = time.process_time()
+                fit = fj.calibrate(off(scene, names, draw, 0.1), data, names, starts=2, seed=draw, progress=False)
+                costs.append(time.process_time() - begin)
+                outcomes[fit.outcome.name.lower()] += 1
+                if fit.outcome.name == "CONVERGED":
+                    scores.append((fit.estimates - truth) / fit.deviations)
+                    held += np.abs(scores[-1]) < 1.96
+            spread = np.sqrt(np.mean(np.square(scores), axis=0)) if scores else np.full(len(names), np.nan)
+            told = ", ".join(f"{n} {h} ({s:.2f})" for n, h, s in zip(names, held, spread, strict=True))
+            print(
+                f"{name}, points at {rate} Hz: {dict(outcomes)}; of {len(scores)} converged, the 95 % interval holds the truth "
+                f"(error in standard deviations, root mean square): {told}; {np.median(costs):.1f} s of processor time (median)",
+                flush=True,
+            )
+
+
 def quiet():
     """Friction from a quiet run: noise alone, in all three regimes."""
     names = FREE[3]
@@ -91,10 +134,12 @@ def cost():
 if __name__ == "__main__":
     options = dict(word[2:].split("=") for word in sys.argv[1:] if word.startswith("--"))
     words = [word for word in sys.argv[1:] if not word.startswith("--")]
-    studies = {"recovery": recovery, "quiet": quiet, "cost": cost}
+    studies = {"recovery": recovery, "points": points_at, "quiet": quiet, "cost": cost}
     for name in words or studies:
         print(f"--- {name}: {studies[name].__doc__}", flush=True)
         if name == "recovery":
             recovery(int(options.get("draws", 100)), options.get("case"), options.get("free"))
+        elif name == "points":
+            points_at(options.get("case"), options.get("rate"), int(options.get("draws", 20)))
         else:
             studies[name]()

@@ -38,6 +38,12 @@ def clean(scene: fj.Scene, begin: float, end: float, y0=None, rate: float = RATE
     return np.diff(run.velocity[first:, :2], axis=0) * rate
 
 
+def points(scene: fj.Scene, begin: float, count: int, rate: float, y0=None) -> np.ndarray:
+    """Accelerations of the two sliding coordinates at instants, as a converter without a filter takes them."""
+    run = fj.simulate(scene, begin + (count - 1) / rate, 1 / rate, y0=y0)
+    return run.acceleration[-count:, :2]
+
+
 def _of_two(c1, k1, coupling):
     """The paper's oscillator and a softer one, whose second masses are coupled by a spring."""
     first, second = (one.matrices for one in (fj.belt_oscillator(c1=c1, k1=k1), fj.belt_oscillator(k1=6e4, k2=6.1e4)))
@@ -99,10 +105,9 @@ def case(name: str) -> tuple[fj.Scene, np.ndarray, str]:
     return scene, clean(scene, begin, end, y0), regime
 
 
-def recording(accelerations: np.ndarray, regime: str, **about) -> fj.Recording:
-    return fj.Recording(
-        RATE, {"acceleration 0": accelerations[:, 0], "acceleration 1": accelerations[:, 1]}, regime, **about
-    )
+def recording(accelerations: np.ndarray, regime: str, sampling="averages", rate=RATE, **about) -> fj.Recording:
+    signals = {"acceleration 0": accelerations[:, 0], "acceleration 1": accelerations[:, 1]}
+    return fj.Recording(rate, signals, regime, sampling, **about)
 
 
 def off(scene: fj.Scene, names, seed: int, share: float = 0.3) -> fj.Scene:
@@ -131,7 +136,7 @@ SAMPLE_RATE = 2000.0
 
 def sample() -> str:
     """The sample recording as a table: 0.8 s, from an instant on that its reader does not know."""
-    accelerations = noisy(clean(paper(**SAMPLE), 0.0371, 0.8371, rate=SAMPLE_RATE), 0.03, 0)
+    accelerations = noisy(points(paper(**SAMPLE), 0.0371, round(0.8 * SAMPLE_RATE), SAMPLE_RATE), 0.03, 0)
     truth = ", ".join(f"{name} = {value:g}" for name, value in SAMPLE.items())
     head = [
         f"# Made by fivjax: the paper's scene with {truth}; a kick of 1.2; 3 % noise. No rig has measured this.",

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..foundation.compiling import compiled
 from .covariance import covariance_of
 from .cycle_misfit import CycleMisfit
-from .goodness_of_fit import WhatIsLeft, exceeds_noise, what_is_left
+from .goodness_of_fit import ROUNDING, WhatIsLeft, exceeds_noise, what_is_left
 from .misfit import OFFSET_UNIT
 from .parameters import FreeParameters
 from .problem import Problem
@@ -44,7 +44,7 @@ def concluded(search: Search, identifiable_within: float) -> Calibration:
         deviations = np.full_like(deviations, np.inf)
     elif left.smaller or not _stated(search.recordings):
         # The residuals are noise, and tell its size better than the estimate that was made before the fit.
-        deviations = deviations * np.sqrt(left.misfit)
+        deviations = deviations * np.sqrt(max(left.misfit, ROUNDING))
     offsets: list = [None] * len(problem.misfits)
     for k in search.moved:
         place = problem.places[k].start

@@ -18,6 +18,8 @@ UNLIKELY = 5.0
 # Number of lags tested together, in blocks; about a period of a vibration.
 LAGS = 16
 IMPROBABLE = 1e-6
+# What is left of a recording without noise is rounding, which is alike from block to block.
+ROUNDING = 1e-6
 
 
 class WhatIsLeft(NamedTuple):
@@ -50,7 +52,7 @@ def what_is_left(
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
-    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3]
+    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > ROUNDING]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
     return WhatIsLeft(
         misfit=misfit,

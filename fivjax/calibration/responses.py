@@ -81,13 +81,11 @@ def through_events(
     place = jnp.where(within, block, blocks)
     means = jnp.zeros((blocks + 1, len(channels))).at[place].add(sums)[:blocks]
     # One more at each side, for what is near the first and the last block.
-    count = jnp.zeros((2, blocks + 2))
+    beside = jnp.zeros((blocks + 2, 2), bool)
     for side in (0, 1, 2):
-        count = count.at[:, jnp.where(within, block + side, blocks + 1)].add(
-            jnp.where(within, near[:, :, side], False).T
-        )
-    near = count[:, 1:-1] > 0
-    return Response(means, near[0], near[1], _near_jumps(scene, edges))
+        beside = beside.at[jnp.where(within, block + side, blocks + 1)].max(near[:, :, side] & within[:, None])
+    near = beside[1:-1]
+    return Response(means, near[:, 0], near[:, 1], _near_jumps(scene, edges))
 
 
 def _integrals(method, mechanics, segment: Segment, channels: tuple[Channel, ...]) -> Float[Array, " k"]:
