@@ -1,76 +1,58 @@
-"""The parts of a calibration, each against something that is known: harmonics, noise, residual tests, least squares, covariance."""
+"""The parts of a calibration, each against something that is known: folding, noise, residual tests, least squares, covariance."""
 
 import jax
 import numpy as np
 import pytest
 from recordings import paper
 
-import fivjax as fj
 from fivjax.calibration.covariance import combinations, covariance_of
-from fivjax.calibration.cycle_misfit import BEATS, cycle_rate
+from fivjax.calibration.cycle_misfit import BEATS
+from fivjax.calibration.folding import folded
 from fivjax.calibration.goodness_of_fit import exceeds_noise, what_is_left
-from fivjax.calibration.harmonics import beating, fitted_harmonics, referred
 from fivjax.calibration.least_squares import Evaluated, minimise
 from fivjax.calibration.noise import estimated_noise
 from fivjax.calibration.parameters import FreeParameters
-from fivjax.io.recordings import averaged
 
 
-def test_lines_of_a_train_of_pulses_do_not_depend_on_where_they_are_looked_at():
-    """Pulses have lines without end. What blocks fold down of them between the lines must not reach those that are fitted."""
-    t = np.arange(25_000) / 25_000
-    pulses = (np.mod(67.456 * t[:, None] + np.linspace(0.2, 0.2 + 67.456 / 25_000, 9), 1.0) < 0.05).mean(axis=1)
-    data = fj.Recording(25e3, {"a0": pulses - pulses.mean()}, "limit cycle")
-    with jax.enable_x64(True):
-        blocks = averaged(data, cycle_rate(data, paper()))
-        width = float(np.diff(blocks.edges[:2])[0])
-        whole, part = (
-            fitted_harmonics(blocks.means[begin:end], width, 8, 50.0, 90.0, np.ones(1)).values
-            for begin, end in ((0, None), (301, 301 + int(30 / 67.456 / width)))
-        )
-    assert whole[0] == pytest.approx(67.456, rel=1e-5)
-    # The whole recording, and thirty periods out of its middle. At 1 % noise a line is good to some 1e-3 of the largest;
-    # at eight samples to a block, which would be as good a choice otherwise, this is 1.6e-3.
-    np.testing.assert_allclose(part[1:], whole[1:], rtol=0, atol=1e-3 * whole[1])
+FREQUENCY = 67.456
 
 
-def harmonic(rng, frequency, dt, count=600, channels=2):
-    """Signals of eight harmonics, and their complex amplitudes at the middle instant."""
-    lines = (rng.normal(size=(8, channels)) + 1j * rng.normal(size=(8, channels))) / np.arange(1, 9)[:, None]
-    t = dt * (np.arange(count) - 0.5 * (count - 1))
-    waves = np.exp(2j * np.pi * frequency * t[:, None] * np.arange(1, 9))
-    return (waves @ lines).real, lines
+def saw(turns):
+    """A waveform with two jumps, as an acceleration has where a contact changes its mode."""
+    turns = np.mod(turns, 1.0)
+    return np.where(turns < 0.3, 2 * turns, np.where(turns < 0.55, -1.0, np.sin(2 * np.pi * turns)))
 
 
-def test_harmonics_err_as_they_are_said_to():
-    """A covariance of frequency and lines that is too small, or without their correlation, is rejected: the parameters rest on it."""
-    rng = np.random.default_rng(0)
-    signals, lines = harmonic(rng, 67.456, 4.4e-4)
-    sigma = np.array([0.05, 0.02])
-    exact = fitted_harmonics(signals, 4.4e-4, 8, 50.0, 90.0, sigma)
-    np.testing.assert_allclose(exact.values, referred(67.456, lines)[0], atol=1e-12)
-    found = [
-        fitted_harmonics(signals + sigma * rng.normal(size=signals.shape), 4.4e-4, 8, 50.0, 90.0, sigma).values
-        for _ in range(400)
-    ]
-    whitened = np.linalg.solve(np.linalg.cholesky(exact.covariance), (found - exact.values).T)
-    # Each of 32 means is good to 0.05, their squares to 0.07, and eigenvalues of the covariance lie in (1 ± √(32/400))².
-    assert np.abs(whitened.mean(axis=1)).max() < 0.2
-    eigenvalues = np.linalg.eigvalsh(np.cov(whitened))
-    assert eigenvalues.min() > 0.45 and eigenvalues.max() < 1.75
+@pytest.mark.parametrize("rate", [500.0, 1000.0, 20_000.0])
+def test_a_second_of_samples_shows_one_period_whatever_the_rate(rate):
+    """Seven samples to a period fold into five hundred phases of it. In a spectrum, lines far above the rate would look like others."""
+    sigma, rng = 0.02, np.random.default_rng(0)
+    t = np.arange(int(rate)) / rate
+    samples = saw(FREQUENCY * t)[:, None] + sigma * rng.normal(size=(len(t), 2))
+    found = folded(samples, rate, 40.0, 110.0)
+    # A tenth of the time by which a period is longer shows after a second.
+    assert found.frequency == pytest.approx(FREQUENCY, abs=0.012)
+    assert found.noise == pytest.approx(sigma, rel=0.3)
+    assert found.sidebands < BEATS
+    # Where it is at the middle of the recording, the waveform began an unknown number of turns ago.
+    middle = FREQUENCY * 0.5 * (len(t) - 1) / rate
+    away = np.abs(np.mod(found.phases[:, None] + middle - [0.0, 0.3, 0.55] + 0.5, 1.0) - 0.5).min(axis=1)
+    clear = away > 4 * found.apart + abs(found.frequency - FREQUENCY)
+    left = (found.means - saw(found.phases + middle)[:, None]) * np.sqrt(found.counts)[:, None] / sigma
+    assert np.mean(clear) > 0.8
+    assert np.sqrt(np.mean(left[clear] ** 2)) < 1.5
 
 
 def test_a_vibration_that_beats_is_told_from_one_that_repeats():
-    """Two sidebands of half the depth each; the harmonics of what beats are not those of any one cycle."""
+    """Two sidebands of half the depth each; what beats is not any one cycle. At a low rate, too."""
     rng = np.random.default_rng(1)
-    signals, _ = harmonic(rng, 67.456, 1 / 25e3, 25_000)
-    t = np.arange(25_000) / 25e3
-    for depth in (0.0, 0.1):
-        modulated = signals * (1 + depth * np.cos(2 * np.pi * 4.8 * t))[:, None]
-        sigma = 0.05 * signals.std(axis=0)
-        size = beating(modulated + sigma * rng.normal(size=signals.shape), 1 / 25e3, 67.456, sigma)
-        assert size == pytest.approx(depth / np.sqrt(2), abs=0.005)
-        assert (size > BEATS) is (depth > 0)
+    for rate in (25_000.0, 1000.0):
+        t = np.arange(int(rate)) / rate
+        for depth in (0.0, 0.1):
+            signal = saw(FREQUENCY * t) * (1 + depth * np.cos(2 * np.pi * 4.8 * t))
+            size = folded(signal[:, None] + 0.02 * rng.normal(size=(len(t), 2)), rate, 40.0, 110.0).sidebands
+            assert size == pytest.approx(depth / np.sqrt(2), abs=0.02)
+            assert (size > BEATS) is (depth > 0)
 
 
 T = np.arange(20_000) / 25e3
@@ -106,17 +88,17 @@ def test_white_noise_is_taken_for_noise_and_an_alikeness_within_its_scatter_is_n
     rng = np.random.default_rng(0)
     for _ in range(300):
         left = rng.normal(size=(1111, 2))
-        assert what_is_left(float(np.sum(left**2)), left.size, [left], stated=True).is_noise
+        assert what_is_left(float(np.sum(left**2)), left.size, [left.T], stated=True).is_noise
     white = rng.normal(size=1112)
     # A moving average with this weight has a correlation of 0.17 and unit variance.
     weight = 0.18
     alike = ((white[1:] + weight * white[:-1]) / np.sqrt(1 + weight**2))[:, None]
-    found = what_is_left(float(np.sum(alike**2)), alike.size, [alike], stated=False)
+    found = what_is_left(float(np.sum(alike**2)), alike.size, [alike.T], stated=False)
     assert 0.13 < found.correlation < 0.21
     assert found.correlated and not found.larger
     # A weak vibration shows in all lags together before it does in the first one.
     vibration = (white[1:] + 0.4 * np.sin(2 * np.pi * np.arange(1111) / 16))[:, None]
-    assert what_is_left(1111.0, 1111, [vibration], stated=False).correlated
+    assert what_is_left(1111.0, 1111, [vibration.T], stated=False).correlated
 
 
 def test_left_overs_are_compared_with_a_stated_noise():

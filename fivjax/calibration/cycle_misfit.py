@@ -1,8 +1,8 @@
 """A measured limit cycle beside that of a scene: one period's waveform, the frequency, and fractions of time in the statuses.
 
-The recording is folded into one period (`folding`). The scene's cycle is closed (`shooting`), and sampled at the same phases in the
-way in which the recording was: at points, by averages, or through a low-pass. Far from the answer only the first harmonics are
-compared, which do not depend on where the recording begins.
+The recording is folded into one period (`folding`). The scene's cycle is closed (`shooting`), and sampled at the same phases in
+the way in which the recording was: at points, by averages, or through a low-pass. Far from the answer only the first harmonics
+are compared, which do not depend on where the recording begins.
 """
 
 import equinox as eqx
@@ -34,7 +34,8 @@ MOST_THROUGH = 64
 
 
 class CycleMisfit(AbstractMisfit):
-    """A limit cycle, compared by one period of its waveform and, if they were measured, its fractions of time in the statuses."""
+    """A limit cycle, compared by one period of its waveform and by its fractions of time in the statuses, if those were
+    measured."""
 
     means: Float[Array, "B k"]
     sigma: Float[Array, "B k"]

@@ -1,12 +1,12 @@
 r"""A periodic recording folded into one period: its frequency, its waveform, its noise, and whether it is periodic at all.
 
-Samples of a vibration of frequency f that are taken at instants t show its waveform at the phases f t, up to whole turns. Over many
-periods these lie close together, however few samples a period has: a thousand samples per second of a vibration of 68 Hz, for a
-second, show a thousand phases. So nothing is lost by a low rate, and nothing is taken for what it is not: the lines that a spectrum
-shows of such samples are the vibration's own lines and, at other frequencies, those that were too high for the rate.
+Samples of a vibration of frequency f that are taken at instants t show its waveform at the phases f t, up to whole turns. Over
+many periods these lie close together, however few samples a period has: a thousand samples per second of a vibration of 68 Hz, for
+a second, show a thousand phases. So a low rate loses nothing. In a spectrum, lines that are too high for the rate would look like
+others.
 
 `folded` finds the frequency, and means of the samples over groups of neighbouring phases, for a few parts of the recording: from
-part to part a waveform that has another frequency moves. What differs between neighbours is noise; what then is left beside the
+part to part a waveform of another frequency moves. What differs between neighbours is noise. What is then left beside the
 fundamental are sidebands, by which a vibration beats or has not settled.
 """
 
@@ -17,8 +17,8 @@ from jaxtyping import Complex, Float
 
 from .noise import rounding, taper
 
-# The most groups: of phases, many, so that few samples lie beside a jump; and of times. Four of these tell the frequency with nearly
-# the error of all samples: the mean square of their times is 15/16 of that of all.
+# The most groups: of phases, many, so that few samples lie beside a jump; and of times. Four of these tell the frequency with
+# nearly the error of all samples: the mean square of their times is 15/16 of that of all.
 PHASES, TIMES = 512, 4
 MOST_HARMONICS = 8
 # Neighbours in phase whose median is the waveform; more of them where there are many samples.
@@ -103,8 +103,8 @@ def _apart(phases, together: int) -> Float[np.ndarray, " g"]:
 def _correction(scaled, t, frequency: float, count: int, by_neighbours: bool) -> float:
     """A step of the frequency (Hz).
 
-    A sample at time t changes by t times the waveform's slope (by phase) for each Hz. What a sample differs by from its neighbours
-    in phase, whose times are others, therefore tells the frequency, whatever lines the waveform has.
+    A sample at time t changes by t times the waveform's slope (by phase) for each Hz. So what a sample differs by from its
+    neighbours in phase, whose times are others, tells the frequency, whatever lines the waveform has.
     """
     phases = np.mod(frequency * t, 1.0)
     waves = _waves(phases, count)
@@ -130,8 +130,8 @@ def _from_neighbours(samples, phases):
 
 
 def _between_neighbours(ordered):
-    """The noise of single samples, from third differences in the order of phases: they hardly contain a waveform of many samples,
-    and their median ignores its jumps."""
+    """The noise of single samples, from third differences in the order of phases: they hardly contain a waveform of many
+    samples, and their median ignores its jumps."""
     around = np.concatenate([ordered, ordered[:3]])
     return np.median(np.abs(np.diff(around, 3, axis=0)), axis=0) / (0.6745 * np.sqrt(20.0))
 
@@ -141,8 +141,8 @@ def _robust(left):
 
 
 def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
-    """How much a vibration beats: what neighbours in phase differ by, below one and a half times its frequency and above its noise,
-    relative to its fundamental."""
+    """How much a vibration beats: what neighbours in phase differ by, below one and a half times its frequency and above its
+    noise, relative to its fundamental."""
     left = _from_neighbours(scaled, np.mod(frequency * t, 1.0))
     spread = np.maximum(_robust(left), 1e-12)
     weight = taper(len(left))

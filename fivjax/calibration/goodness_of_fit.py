@@ -46,8 +46,8 @@ class WhatIsLeft(NamedTuple):
 def what_is_left(
     squares: float, freedom: int, waveforms: Iterable[Iterable[Float[np.ndarray, " B"]]], stated: bool
 ) -> WhatIsLeft:
-    """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings, one
-    for each channel; `stated`: whether the noise was given.
+    """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings,
+    one for each channel; `stated`: whether the noise was given.
     """
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.

@@ -78,8 +78,8 @@ class AbstractMisfit(eqx.Module):
 
     @abc.abstractmethod
     def compared(self, scene: Scene, own, share: Float[Array, ""]) -> Compared:
-        """The scene compared with the first `share` of the recording. `own`: see there; with a guess of the cycle before it, where
-        there is one."""
+        """The scene compared with the first `share` of the recording. `own`: what the method of that name gives; for a limit
+        cycle a pair of a guess of the cycle and that."""
 
 
 def sliding_frequencies(scene: Scene, recording: Recording) -> Float[np.ndarray, " m"]:

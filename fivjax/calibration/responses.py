@@ -101,8 +101,8 @@ def _integrals(method, mechanics, segment: Segment, channels: tuple[Channel, ...
 def sliding_throughout(
     scene: Scene, sampled: Sampled, begin: Float[Array, ""], channels: tuple[Channel, ...]
 ) -> Response:
-    """The response from steady sliding for constant friction, if no contact ever stops sliding: exact, from one jump of the load
-    to the next."""
+    """The response from steady sliding for constant friction, if no contact ever stops sliding: exact, from one jump of the
+    load to the next."""
     edges, width, blocks = sampled.edges(begin), sampled.width, sampled.count
     points = sampled.per_block
     # Displacements are not changes of anything that is known: their averages are those of points, with the next order.

@@ -33,8 +33,8 @@ class FitOutcome(enum.StrEnum):
         "compare; record it later or with a slower belt, or record how it starts, as a kick or as sliding"
     )
     TOO_SLOW = (
-        "not fitted: sampled too slowly for the contact's events, whose instants then decide what most samples are; record at a "
-        "higher rate, or through an anti-alias filter and name it with `filter`"
+        "not fitted: sampled too slowly for the contact's events, whose instants then decide what most samples are; record at "
+        "a higher rate, or through an anti-alias filter and name it with `filter`"
     )
     UNSTABLE = (
         "not stable: the limit cycle that fits best would not last in this scene, so it is not what was measured; start "

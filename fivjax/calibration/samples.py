@@ -61,7 +61,7 @@ class Sampled(eqx.Module):
         return jnp.mean(jnp.fft.irfft(spectrum * response, self.count, axis=0)[self.picked], axis=1)
 
     def jumping(self, channels: tuple[Channel, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Which channels' samples jump where the event that they are near moves past one: with accelerations, with velocities."""
+        """Which channels' samples jump where an event moves past them: those with accelerations, and those with velocities."""
         derivatives = np.array([channel.derivative for channel in channels]) - self.averages
         return (derivatives >= 2) & (not self.filtered), (derivatives >= 1) & (not self.filtered)
 

@@ -5,7 +5,8 @@
 3. The waveform is fitted over growing windows, from the best few guesses.
 4. The best fit is tried again some periods earlier and later.
 
-Every fit leaves out what is next to a jump of the motion that it starts from; where it ends with others, it goes on without those.
+Every fit leaves out what is next to a jump of the motion that it starts from; where it ends with others, it goes on without
+those.
 
 If all recordings are of limit cycles, guesses that have a limit cycle are first brought to the measured frequency. Then the
 harmonics are fitted roughly and then the waveform, from one guess after the other until the residuals are noise.

@@ -10,8 +10,8 @@ same equation gives the derivatives, over a single period. (In the derivative of
 thousands of degrees.)
 
 Fourier coefficients are integrals over exactly one period. Where the contact closes, velocities jump and accelerations are
-impulses; the coefficients of an acceleration follow from those of its velocity by differentiation. Samples at points in time see
-no impulse, so its share is known apart.
+impulses; the coefficients of an acceleration follow from those of its velocity by differentiation. Samples at points in time
+see no impulse, so its share is known apart.
 """
 
 from typing import NamedTuple

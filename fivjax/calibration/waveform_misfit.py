@@ -118,8 +118,8 @@ class KickMisfit(AbstractWaveformMisfit):
         return through_events(scene, self.method, y0, sampled, begin, self.channels)
 
     def first(self, scene: Scene) -> Float[np.ndarray, " u"]:
-        """Where to start for the recording's own unknowns: for a state, with the free motion without friction that is closest to
-        the beginning of the recording."""
+        """Where to start for the recording's own unknowns: for a state, with the free motion without friction that is closest
+        to the beginning of the recording."""
         if not self.free:
             return np.zeros(self.unknowns)
         return np.asarray(_closest_start(scene.replace(**self.known), self)) / np.asarray(self.scale)

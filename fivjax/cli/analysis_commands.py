@@ -11,7 +11,7 @@ import fivjax as fj
 
 from .options import SceneOptions
 from .outputs import Overwrite, output_paths, say
-from .parsing import axis, bound, pair
+from .parsing import axis, bound, low_pass, pair
 from .structure_options import StructureOptions
 
 
@@ -75,6 +75,12 @@ class Calibrate:
     """parameters to find, such as `mu c1 k1` or `mu,c1,k1`; all others are taken from the scene"""
     regime: Literal["sliding", "kick", "limit cycle"] = "kick"
     """what was recorded: a small motion about sliding, the response to the scene's kick, or a steady vibration"""
+    sampling: Literal["points", "averages"] = "points"
+    """what a sample is: the value at its instant, or the mean over the time between samples"""
+    filter: Annotated[str | None, tyro.conf.arg(metavar="CUTOFF:ORDER")] = None
+    """anti-alias filter in front of the sampler: a Butterworth low-pass of this cut-off (Hz) and order, such as `400:4`"""
+    y0: tuple[float, ...] | None = None
+    """kick: state at the simulation's start, displacements (m) then velocities (m/s); steady sliding unless given"""
     column: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=CHANNEL …")] = ()
     """channels of columns, such as `Acc_X=acceleration0`; by their names unless given"""
     unit: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=UNIT …")] = ()
@@ -86,7 +92,7 @@ class Calibrate:
     full_scale: float = 1.0
     """value of the largest sample of a .wav, in the channel's unit"""
     offset: tuple[float, float] | None = None
-    """kick: range for the time of the first sample in the simulation (s), 0 to 0.5 unless given"""
+    """kick: range for the time of the first sample in the simulation (s), 0 to 0.5 unless given, or 0 with --y0"""
     bound: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW:HIGH …")] = ()
     """bounds of free parameters, such as `mu=0.05:0.5`"""
     starts: int = 8
@@ -111,6 +117,9 @@ class Calibrate:
                 units=units,
                 full_scale=self.full_scale,
                 offset=self.offset,
+                sampling=self.sampling,
+                filter=None if self.filter is None else low_pass(self.filter),
+                y0=self.y0,
             )
         except ValueError as error:
             raise ValueError(with_options(str(error))) from None
@@ -130,6 +139,9 @@ def with_options(sentence: str) -> str:
         "time": "--time",
         "rate": "--rate",
         "full_scale": "--full-scale",
+        "filter": "--filter",
+        "y0": "--y0",
+        "offset": "--offset",
     }
     sentence = re.sub(
         rf"\b(with|give|Argument) `({'|'.join(options)})`", lambda found: f"{found[1]} `{options[found[2]]}`", sentence

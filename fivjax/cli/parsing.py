@@ -79,6 +79,15 @@ def bound(text: str) -> tuple[str, tuple[float, float]]:
     return name, (low, high)
 
 
+def low_pass(text: str) -> tuple[float, int]:
+    """The cut-off (Hz) and the order of `CUTOFF:ORDER`."""
+    try:
+        cutoff, order = text.split(":")
+        return float(cutoff), int(order)
+    except ValueError:
+        raise ValueError(f"A filter must read CUTOFF:ORDER, such as 400:4, but reads {text!r}.") from None
+
+
 def check_angle(what: str, angle: float) -> None:
     """Refuse an inclination of a right angle or more, which was probably meant in degrees."""
     if math.isfinite(angle) and abs(angle) >= 0.5 * math.pi:

@@ -8,7 +8,7 @@ from ..foundation.quantities import QUANTITIES
 from .style import BLACK, SKY, VERMILION, new_figure
 
 MEASURED, FITTED, LEFT = SKY, BLACK, VERMILION
-UNITS = {"acceleration": "m/s²", "velocity": "m/s"}
+UNITS = {"acceleration": "m/s²", "velocity": "m/s", "displacement": "m"}
 # The number of blocks shown in the detailed view of a fit.
 DETAIL = 160
 
@@ -16,7 +16,7 @@ DETAIL = 160
 def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
     """Every channel of every recording: the beginning in detail, the whole with the residuals of the fit; the parameters above.
 
-    A limit cycle is fitted by its first harmonics: these are drawn, and the residuals contain all higher ones.
+    A limit cycle is drawn over one period, into which the recording was folded.
     """
     rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
     figure = new_figure(figure, 9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows))
