@@ -86,7 +86,9 @@ def points_at(only_case=None, only_rate=None, total=20):
         for rate in RATES if only_rate is None else (int(only_rate),):
             held, scores, outcomes, costs = np.zeros(len(names), int), [], Counter(), []
             for draw in tqdm(range(total), desc=f"{name}, {rate} Hz", disable=None):
-                first = int(np.random.default_rng(3000 + draw).integers(20_000 * earliest, 20_000 * latest))
+                first = int(
+                    np.random.default_rng(3000 + draw).integers(round(20_000 * earliest), round(20_000 * latest))
+                )
                 samples = noisy(accelerations[first :: 20_000 // rate][:rate], 0.02, draw)
                 regime, about = ("limit cycle", {}) if cycle else ("kick", {"offset": (0.0, 0.2)})
                 data = recording(samples, regime, "points", float(rate), **about)

@@ -13,7 +13,6 @@ from fivjax.calibration.least_squares import Evaluated, minimise
 from fivjax.calibration.noise import estimated_noise
 from fivjax.calibration.parameters import FreeParameters
 
-
 FREQUENCY = 67.456
 
 
@@ -49,7 +48,7 @@ def test_a_vibration_that_beats_is_told_from_one_that_repeats():
     for rate in (25_000.0, 1000.0):
         t = np.arange(int(rate)) / rate
         for depth in (0.0, 0.1):
-            signal = saw(FREQUENCY * t) * (1 + depth * np.cos(2 * np.pi * 4.8 * t))
+            signal = (saw(FREQUENCY * t) - np.mean(saw(FREQUENCY * t))) * (1 + depth * np.cos(2 * np.pi * 4.8 * t))
             size = folded(signal[:, None] + 0.02 * rng.normal(size=(len(t), 2)), rate, 40.0, 110.0).sidebands
             assert size == pytest.approx(depth / np.sqrt(2), abs=0.02)
             assert (size > BEATS) is (depth > 0)

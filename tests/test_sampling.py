@@ -51,11 +51,13 @@ def of_blocks(samples, per_block):
     return samples[: len(samples) // per_block * per_block].reshape(-1, per_block, samples.shape[1]).mean(axis=1)
 
 
-@pytest.mark.parametrize("respond", [sliding_throughout, through_events])
-@pytest.mark.parametrize("rate", [2000.0, 500.0])
-def test_points_and_averages_are_those_of_a_run(respond, rate):
+@pytest.mark.parametrize(
+    ("respond", "p"), [(sliding_throughout, 1.2), pytest.param(through_events, 3.0, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("rate", [pytest.param(2000.0, marks=pytest.mark.slow), 500.0])
+def test_points_and_averages_are_those_of_a_run(respond, p, rate):
     """A decaying response and, through events, one with two dozen landings: every block without an event or a jump of the load."""
-    scene = paper(mu=0.2, p=1.2) if respond is sliding_throughout else paper(mu=0.2, p=3.0)
+    scene = paper(mu=0.2, p=p)
     fine = run(scene)
     size = fine.std(axis=0)
     means, found, per_block = predicted(scene, respond, "points", rate)
@@ -64,15 +66,16 @@ def test_points_and_averages_are_those_of_a_run(respond, rate):
     assert np.any(found.landings) == (respond is through_events)
     wanted = of_blocks(fine[FINER::FINER][:COUNT], per_block)
     assert np.abs((means - wanted) / size)[quiet].max() < 1e-6
-    # Averages by Simpson's rule, which jumps spoil.
     means, found, _ = predicted(scene, respond, "averages", rate)
     weight = np.ones(FINER + 1)
     weight[1:-1:2], weight[2:-1:2] = 4.0, 2.0
     windows = np.lib.stride_tricks.sliding_window_view(fine, FINER + 1, axis=0)[FINER // 2 :: FINER][:COUNT]
     wanted = of_blocks(windows @ (weight / weight.sum()), per_block)
-    assert np.abs((means - wanted) / size)[quiet].max() < 1e-5
+    # By Simpson's rule. After a landing a fast vibration has only a dozen of its steps to a period.
+    assert np.abs((means - wanted) / size)[quiet].max() < (1e-5 if respond is sliding_throughout else 2e-4)
 
 
+@pytest.mark.slow
 def test_an_average_holds_the_impulse_of_a_landing():
     """The change of velocity over each step is exact, whatever happens in it."""
     scene = paper(mu=0.2, p=3.0)
@@ -87,16 +90,22 @@ def test_an_average_holds_the_impulse_of_a_landing():
     np.testing.assert_allclose(means[:, 2], wanted, atol=1e-6 * np.abs(wanted).max())
 
 
+def butterworth(order):
+    """SciPy's coefficients of an analogue filter of 400 Hz."""
+    above, below = scipy.signal.butter(order, 2 * np.pi * 400.0, analog=True)  # pyright: ignore[reportGeneralTypeIssues]
+    return above, below
+
+
 def test_a_low_pass_is_butterworths():
     """Against SciPy's analogue filter; half of the power passes at the cut-off."""
     frequencies = np.linspace(0, 3000, 301)
     for order in (1, 2, 5):
-        _, wanted = scipy.signal.freqs(
-            *scipy.signal.butter(order, 2 * np.pi * 400.0, analog=True), 2 * np.pi * frequencies
-        )
+        above, below = butterworth(order)
+        _, wanted = scipy.signal.freqs(above, below, 2 * np.pi * frequencies)
         np.testing.assert_allclose(LowPass(400.0, order)(frequencies), wanted, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [(400.0, 4), lambda frequency: LowPass(400.0, 4)(frequency)])
 def test_samples_through_a_low_pass_are_those_of_the_filtered_motion(given):
     """A kick's response, filtered in time by SciPy from a finely stepped run, with events and impulses."""
@@ -104,11 +113,10 @@ def test_samples_through_a_low_pass_are_those_of_the_filtered_motion(given):
     means, *_ = predicted(scene, through_events, "points", RATE, filter=given)
     dt = 1e-5
     fine = fj.simulate(scene, BEGIN + (COUNT + 1) / RATE, dt)
-    coefficients = scipy.signal.butter(4, 2 * np.pi * 400.0, analog=True)
     # Accelerations are changes of velocity, in which impulses are whole; each is the mean over its step.
     motion = np.diff(fine.velocity[:, 1]) / dt
     middles = 0.5 * (fine.t[1:] + fine.t[:-1])
-    _, filtered, _ = scipy.signal.lsim(scipy.signal.TransferFunction(*coefficients), motion, middles - middles[0])
+    _, filtered, _ = scipy.signal.lsim(scipy.signal.TransferFunction(*butterworth(4)), motion, middles - middles[0])
     instants = BEGIN + np.arange(COUNT) / RATE
     wanted = np.interp(instants, middles, filtered)
     assert np.abs(means[:, 2] - wanted).max() < 3e-3 * np.abs(wanted).max()

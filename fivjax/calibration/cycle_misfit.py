@@ -57,11 +57,8 @@ class CycleMisfit(AbstractMisfit):
     channels: tuple[Channel, ...] = eqx.field(static=True)
     # The shift in time that is left between the phases of the fundamentals, measured and predicted.
     unknowns: int = eqx.field(static=True, default=1)
-
-    @property
-    def projected(self) -> int:
-        """The zeros of the sensors."""
-        return len(self.channels)
+    # The zeros of the sensors.
+    projected: int = eqx.field(static=True, kw_only=True)
 
     @property
     def numbers(self):
@@ -140,8 +137,9 @@ class CycleMisfit(AbstractMisfit):
             else (before[:, k] + 4 * middle[:, k] + later[:, k]) / 6
             for k, channel in enumerate(self.channels)
         ]
-        ends = [jnp.minimum(*jnp.split(part, 3, axis=1)[::2]) for part in (found.from_changes, found.from_landings)]
-        return jnp.stack(columns, axis=1), self._touched(*ends, cycle)
+        sides = [jnp.split(part, 3, axis=1) for part in (found.from_changes, found.from_landings)]
+        changes, landings = (jnp.minimum(begin, end) for begin, _, end in sides)
+        return jnp.stack(columns, axis=1), self._touched(changes, landings, cycle)
 
     def _touched(self, changes, landings, cycle: Cycle) -> Bool[Array, "B k"]:
         reach = BESIDE * self.apart * cycle.period
@@ -196,6 +194,7 @@ def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene)
         sampled=_way(recording, interval),
         beating=jnp.asarray(fold.sidebands),
         channels=recording.channels,
+        projected=len(recording.channels),
     )
 
 

@@ -1,12 +1,12 @@
 r"""A periodic recording folded into one period: its frequency, its waveform, its noise, and whether it is periodic at all.
 
 Samples of a vibration of frequency f that are taken at instants t show its waveform at the phases f t, up to whole turns. Over
-many periods these lie close together, however few samples a period has: a thousand samples per second of a vibration of 68 Hz, for
-a second, show a thousand phases. So a low rate loses nothing. In a spectrum, lines that are too high for the rate would look like
-others.
+many periods these lie close together, however few samples a period has: of a vibration of 68 Hz, a thousand samples per second
+show a thousand phases in a second. So a low rate loses nothing. In a spectrum, lines that are too high for the rate would look
+like others.
 
-`folded` finds the frequency, and means of the samples over groups of neighbouring phases, for a few parts of the recording: from
-part to part a waveform of another frequency moves. What differs between neighbours is noise. What is then left beside the
+`folded` finds the frequency, and means of the samples over groups of neighbouring phases, for a few parts of the recording:
+from part to part a waveform of another frequency moves. What differs between neighbours is noise. What is then left beside the
 fundamental are sidebands, by which a vibration beats or has not settled.
 """
 

@@ -93,7 +93,7 @@ def _through(recording: Recording, blocks: Averaged) -> Through:
     step = interval / finer
     ringing = int(np.ceil(memory(response, step) / step))
     samples = len(blocks.means) * blocks.per_block
-    count = scipy.fft.next_fast_len(2 * ringing + samples * finer, real=True)
+    count = int(scipy.fft.next_fast_len(2 * ringing + samples * finer, real=True))
     frequencies = np.fft.rfftfreq(count, step)
     # A mean over a fine step is itself a low-pass, which is undone.
     factor = response(frequencies) / np.sinc(frequencies * step)

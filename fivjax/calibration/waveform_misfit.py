@@ -91,6 +91,7 @@ class KickMisfit(AbstractWaveformMisfit):
     def own(self, x):
         """The time offset (s) and the state at time 0, None for steady sliding."""
         if self.free:
+            assert self.y0 is not None and self.scale is not None
             return self.reference, self.y0.at[jnp.array(self.free)].set(self.scale * x)
         return (self.reference + OFFSET_UNIT * x[0] if self.unknowns else self.reference), self.y0
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class LowPass(NamedTuple):
         return 1.0 / np.prod(along - poles, axis=-1)
 
 
-def frequency_response(given) -> FrequencyResponse | None:
+def frequency_response(given: Any) -> FrequencyResponse | None:
     """A filter from a pair of cut-off (Hz) and order, or a function of the frequency (Hz); None for none.
 
     **Raises:** `ValueError` or `TypeError`, as a sentence, for anything else, and for a function that does not give one finite
@@ -45,7 +45,7 @@ def frequency_response(given) -> FrequencyResponse | None:
                 f"Argument `filter` must give one finite factor for each frequency in Hz, but gives "
                 f"{arguments.describe(found)} for three."
             )
-        return given
+        return cast(FrequencyResponse, given)
     if not isinstance(given, tuple | list) or len(given) != 2:
         raise TypeError(
             f"Argument `filter` must be a pair of a cut-off in Hz and the order of a Butterworth low-pass, such as "
