@@ -40,10 +40,12 @@ def through_events(
     mechanics, edges = Mechanics(scene), sampled.edges(begin)
     method = for_derivatives(method, mechanics)
     blocks, points, width = sampled.count, sampled.per_block, sampled.width
-    if y0 is None:
+    start = jax.lax.stop_gradient(jnp.minimum(edges[0], 0.0))
+    if y0 is not None:
+        start = jnp.zeros(())
+    else:
         q, _ = steady_sliding(scene, scene.load.force)
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
-    start = jax.lax.stop_gradient(jnp.minimum(edges[0], 0.0))
     # Stretches end at the blocks' edges and at the load's jumps; one outside has no effect, not even on a derivative.
     inside = (scene.load.jumps >= start) & (scene.load.jumps <= edges[-1])
     ends = jnp.where(inside, scene.load.jumps, jax.lax.stop_gradient(jnp.clip(scene.load.jumps, start, edges[-1])))

@@ -201,6 +201,13 @@ def misfit_of_waveform(
 
 def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventful: bool, common: dict) -> KickMisfit:
     low, high = recording.offset
+    # What is predicted begins this much before the first sample; before a known state nothing is known.
+    before = -float(common["edges"][0] + common["sampled"].lead)
+    if recording.y0 is not None and common["sampled"].averages and low < before:
+        raise ValueError(
+            f"Argument `offset` of a recording with `y0` must be at least {before:.3g} s, but is {low:g}: its first averages, or "
+            f"what its filter remembers, would begin before the state `y0`. Leave out the recording's first samples."
+        )
     kick = KickMisfit(
         **common,
         method=method,
@@ -215,7 +222,7 @@ def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventfu
         return kick
     n, keep = scene.structure.size, free_in_sliding(scene.structure)
     free = tuple(int(place) for place in (*keep, *(n + keep)))
-    parts = (jnp.zeros(2 * n), jnp.ones(len(free)), jnp.zeros(()))
+    parts = (jnp.zeros(2 * n), jnp.ones(len(free)), jnp.asarray(before))
     kick = dataclasses.replace(kick, y0=parts[0], scale=parts[1], reference=parts[2], free=free, unknowns=len(free))
     guess = np.abs(kick.first(scene).reshape(2, -1)).max(axis=1)
     scale = jnp.asarray(np.repeat(np.where(guess > 0, guess, 1.0), len(keep)))
