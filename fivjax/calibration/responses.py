@@ -49,7 +49,7 @@ def through_events(
     # Stretches end at the blocks' edges and at the load's jumps; one outside has no effect, not even on a derivative.
     inside = (scene.load.jumps >= start) & (scene.load.jumps <= edges[-1])
     ends = jnp.where(inside, scene.load.jumps, jax.lax.stop_gradient(jnp.clip(scene.load.jumps, start, edges[-1])))
-    ends = jnp.sort(jnp.concatenate([edges, ends]))
+    ends = jnp.maximum(jnp.sort(jnp.concatenate([edges, ends])), start)
     begins = jnp.concatenate([start[None], ends[:-1]])
     block = jnp.searchsorted(edges, 0.5 * (begins + ends), side="right") - 1
 

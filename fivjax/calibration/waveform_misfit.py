@@ -206,7 +206,7 @@ def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventfu
     if recording.y0 is not None and common["sampled"].averages and low < before:
         raise ValueError(
             f"Argument `offset` of a recording with `y0` must be at least {before:.3g} s, but is {low:g}: its first "
-            f"averages, or what its filter remembers, would begin before the state `y0`. Leave out the recording's first samples."
+            f"averages, or what its filter remembers, would begin before the state `y0`. Leave out its first samples."
         )
     kick = KickMisfit(
         **common,
