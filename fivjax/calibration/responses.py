@@ -56,7 +56,9 @@ def through_events(
     def to_next(carry, stretch):
         y, contact = carry
         t, end, block = stretch
-        samples = edges[block] + width * (jnp.arange(points) + 0.5) / points - t
+        samples = edges[block] + width * (jnp.arange(points) + 0.5) / points
+        # Rounding must not put a sample at the start before it.
+        samples = jnp.where(jnp.abs(samples - start) < 1e-6 * width, start, samples) - t
 
         def add(total, segment: Segment):
             sums, near = total
