@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Mechanics, State
+from ..foundation.matrix_factors import exponential
 from ..io.recordings import Channel
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
@@ -134,9 +135,9 @@ def sliding_throughout(
 def _slid(scene: Scene, begin, width, blocks: int, at: Float[Array, " p"]) -> Float[Array, "3 b p m"]:
     """Displacement, velocity and acceleration of the free coordinates, `at` these times (s) after the start of each block."""
     matrix, keep = linear_sliding(scene).matrix, free_in_sliding(scene.structure)
-    steps = powers(jax.scipy.linalg.expm(width * matrix), blocks)
+    steps = powers(exponential(width * matrix), blocks)
     step = at[1] - at[0] if len(at) > 1 else jnp.zeros(())
-    fine = powers(jax.scipy.linalg.expm(step * matrix), len(at)) @ jax.scipy.linalg.expm(at[0] * matrix)
+    fine = powers(exponential(step * matrix), len(at)) @ exponential(at[0] * matrix)
     instants = begin + width * jnp.arange(blocks)[:, None] + at
 
     def equilibrium(force):
@@ -149,11 +150,11 @@ def _slid(scene: Scene, begin, width, blocks: int, at: Float[Array, " p"]) -> Fl
     pushes = jnp.zeros_like(states)
     jump_times = scene.load.jumps
     for k in range(jump_times.shape[0]):
-        z = rest + jax.scipy.linalg.expm((jump_times[k] - since) * matrix) @ (z - rest)
+        z = rest + exponential((jump_times[k] - since) * matrix) @ (z - rest)
         since = jump_times[k]
         until = jump_times[k + 1] if k + 1 < jump_times.shape[0] else jnp.inf
         rest = equilibrium(scene.load(since + jnp.minimum(0.5 * (until - since), 1.0)))
-        first = steps @ (jax.scipy.linalg.expm((begin - since) * matrix) @ (z - rest))
+        first = steps @ (exponential((begin - since) * matrix) @ (z - rest))
         away = jnp.einsum("pij,bj->bpi", fine, first)
         later = (instants >= since)[..., None]
         states, pushes = jnp.where(later, away + rest, states), jnp.where(later, away @ matrix.T, pushes)
