@@ -1,19 +1,27 @@
 """Where a map keeps its finished jobs, and the description by which a resumed map is recognised."""
 
+import re
 from importlib import metadata
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 
+from .. import contact as physics
 from ..batches.sharing import bytes_per_trajectory, in_bulk, kernels_by
+from ..cycles.section_map import mechanics_about_sliding
 from ..foundation import arguments
-from ..io.datasets import describe
+from ..foundation.traced_code import digest, is_from_outside
+from ..model.description import code_of, describe
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .plan import in_a_job
 from .store import Store, is_store
 from .trajectories import Grid
+
+# Packages whose versions may change a map's last bits.
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
 
 
 def keeper_at(
@@ -29,11 +37,12 @@ def keeper_at(
     arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part", or of a folder "map.zarr"')
     run = {
         "fivjax": metadata.version("fivjax"),
-        "jax": jax.__version__,
+        **{package: metadata.version(package) for package in PACKAGES},
         **kernels_by(method, scene, energy),
         "device": jax.devices()[0].device_kind,
         "scene": describe(scene),
-        "method": repr(method),
+        "method": re.sub(r" at 0x[0-9a-f]+", "", repr(method)),
+        "code": code_of(scene) | _code_of_method(method, scene),
         **limits,
         "axes": {name: values.tolist() for name, values in grid.axes.items()},
     }
@@ -43,3 +52,18 @@ def keeper_at(
     each = bytes_per_trajectory(scene, of_group)
     tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group))
     return Store(path, run, grid, tile, energy)
+
+
+def _code_of_method(method: AbstractStepper, scene: Scene) -> dict[str, str]:
+    """A digest of what a stepper of a user's own computes; the others are fixed by fivjax's version."""
+    if not is_from_outside(method):
+        return {}
+    state, one = jnp.ones(2 * scene.structure.size), jnp.ones(())
+    return {"stepper": digest(_of_method, method, scene, state, one)}
+
+
+def _of_method(method: AbstractStepper, scene: Scene, y, one):
+    mechanics = mechanics_about_sliding(scene)
+    prepared, contact = method.prepare(mechanics), physics.status_from_forces(mechanics, one, y)
+    advances = [method.advance(prepared, contact, one, y, one, at_section) for at_section in (False, True)]
+    return prepared, advances, method.within(prepared, contact, one, y, one)

@@ -8,9 +8,12 @@ import html
 import json
 from collections.abc import Iterator, Mapping
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.quantities import QUANTITIES
+from ..foundation.traced_code import digest
 from .belt import belt_oscillator
 from .contact_point import ContactPoint
 from .friction import AbstractFriction
@@ -36,6 +39,42 @@ def describe(scene) -> dict:
         **_places(structure),
         "coordinates": list(structure.coordinates),
     }
+
+
+def code_of(scene) -> dict[str, str]:
+    """Digests of what the friction law, the load and the structure compute: a description has their names and parameters only,
+    which do not tell what a class or a builder of one's own does.
+    """
+    one = jnp.ones(())
+    laws = scene.friction.laws if isinstance(scene.friction, FrictionPerContact) else (scene.friction,)
+    return {
+        "friction law": " ".join(digest(_of_law, law, one) for law in laws),
+        "load": digest(_of_load, scene.load, one),
+        "structure": digest(_of_structure, scene.structure, scene.structure.parameters),
+    }
+
+
+def _of_law(law: AbstractFriction, speed):
+    law = _made_again(law)
+    own_series = type(law).next_term is not AbstractFriction.next_term
+    series = law.next_term([speed, speed, speed], [speed, speed]) if own_series else None
+    # With the derivative: a law may define its own.
+    return law.static, jax.jvp(law, (speed,), (jnp.ones_like(speed),)), law.variation(speed), series
+
+
+def _of_load(load: AbstractLoad, t):
+    load = _made_again(load)
+    return load.force, load.final, load.jumps, load(t)
+
+
+def _of_structure(structure: Structure, parameters: Mapping):
+    made = structure.replace(**parameters)
+    return made, made.matrices, made.damping_parts
+
+
+def _made_again(part):
+    """A law or a load as `Scene.replace` makes it for other values."""
+    return type(part)(**{name: value for name, value in vars(part).items() if value is not None})
 
 
 def _laws(friction: AbstractFriction) -> str | list[str]:
