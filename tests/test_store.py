@@ -75,7 +75,8 @@ def test_a_broken_chunk_is_run_again(paper_scene, tmp_path, jobs_run):
     fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
     (path / "amplitude" / "c" / "1" / "0").write_bytes(b"half a chu")
     (path / "verdict" / "c" / "2" / "0").unlink()
-    m = fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
+    with pytest.warns(UserWarning, match="file `amplitude/c/1/0` is not what was written"):
+        m = fj.bistability_map(paper_scene, resume=path, progress=False, **AXES)
     assert [mu.min() for mu in run[3:]] == [AXES["mu"][2], AXES["mu"][4]]
     np.testing.assert_array_equal(m["amplitude"], expected()[1])
     np.testing.assert_array_equal(xr.open_zarr(path)["amplitude"], expected()[1])

@@ -9,6 +9,8 @@ What is found of a group depends on its parameters and on those of the group tha
 their number, nor on who is in the same job.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -42,17 +44,20 @@ def search(
     columns: Float[np.ndarray, " h"],
     found: dict[int, Attractors],
     report,
+    complete: Callable[[list[int]], None],
 ) -> None:
     """Adds to those `found` the attractors of the groups in `seeds`, each with the group that seeds it: itself, where it is
-    searched from an ensemble. `columns` are the load's histories of any trajectory.
+    searched from an ensemble. `columns` are the load's histories of any trajectory. `complete` is told of groups whose search
+    is over, some at a time.
     """
 
     def by_ensembles(groups: list[int]) -> None:
         for g in groups:
             found[g] = Attractors([], [])
         for start in range(0, len(groups), ENSEMBLES):
-            part = np.array(groups[start : start + ENSEMBLES])
-            _by_ensembles(batch, kernels, shared, maps, part, columns, found, report)
+            part = groups[start : start + ENSEMBLES]
+            _by_ensembles(batch, kernels, shared, maps, np.array(part), columns, found, report)
+            complete(part)
 
     by_ensembles(sorted({seed for seed in seeds.values() if seed not in found}))
     seeded = sorted(g for g in seeds if g not in found)
@@ -60,6 +65,7 @@ def search(
     for start in range(0, len(seeded), ENSEMBLES):
         part = seeded[start : start + ENSEMBLES]
         _continued(maps, {g: seeds[g] for g in part}, found, report)
+        complete([g for g in part if found[g].cycles or found[g].tori])
     by_ensembles([g for g in seeded if not (found[g].cycles or found[g].tori)])
 
 

@@ -18,6 +18,7 @@ from .captures import CROSSINGS, MORE_CROSSINGS, Cycle, distinct
 from .conclusion import slide_forever
 from .flattened import Flattened
 from .following import begun, compile_conclusions, follow
+from .halfway import Halfway, Log, NoLog
 from .kernels import Kernels, begin_building
 from .parting import followed_on
 from .progress import Progress
@@ -52,6 +53,7 @@ def follow_all(
     verdicts: Verdicts,
     index: np.ndarray,
     report: Callable[[int], None],
+    log: Log | None = None,
 ) -> None:
     """Follow trajectories that fit in memory together; writes the results of those not run yet at `index`.
 
@@ -60,8 +62,10 @@ def follow_all(
     `states` are the names of `values` that are initial displacements and velocities.
 
     `known` has the attractors of groups, by the group's parameters, and gets those that are found; `report` is told how many
-    have ended.
+    have ended. `log` keeps the state between rounds, and has the one from which an interrupted run goes on; for this the
+    trajectories must be all those of `verdicts`.
     """
+    log = NoLog() if log is None else log
     of_groups, group = grouped(values, states)
     of_groups, seeds = with_seeding(of_groups, seeding[np.unique(group, return_index=True)[1]])
     if batch.by_kernel:
@@ -80,6 +84,18 @@ def follow_all(
     limit = np.maximum(LEAST_TIME, LEAST_PERIODS * shared.tree.modes.slowest_period) if t_max is None else t_max
     limit = np.broadcast_to(limit, len(of_groups))
     done = 0
+    if (earlier := log.last()) is not None:
+        done, own_from, pending = earlier.done, earlier.own_from, earlier.pending
+        trajectories = Flattened(earlier.numbers, trajectories.form)
+        basins.go_on(earlier)
+        known.update(earlier.known)
+        for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(earlier.verdicts), strict=True):
+            whole[:] = own
+        report(len(index) - len(pending))
+
+    def state() -> Halfway:
+        return basins.halfway(done, own_from, verdicts, pending, trajectories.numbers, known)
+
     while True:
         _, now = trajectories.tree
         verdict = np.array(now.verdict)
@@ -102,18 +118,21 @@ def follow_all(
         ended = Ended(verdict, *_described(len(pending), entered | at_last, chaotic))
         chosen = np.flatnonzero(finished)
         record(verdicts, index[pending[finished]], *(_rows(part, chosen) for part in (now, ended)))
-        report(int(finished.sum()))
-        if finished.all():
-            return
         pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
+        # A run that begins here comes to the same: it finds nothing more to conclude.
+        log.note(state(), at_once=done == known_from or done >= own_from)
+        report(int(finished.sum()))
+        if not len(pending):
+            return
         if done == known_from:
-            basins.search(np.unique(group[pending]), columns, known, report)
+            basins.search(np.unique(group[pending]), columns, known, report, lambda: log.note(state()))
         elif done >= own_from:
             crossings = CROSSINGS if done < MORE_FROM * batch.method.round else MORE_CROSSINGS
             basins.search_alone(pending, trajectories.tree[1], crossings, report)
             own_from = OWN_AGAIN * done
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(batch.method.round, done // LOOKS), max(max_steps - done, 1))
+        log.moving()
         follow(batch, kernels, shared, group[pending], trajectories, steps)
         done += steps
 
@@ -177,15 +196,31 @@ class Basins:
         self.settled_by = np.zeros(len(of_groups))  # s
         self.most_time = MOST_PERIODS * np.asarray(shared.tree.modes.slowest_period)  # for which cycles are waited, s
 
-    def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report) -> None:
-        """Finds the attractors of these groups, where they are not `known`."""
+    def halfway(self, done: int, own_from: int, verdicts: Verdicts, pending, numbers, known) -> Halfway:
+        """The state of the job, with what is known of attractors by now."""
+        mine, last = ({g: one.copy() for g, one in of.items()} for of in (self.known, self.known_at_last))
+        return Halfway(done, own_from, verdicts, pending, numbers, self.settled_by.copy(), dict(known), mine, last)
+
+    def go_on(self, earlier: Halfway) -> None:
+        """Go on from that state."""
+        self.known, self.known_at_last = dict(earlier.of_groups), dict(earlier.at_last)
+        self.settled_by = earlier.settled_by
+        if self.known:
+            self.maps = ReturnMaps(self.batch, self.shared, self.kernels)
+
+    def search(self, groups: np.ndarray, columns: np.ndarray, known: dict[bytes, Attractors], report, keep) -> None:
+        """Finds the attractors of these groups, where they are not `known`; `keep` is called when some are found."""
         self.maps = ReturnMaps(self.batch, self.shared, self.kernels)
         keys = [row.tobytes() for row in self.of_groups]
         seeds = {int(g): int(self.seeds[g]) for g in groups if keys[g] not in known}
         found = {g: known[keys[g]] for g in {*seeds, *seeds.values()} if keys[g] in known}
+
+        def add(groups: list[int]) -> None:
+            known.update((keys[g], found[g]) for g in groups)
+            keep()
+
         # Ensembles are released after all kicks, so any of these will do.
-        search(self.batch, self.kernels, self.shared, self.maps, seeds, columns[0], found, report)
-        known.update((keys[g], one) for g, one in found.items())
+        search(self.batch, self.kernels, self.shared, self.maps, seeds, columns[0], found, report, add)
         for g in groups:
             # Without what trajectories find by themselves.
             self.known[int(g)] = known[keys[g]].copy()

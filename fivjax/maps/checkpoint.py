@@ -1,27 +1,32 @@
 """The finished jobs of a long run, kept in one file while the run goes on.
 
 A checkpoint is a file with one value per trajectory of each result, and a description of the run it belongs to. It is always
-written as a whole under another name and then renamed (`io.datasets.save`), so at any instant, even after a power failure, the
-file is some earlier state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the
-results of one that was not interrupted.
+written as a whole under another name and then renamed, so at any instant, even after a power failure, the file is some earlier
+state of the run. It contains a job as a whole or not at all, so a resumed run gives, bit for bit, the results of one that was
+not interrupted. Jobs that are under way are kept beside it, in a folder that exists only while there are any (`job_files`).
 """
 
 import json
+import shutil
 import time
 import warnings
 from pathlib import Path
 
 import jax
 import numpy as np
-import xarray as xr
 
 from ..batches.attractors import Attractors
 from ..batches.results import Verdicts, by_name, not_run
-from ..io.datasets import check_writable, save
+from ..io.files import check_writable, replace_whole
+from ..io.seals import Damaged
+from ..verdicts.verdict import Verdict
+from . import checkpoint_file
 from .attractor_files import from_bytes, to_bytes
+from .checkpoint_file import KIND as KIND
+from .checkpoint_file import Contents
+from .job_files import file_of
 from .trajectories import Places
 
-KIND = "fivjax checkpoint"
 # Time between writes, s: long enough to cost nothing, short enough to lose little.
 KEEP_EVERY = 2.0
 
@@ -35,66 +40,105 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
-        self.path, self.run = path, run
-        self.found: dict[int, dict[bytes, Attractors]] = {}
-        self.verdicts = not_run(total, energy)
+        self.path, self.run = Path(path), run
+        self.verdicts, self.found = not_run(total, energy), {}
+        self._new, self._done = False, []
         kept = recall(path, run)
         if kept is not None:
-            for place, content in json.loads(kept.pop("found", np.zeros(0, np.uint8)).tobytes() or "{}").items():
-                self.found[int(place)] = from_bytes(bytes.fromhex(content))
-            parts = {name: kept.pop(name) for name in Verdicts._fields if name != "energy"}
-            self.verdicts = Verdicts(**parts, energy=kept)
-        self._written, self._new = time.monotonic(), False
+            for name, values in by_name(self.verdicts).items():
+                values[:] = kept.results[name]
+            self._new = self._leave_out_damage(kept)
+            self.found = {place: from_bytes(content) for place, content in kept.found.items()}
+        self._written = time.monotonic()
+
+    def _leave_out_damage(self, kept: Contents) -> bool:
+        """Damaged results count as not run; whether there are any, or other damage."""
+        for name, parts in kept.damaged.items():
+            for part in parts:
+                warnings.warn(
+                    f"Checkpoint `{self.path}` is damaged: the `{name}` of trajectories {part.start} to {part.stop - 1} is not "
+                    f"what was written. These trajectories are computed anew.",
+                    stacklevel=5,
+                )
+                self.verdicts.verdict[part] = Verdict.NOT_RUN
+        if kept.elsewhere:
+            warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=5)
+        return bool(kept.damaged) or kept.elsewhere
 
     def recalled(self, places: Places | None) -> Verdicts:
         """The results kept of these trajectories (all, unless given)."""
         chosen = slice(None) if places is None else places
         return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
+    def job_file(self, places: Places) -> tuple[str, str]:
+        """The path and the key of the file for the job with these trajectories."""
+        return file_of(self._jobs, self.run, places)
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         """Keep the results of a job; they are written if it is time."""
-        if found:
+        if found is not None:
             self.found[int(places[0])] = found
         for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(verdicts), strict=True):
             whole[places] = own
         self._new = True
+        self._done.append(places)
         if time.monotonic() - self._written >= KEEP_EVERY:
             self.flush()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Remove the folder of jobs under way if there are none."""
+        if not self.verdicts.pending().any():
+            shutil.rmtree(self._jobs, ignore_errors=True)
 
     def flush(self) -> None:
         """Write results that are not written yet."""
         if not self._new:
             return
-        found = json.dumps({place: to_bytes(part).hex() for place, part in self.found.items()}).encode()
-        results = {**by_name(self.verdicts), "found": np.frombuffer(found, np.uint8)}
-        keep(self.path, self.run, results)
-        self._written, self._new = time.monotonic(), False
+        found = {place: to_bytes(part) for place, part in self.found.items()}
+        self._written = time.monotonic()
+        if keep(self.path, self.run, by_name(self.verdicts), found):
+            self._new = False
+            for places in self._done:
+                Path(self.job_file(places)[0]).unlink(missing_ok=True)
+            self._done = []
+
+    @property
+    def _jobs(self) -> Path:
+        return jobs_beside(self.path)
 
 
-def recall(path: str | Path, run: dict) -> dict[str, np.ndarray] | None:
-    """The results kept in a checkpoint, by name; None if there is no such file yet.
+def jobs_beside(path: Path) -> Path:
+    """The folder of the jobs under way, beside a checkpoint."""
+    return path.with_name(f"{path.name}.jobs")
+
+
+def recall(path: str | Path, run: dict) -> Contents | None:
+    """What is kept in a checkpoint; None if there is no such file yet.
 
     `run` describes the run in plain Python values (that `json` can hold).
 
-    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, and
-    the checkpoint of another run, naming the first difference.
+    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a file that is no checkpoint, one
+    whose list of contents is damaged, and the checkpoint of another run, naming the first difference.
     """
     path = check_writable(path)
     if not path.exists():
         return None
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            kept = file.load()
-        theirs = json.loads(kept.attrs["run"]) if kept.attrs.get("kind") == KIND else None
-    except (OSError, ValueError, KeyError):
-        theirs = None
-    if theirs is None:
-        raise ValueError(f"File `{path}` is not a checkpoint of fivjax; give another path for the checkpoint.")
-    refuse_other_run(f"Checkpoint `{path}`", theirs, run)
-    return {str(name): kept[name].values for name in kept.data_vars}
+        data = path.read_bytes()
+        kept = checkpoint_file.read(data)
+    except OSError as error:
+        raise ValueError(f"Checkpoint `{path}` cannot be read: {error.strerror}.") from None
+    except Damaged:
+        if KIND.encode() not in data:
+            raise ValueError(
+                f"File `{path}` is not a checkpoint of fivjax; give another path for the checkpoint."
+            ) from None
+        raise ValueError(
+            f"Checkpoint `{path}` has no list of its contents with checksums that are right: it is damaged, or a version of "
+            f"fivjax wrote it that kept none. Delete it to begin the run anew, or put an undamaged copy in its place."
+        ) from None
+    refuse_other_run(f"Checkpoint `{path}`", kept.run, run)
+    return kept
 
 
 def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
@@ -104,31 +148,42 @@ def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
     """
     ours = json.loads(json.dumps(run))
     for name in [*ours, *theirs]:
-        if ours.get(name) != theirs.get(name):
+        if _differ(ours.get(name), theirs.get(name)):
             raise ValueError(
                 f"{what} is of another run: {_difference(name, theirs.get(name), ours.get(name))}. "
                 f"Resume it with the arguments it was begun with, or give another path."
             )
 
 
-def keep(path: str | Path, run: dict, results: dict[str, np.ndarray]) -> None:
-    """Write the checkpoint; if the disk does not take it, warn and leave the earlier one."""
-    # All results are over trajectories, except for the attractors, which are bytes.
-    over = {name: "byte" if name == "found" else "trajectory" for name in results}
-    dataset = xr.Dataset({name: (over[name], values) for name, values in results.items()})
-    dataset.attrs.update(kind=KIND, run=json.dumps(run))
+def keep(path: Path, run: dict, results: dict[str, np.ndarray], found: dict[int, bytes]) -> bool:
+    """Write the checkpoint; if the disk does not take it, warn and leave the earlier one. Whether it was written."""
     try:
-        save(dataset, path)
+        replace_whole(check_writable(path), checkpoint_file.written(run, results, found))
     except (OSError, ValueError) as error:
         warnings.warn(
             f"Checkpoint `{path}` could not be written ({error}); the run goes on and will try again.", stacklevel=3
         )
+        return False
+    return True
+
+
+def _differ(ours, theirs) -> bool:
+    """Whether values differ in any bit: in the order of names, in the sign of a zero."""
+    return json.dumps(ours) != json.dumps(theirs)
 
 
 def _difference(name: str, theirs, ours) -> str:
+    if name == "code":
+        part = next(part for part in [*ours, *theirs] if ours.get(part) != theirs.get(part))
+        return (
+            f"the code of its {part} is not that of this run's, or a constant or a field in it that is no parameter of the "
+            f"scene is another"
+        )
     if isinstance(theirs, dict) and isinstance(ours, dict):
+        if list(theirs) != list(ours) and set(theirs) == set(ours):
+            return f"its {name} are in the order {', '.join(theirs)} and not {', '.join(ours)}"
         for inner in [*ours, *theirs]:
-            if theirs.get(inner) != ours.get(inner):
+            if _differ(ours.get(inner), theirs.get(inner)):
                 return _difference(inner, theirs.get(inner), ours.get(inner))
     short = [text if len(text) <= 40 else f"{text[:37]}..." for text in map(json.dumps, (theirs, ours))]
     return f"its `{name}` is {short[0]} and not {short[1]}"

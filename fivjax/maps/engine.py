@@ -43,8 +43,12 @@ class Keeper(Protocol):
         """The results of an earlier run of these trajectories (all, unless given), in their order."""
         ...
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors]) -> None:
-        """Keep the results of the job with these trajectories."""
+    def job_file(self, places: Places) -> tuple[str, str]:
+        """The path and the key of the file in which the job with these trajectories keeps how far it has come."""
+        ...
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
+        """Keep the results of the job with these trajectories; of its attractors, those that are needed later."""
         ...
 
     def flush(self) -> None:
@@ -136,7 +140,12 @@ def _follow(
     """Run the jobs of one part of the plan whose results are missing in the `rows` of each, and add the attractors that they
     find.
     """
-    missing = [number for number in part if np.any(verdicts.pending(rows(number)))]
+
+    def is_missing(number: int) -> bool:
+        lost = needed_later and keeper is not None and int(plan.jobs[number][0]) not in keeper.found
+        return lost or bool(np.any(verdicts.pending(rows(number))))
+
+    missing = [number for number in part if is_missing(number)]
     found: dict[int, dict[bytes, Attractors]] = {}
     if keeper is not None and keeper.found:
         found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
@@ -146,7 +155,9 @@ def _follow(
         seeding = plan.trajectories.seeding(plan.jobs[number])
         own = grouped(values, tuple(plan.task.states))[0] if attractors else np.zeros((0, seeding.shape[1]))
         keys = {row.tobytes() for row in (*own, *np.unique(seeding, axis=0))}
-        return Job(plan.task, values, seeding, {key: attractors[key] for key in keys & attractors.keys()})
+        known = {key: attractors[key] for key in keys & attractors.keys()}
+        file = (None, "") if keeper is None else keeper.job_file(plan.jobs[number])
+        return Job(plan.task, values, seeding, known, *file)
 
     def write(number: int, results: Verdicts) -> None:
         for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(results), strict=True):
@@ -156,7 +167,7 @@ def _follow(
         write(number, result.verdicts)
         found[number] = result.found
         if keeper is not None:
-            keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else {})
+            keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else None)
         if workers is not None:
             ended(len(plan.jobs[number]))
 
@@ -201,7 +212,7 @@ def _run_here(
             raise KeyboardInterrupt
 
     def interrupted(number: int, results: Verdicts) -> None:
-        # Results of an interrupted job are returned but not kept on disk, so that all results kept are of whole jobs.
+        # Results of an interrupted job are returned but not kept with the others, which are of whole jobs.
         if not over:
             write(number, results)
 

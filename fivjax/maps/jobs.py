@@ -1,7 +1,8 @@
 """A map as independent jobs: each is a pure function from its data to its results, for any process on any machine.
 
-A job runs some trajectories of a map. Its results follow from the job alone, not from the worker or from other jobs. A job is
-run as a whole or not at all, so an interrupted map continues with its missing jobs.
+A job runs some trajectories of a map. Its results follow from the job alone, not from the worker or from other jobs. A map
+keeps the results of whole jobs, so an interrupted map continues with its missing jobs; one that was under way goes on from its
+own file (`job_files`).
 """
 
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.windowed import Windowed
+from .job_files import JobFile
 
 
 class Task(NamedTuple):
@@ -46,6 +48,8 @@ class Job(NamedTuple):
     values: dict[str, np.ndarray]
     seeding: Float[np.ndarray, "r k"]  # see `Grid.seeding`
     known: dict[bytes, Attractors]
+    file: str | None = None  # where it keeps how far it has come,
+    key: str = ""  # and what the file calls this job of this run
 
 
 class Done(NamedTuple):
@@ -65,7 +69,7 @@ def run_job(
     """The results of a job.
 
     It may use `threads` of the process it runs in. `report` gets the number of trajectories that have ended and may stop the
-    job by an exception; `interrupted` then gets the verdicts known by then.
+    job by an exception; `interrupted` then gets the verdicts known by then, and the job's file what it takes to go on.
     """
     if threads is None:
         # Also in a pool that a user has made: its workers would wait for jobs of a killed process for ever.
@@ -74,7 +78,7 @@ def run_job(
             return run_job(job, one, report, interrupted)
     task = job.task
     total = len(next(iter(job.values.values())))
-    verdicts, known = not_run(total, task.energy), dict(job.known)
+    verdicts, known, log = not_run(total, task.energy), dict(job.known), JobFile(job.file, job.key)
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, task.scene)
     batch = Batch(
         scene=scene,
@@ -99,8 +103,10 @@ def run_job(
             verdicts,
             np.arange(total),
             report or (lambda count: None),
+            log,
         )
     except KeyboardInterrupt:
+        log.flush()
         if interrupted is not None:
             interrupted(verdicts)
         raise
