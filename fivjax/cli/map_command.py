@@ -1,6 +1,7 @@
 """`fivjax map`: a bi-stability map over two parameters."""
 
 import dataclasses
+import shutil
 import warnings
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,7 @@ import tyro
 
 import fivjax as fj
 
+from ..maps.checkpoint import jobs_beside
 from .options import MethodOptions
 from .outputs import Failure, Interrupted, Overwrite, output_paths, say
 from .parsing import axis, number
@@ -71,7 +73,9 @@ class Map:
         folder = None if self.resume == Path() else self.resume
         if folder is not None and folder.suffix != ".zarr":
             raise ValueError(f"Option `--resume` must name a folder that ends in .zarr, but is `{folder}`.")
-        going_on = asked and (folder or unfinished).exists()
+        jobs = jobs_beside(unfinished)
+        begun = [path for path in (unfinished, jobs) if path.exists()]
+        going_on = asked and bool(folder.exists() if folder else begun)
         data, picture = output_paths(self.out, self.overwrite or going_on, ".nc", ".png")
         axes = dict(map(axis, (self.x, self.y)))
         if len(axes) != 2:
@@ -80,9 +84,9 @@ class Map:
             raise ValueError(
                 "Option `--belt-speed` must not be zero: a map starts from steady sliding, which a belt at rest does not have."
             )
-        if unfinished.exists() and not asked:
+        if begun and not asked:
             raise ValueError(
-                f"An interrupted map is kept in `{unfinished}`. Go on with it by `--resume`, or delete the file to begin anew."
+                f"An interrupted map is kept in {_listed(begun)}. Go on with it by `--resume`, or delete that to begin anew."
             )
         scene, method = self.scene.scene(), self.method.stepper()
         try:
@@ -104,9 +108,10 @@ class Map:
             fj.save(dataset, data)
             fj.save_figure(fj.plot.bistability(dataset), picture)
         except KeyboardInterrupt:
-            raise Interrupted(_how_to_resume(folder, unfinished)) from None
+            raise Interrupted(_how_to_resume(folder, unfinished, jobs)) from None
         if folder is None:
             unfinished.unlink(missing_ok=True)
+            shutil.rmtree(jobs, ignore_errors=True)
         say(data, picture)
         counts = {verdict: int((dataset["verdict"] == verdict).sum()) for verdict in fj.Verdict}
         for verdict, count in counts.items():
@@ -121,9 +126,14 @@ def _in_words(verdict) -> str:
     return verdict.name.lower().replace("_", " ")
 
 
-def _how_to_resume(folder: Path | None, unfinished: Path) -> str:
+def _listed(paths: list[Path]) -> str:
+    return " and ".join(f"`{path}`" for path in paths)
+
+
+def _how_to_resume(folder: Path | None, *files: Path) -> str:
     if folder is not None:
         return f"Interrupted; what is finished is kept in `{folder}`. Go on with the same command."
-    if not unfinished.exists():
+    kept = [path for path in files if path.exists()]
+    if not kept:
         return "Interrupted before any trajectory was finished; nothing was written."
-    return f"Interrupted; what is finished is kept in `{unfinished}`. Go on with the same command and `--resume`."
+    return f"Interrupted; what is finished is kept in {_listed(kept)}. Go on with the same command and `--resume`."

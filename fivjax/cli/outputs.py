@@ -22,11 +22,16 @@ class Failure(Exception):
 def output_paths(stem: Path, overwrite: bool, *endings: str) -> tuple[Path, ...]:
     """The files of a result, by endings such as `.nc`; checked before any work is done.
 
-    **Raises:** `ValueError` if the option names no file, if a folder does not exist or cannot be written, and for existing
-    files unless they may be overwritten.
+    **Raises:** `ValueError` if the option names no file or a folder, if a folder does not exist or cannot be written, and for
+    existing files unless they may be overwritten.
     """
     if not stem.name:
         raise ValueError(f"Option `--out` must name the files to write, such as `--out result`, but is `{stem}`.")
+    if stem.is_dir():
+        raise ValueError(
+            f"Option `--out` must name the files to write, but `{stem}` is a folder. Name files in it, such as "
+            f"`--out {stem / 'result'}`."
+        )
     stem = stem.with_suffix("") if stem.suffix in (".nc", ".png") else stem
     paths = tuple(check_writable(stem.with_name(stem.name + ending)) for ending in endings)
     if not overwrite:

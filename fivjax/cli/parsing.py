@@ -7,11 +7,15 @@ import tyro
 
 from ..foundation.digits import apart
 
+# The most values of an axis.
+MOST_VALUES = 10**7
+
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     """The name and values of an axis from `NAME=FROM:TO:COUNT`.
 
-    **Raises:** `ValueError` for anything else, ends that are not finite or not increasing, and fewer than `least` values.
+    **Raises:** `ValueError` for anything else, ends that are not finite or not increasing, and fewer than `least` values or
+    more than `MOST_VALUES`.
     """
     try:
         name, values = text.split("=")
@@ -23,6 +27,11 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
         ) from None
     if points < least:
         raise ValueError(f"Axis `{name}` must have at least {number(least, 'value')}, but its COUNT is {points}.")
+    if points > MOST_VALUES:
+        raise ValueError(
+            f"Axis `{name}` must have at most {MOST_VALUES:,} values, but asks for {points:,}: {8 * points:,} bytes, before "
+            f"anything is computed for them."
+        )
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError(f"Axis `{name}` must be finite, but goes from {low:g} to {high:g}.")
     if points > 1 and not high > low:

@@ -2,17 +2,18 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Mapping
 
 import numpy as np
 
+from ..batches.results import by_name, not_run
 from ..foundation import arguments
 from ..linear.critical import critical_friction
 from ..model.scene import Scene, refuse_vector_contacts
 from ..steppers.base import AbstractStepper
-from .trajectories import Grid
 
-# The most trajectories of a map: some 10 GB of results, and days of work.
+# The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
 MOST_TRAJECTORIES = 10**8
 
 
@@ -41,19 +42,36 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     return checked
 
 
-def checked_grid(axes: dict[str, np.ndarray], states: Sequence[str] = ()) -> Grid:
-    """One trajectory for each combination of values on the axes; the axes named in `states` are initial displacements and
-    velocities.
+def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
+    """Check how many trajectories axes ask for, before anything is made of their values; each interval is halved so often.
 
-    **Raises:** `ValueError` for more trajectories than a map may have.
+    **Raises:** `ValueError`, with the number of bytes, for more than a map may have, or than this machine has memory for.
     """
-    total = math.prod(len(values) for values in axes.values())
-    if total > MOST_TRAJECTORIES:
-        raise ValueError(
-            f"The axes ask for {total:.3g} trajectories, whose results no memory holds; the most is "
-            f"{MOST_TRAJECTORIES:.0e}. Give fewer values, or make several maps."
-        )
-    return Grid(axes, states)
+    counts = {name: (_count(values) - 1) * 2**halvings + 1 for name, values in axes.items()}
+    total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
+    if total <= MOST_TRAJECTORIES and total * each <= _memory():
+        return
+    listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())
+    raise ValueError(
+        f"The axes ask for {total:,} trajectories ({listed}), whose results alone take {total * each:,} bytes. The most is "
+        f"{MOST_TRAJECTORIES:,} trajectories, and what the memory of this machine holds. Give fewer values, or make several "
+        f"maps."
+    )
+
+
+def _count(values) -> int:
+    try:
+        return max(len(values), 1)  # none are refused later
+    except TypeError:  # one number
+        return 1
+
+
+def _memory() -> float:
+    """The memory of this machine, in bytes."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # Windows
+        return math.inf
 
 
 def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:

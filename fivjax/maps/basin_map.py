@@ -14,13 +14,14 @@ from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .axes import check_run, checked_axes, checked_grid, linear_limit
+from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset
 from .engine import run_to_verdict
 from .executors import with_workers
 from .resuming import keeper_at
 from .shares import wilson
 from .states import state_places
+from .trajectories import Grid
 
 
 @in_double_precision
@@ -73,9 +74,10 @@ def basins(
         raise ValueError(f"A map of basins needs at least one displacement or velocity as its axis: {names}.")
     if not kick:
         scene = under_final_load(scene)
+    check_size(axes)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
-    grid = checked_grid(axes, tuple(states))
+    grid = Grid(axes, tuple(states))
     _check_gap(scene, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):

@@ -14,12 +14,13 @@ from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .axes import check_run, checked_axes, checked_grid, linear_limit
+from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .executors import with_workers
 from .refinement import audit_note, finer, refined
 from .resuming import keeper_at
+from .trajectories import Grid
 
 
 @in_double_precision
@@ -108,8 +109,9 @@ def bistability_map(
         )
     arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
+    check_size(axes, refine, bool(energy))
     axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
-    grid = checked_grid(axes)
+    grid = Grid(axes)
     limits = {"t_max": t_max, "max_steps": int(max_steps), "energy": bool(energy)}
     limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
     keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))

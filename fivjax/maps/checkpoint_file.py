@@ -1,4 +1,4 @@
-"""The bytes of a checkpoint: NetCDF for any reader, and behind it a list of its contents with checksums, by which fivjax reads it.
+"""The bytes of a checkpoint: NetCDF for any reader, and behind it a list of its contents with checksums, for fivjax.
 
 A checksum stands for so many values of a result. Damage to one costs these; damage to the rest of the NetCDF costs nothing,
 because the list says where the results are. Only of the list itself must every bit be right.

@@ -1,7 +1,7 @@
 """How far a job has come, kept in a file of its own while it runs, by whichever process runs it.
 
-An interrupted job goes on from there, with the same bits as without the interruption. The file names the run and the job that it
-belongs to and carries a checksum; one that is damaged, or of another job, is not used. It is removed when the job is done.
+An interrupted job goes on from there, with the same bits as without the interruption. The file names the run and the job that
+it belongs to and carries a checksum; one that is damaged, or of another job, is not used. It is removed when the job is done.
 """
 
 import contextlib

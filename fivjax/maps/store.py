@@ -2,10 +2,10 @@
 trajectories.
 
 The folder is a Zarr group that `xarray.open_zarr` reads at any time: one array per result over the map's axes, in which
-trajectories that have not been run have the verdict `NOT_RUN`. A chunk is the part of the grid that one job computes, and ends in
-a checksum (Zarr's codec `crc32c`). Only the process that hands out the jobs writes chunks, so a chunk has one writer; a file lock
-keeps other processes out. The verdicts of a job are written last, after all its other results are on the disk: a chunk with
-verdicts is complete, even if the process is killed. A chunk that cannot be read counts as not run.
+trajectories that have not been run have the verdict `NOT_RUN`. A chunk is the part of the grid that one job computes, and ends
+in a checksum (Zarr's codec `crc32c`). Only the process that hands out the jobs writes chunks, so a chunk has one writer; a file
+lock keeps other processes out. The verdicts of a job are written last, after all its other results are on the disk: a chunk
+with verdicts is complete, even if the process is killed. A chunk that cannot be read counts as not run.
 """
 
 import contextlib

@@ -18,7 +18,7 @@ from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
-from .axes import check_run, checked_axes, linear_limit
+from .axes import check_run, check_size, checked_axes, linear_limit
 from .critical_derivatives import differentiable, with_derivatives
 from .crossing import NO_KICK, Crossing, first_crossings, with_ends
 from .datasets import time_limit
@@ -121,6 +121,8 @@ def critical_perturbation(
     arguments.real_number("p_range[1]", high, above=low)
     arguments.real_number("p_step", p_step, above=0, maximum=float(high) - float(low))
     arguments.real_number("tolerance", tolerance, above=0)
+    scanned = round(min((high - low) / p_step, 1e15)) + 1
+    check_size({**axis, "p": range(scanned)}, energy=bool(energy))
     axes = checked_axes(scene, axis)
     shape = tuple(len(values) for values in axes.values())
     columns = {
@@ -131,7 +133,7 @@ def critical_perturbation(
     run = functools.partial(
         run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={}, executor=executor
     )
-    scan = np.linspace(low, high, round((high - low) / p_step) + 1)
+    scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)
     fine, contradicted = _narrowed(run, method, columns, *_to_narrow(scan, verdicts, seen), tolerance)
