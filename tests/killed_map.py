@@ -37,11 +37,12 @@ def main(folder: str, name: str, delay: str) -> int:
     started = []
 
     def keep_and_arm(*args):
-        keep(*args)
+        written = keep(*args)
         if name != "none" and not started:
             started.append(threading.Timer(float(delay), os.kill, (os.getpid(), getattr(signal, name))))
             started[0].daemon = True
             started[0].start()
+        return written
 
     checkpoint.keep = keep_and_arm
     out = Path(folder) / "map"

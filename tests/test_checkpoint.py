@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 
+import jax
 import killed_map
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ import xarray as xr
 import fivjax as fj
 from fivjax import cli
 from fivjax.batches import rounds
+from fivjax.batches.attractors import Attractors
+from fivjax.batches.halfway import Halfway
 from fivjax.batches.kernels import Kernels
 from fivjax.batches.results import Ended, not_run, record
-from fivjax.maps import checkpoint, plan
+from fivjax.maps import checkpoint, job_files, plan
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 
@@ -69,6 +72,61 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
     monkeypatch.setattr(rounds, "follow_all", None)
     assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
+
+
+@pytest.mark.parametrize("calls", [3, 12])
+def test_an_interrupted_job_goes_on_from_where_it_was(paper_scene, whole, tmp_path, monkeypatch, calls):
+    """A map of one job, stopped before and after its search for attractors: rounds that are done are not done again."""
+    real, made = Kernels.follow, []
+
+    def counting(*args):
+        made.append(1)
+        if len(made) == stop:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(Kernels, "follow", counting)
+    monkeypatch.setattr(job_files, "KEEP_EVERY", 0.0)
+    path, stop = tmp_path / "map.part", 0
+    fj.bistability_map(paper_scene, progress=False, resume=tmp_path / "whole.part", **AXES)
+    total, stop = len(made), calls
+    made.clear()
+    with pytest.warns(UserWarning, match="Interrupted"):
+        fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    stop = 0
+    made.clear()
+    assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
+    # The round that was interrupted is the only one that is repeated; in a search, its last part.
+    assert total > calls and len(made) <= total - calls + 3
+    assert {entry.name for entry in tmp_path.iterdir()} == {"map.part", "whole.part"}
+
+
+def test_the_state_of_a_job_comes_back_from_its_file_bit_for_bit(tmp_path):
+    """And is not that of another job, nor of another run."""
+    rng, folder = np.random.default_rng(0), tmp_path / "map.part.jobs"
+    verdicts = not_run(5, energy=True)
+    for values in verdicts.energy.values():
+        values[:] = rng.normal(size=5)
+    state = Halfway(
+        done=64,
+        own_from=128,
+        verdicts=verdicts,
+        pending=np.array([1, 4]),
+        numbers=rng.normal(size=(2, 7)),
+        settled_by=rng.random(3),
+        known={b"group": Attractors([], [])},
+        of_groups={2: Attractors([], [])},
+        at_last={},
+    )
+    file = job_files.JobFile(*job_files.file_of(folder, {"of": 1}, np.arange(5)))
+    file.note(state)
+    file.flush()
+    again = job_files.JobFile(*job_files.file_of(folder, {"of": 1}, np.arange(5))).last()
+    assert again is not None
+    for mine, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(state), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    for run, places in (({"of": 2}, np.arange(5)), ({"of": 1}, np.arange(4))):
+        assert job_files.JobFile(*job_files.file_of(folder, run, places)).last() is None
 
 
 def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():

@@ -147,7 +147,8 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["simulate", "--k1", "0", "--k2", "0"], ["singular"]),
         (["simulate", "--t1", "1e9", "--dt-save", "1e-9"], ["`dt_save`", "rows"]),
         (["map", "--force", "nan"], ["`force`", "finite"]),
-        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "memory"]),
+        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "46,000,000,000,000 bytes"]),
+        (["map", "--x", "mu=0:1:100000000"], ["`mu`", "800,000,000 bytes"]),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip
@@ -166,6 +167,7 @@ def test_where_to_write_is_asked_first(folder, capsys, command):
     for out, fragment in (
         ("missing/out", "does not exist"),
         ("taken", "is a folder"),
+        ("taken.nc/", "`taken.nc` is a folder. Name files in it"),
         ("good.csv/out", "not a folder"),
     ):
         with untouched(folder):
@@ -211,7 +213,7 @@ def test_resuming_what_is_another_map(folder, capsys):
     (folder / "text.unfinished").write_text("notes")
     message = refused_on_the_command_line(capsys, ["map", "--out", "text", "--resume"])
     assert "is not a checkpoint" in message
-    checkpoint.keep(folder / "other.unfinished", {"fivjax": "0.0"}, {"verdict": np.zeros(4, np.int8)})
+    checkpoint.keep(folder / "other.unfinished", {"fivjax": "0.0"}, {"verdict": np.zeros(4, np.int8)}, {})
     with untouched(folder):
         assert "of another run" in refused_on_the_command_line(capsys, ["map", "--out", "other", "--resume"])
         assert "--resume" in refused_on_the_command_line(capsys, ["map", "--out", "other"])
