@@ -61,7 +61,8 @@ def test_a_flipped_bit_is_never_a_result(paper_scene, tmp_path, jobs_run, kind):
             try:
                 m = the_map(paper_scene, path)
             except ValueError as error:
-                assert "damaged" in str(error)
+                if "damaged" not in str(error):
+                    raise
                 refusals += 1
             else:
                 assert all(m[name].values.tobytes() == right[name].values.tobytes() for name in right.data_vars)

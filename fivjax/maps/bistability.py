@@ -61,7 +61,8 @@ def bistability_map(
     - `resume`: a file in which finished jobs are kept while the map runs, every few seconds; or a folder named `*.zarr`, for
       maps of many million trajectories, in which each job is kept at once and which `xarray.open_zarr` reads at any time (extra
       `fivjax[zarr]`). If it exists, the map goes on from there: after any interruption the same call, on this machine or
-      another, gives the same map, bit for bit. The file is not deleted at the end.
+      another, gives the same map, bit for bit. What was damaged on the disk meanwhile is named in a warning and computed
+      anew. The file is not deleted at the end.
     - `executor`: what runs the jobs: threads of this process unless given, or anything like
       `concurrent.futures.ProcessPoolExecutor` (loky, `mpi4py.futures`), a Dask `Client`, or a function that makes one of these.
       The map is the same, bit for bit. A job that lost its worker is run again; one that loses its worker three times while it

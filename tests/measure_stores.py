@@ -1,0 +1,159 @@
+"""What a map keeps on the disk: interrupted and killed commands, flipped bits, and two processes that begin one store.
+
+    python tests/measure_stores.py [interrupted] [killed] [flipped] [at_once]
+
+`FIVJAX_TIMES` is the number of interrupts, kills or flips (20, 50 and 200 unless given); `FIVJAX_WITHOUT=warp` hides Warp.
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import fivjax as fj
+
+HERE = Path(__file__).parent
+COMMAND = [sys.executable, "-c", "import sys; from fivjax import cli; sys.exit(cli.main(sys.argv[1:]))"]
+# Hides Warp from a process that imports it at its start.
+HIDING = """
+import importlib.machinery as machinery
+found = machinery.PathFinder.find_spec
+def find_spec(name, path=None, target=None):
+    return None if name.partition(".")[0] == "warp" else found(name, path, target)
+machinery.PathFinder.find_spec = staticmethod(find_spec)
+"""
+
+
+def times(usual: int) -> int:
+    return int(os.environ.get("FIVJAX_TIMES", usual))
+
+
+def command(folder: Path, *options: str, points: int = 64) -> subprocess.Popen:
+    """`fivjax map` in a folder."""
+    (folder / "hiding").mkdir(exist_ok=True)
+    paths = [str(HERE.parent)]
+    if os.environ.get("FIVJAX_WITHOUT") == "warp":
+        (folder / "hiding" / "sitecustomize.py").write_text(HIDING)
+        paths.append(str(folder / "hiding"))
+    axes = ["--x", f"mu=0.05:0.228:{points}", "--y", f"p=1:4:{points}"]
+    return subprocess.Popen(
+        [*COMMAND, "map", *axes, "--out", str(folder / "map"), *options],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=folder,
+    )
+
+
+def same(one: xr.Dataset, other: xr.Dataset) -> bool:
+    return all(one[name].values.tobytes() == other[name].values.tobytes() for name in one.data_vars)
+
+
+def interrupted() -> None:
+    """`fivjax map --resume`, 64 × 64, stopped by SIGINT at random instants until it is whole, again and again."""
+    _stopped(signal.SIGINT, times(20))
+
+
+def killed() -> None:
+    """The same by SIGKILL."""
+    _stopped(signal.SIGKILL, times(50))
+
+
+def _stopped(number: int, count: int) -> None:
+    rng, stops, lost, maps, took = random.Random(0), 0, [], 0, 0.0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for _ in range(2):  # so that the second finds its code compiled
+            begin = time.time()
+            assert command(folder, "--overwrite").wait() == 0
+            took = time.time() - begin
+        whole = fj.open(folder / "map.nc")
+        while stops < count:
+            (folder / "map.nc").unlink(missing_ok=True)
+            (folder / "map.png").unlink(missing_ok=True)
+            while not (folder / "map.nc").exists():
+                process, begin = command(folder, "--resume"), time.time()
+                try:
+                    process.wait(rng.uniform(0.2, 1.0) * took if stops < count else None)
+                except subprocess.TimeoutExpired:
+                    written = [file.stat().st_mtime for file in folder.glob("map.unfinished*/*.job")]
+                    now = time.time()
+                    process.send_signal(number)
+                    text = process.communicate()[0]
+                    stops += 1
+                    lost.append(now - max([begin, *written]))
+                    assert "Traceback" not in text, text
+                else:
+                    assert process.returncode == 0, process.communicate()[0]
+            maps += 1
+            assert same(fj.open(folder / "map.nc"), whole)
+            assert {file.name for file in folder.glob("map.*")} == {"map.nc", "map.png"}
+            print(f"map {maps}: whole after {stops} stops in all", flush=True)
+    print(
+        f"{stops} times {signal.Signals(number).name}, {maps} maps of {took:.0f} s, all with the same bits; since the last state "
+        f"on the disk (or the start of the command) at most {max(lost):.1f} s, on average {np.mean(lost):.1f} s"
+    )
+
+
+def flipped() -> None:
+    """A bit flipped anywhere in what a small map has kept, in one file and in a folder; then resumed."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, fj.Pulse(100.0, 1.2))
+    axes = {"mu": np.linspace(0.1, 0.227, 4), "p": np.linspace(1.0, 4.0, 4)}
+
+    def run(path=None):
+        return fj.bistability_map(scene, resume=path, progress=False, t_max=8.0, **axes)
+
+    whole, rng = run(), random.Random(0)
+    for kind in ("part", "zarr"):
+        outcome = {"same bits": 0, "same bits, with a warning": 0, "a sentence": 0, "wrong": 0}
+        with tempfile.TemporaryDirectory() as name:
+            path = Path(name, f"map.{kind}")
+            run(path)
+            files = [file for file in ([path] if kind == "part" else sorted(path.rglob("*"))) if file.is_file()]
+            before = {file: file.read_bytes() for file in files if file.name != ".lock"}
+            for _ in range(times(200)):
+                file = rng.choice(list(before))
+                data = bytearray(before[file])
+                data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+                file.write_bytes(data)
+                with warnings.catch_warnings(record=True) as told:
+                    warnings.simplefilter("always")
+                    try:
+                        again = run(path)
+                    except ValueError as error:
+                        if "damaged" not in str(error):
+                            raise
+                        outcome["a sentence"] += 1
+                    else:
+                        right = "same bits, with a warning" if told else "same bits"
+                        outcome[right if same(again, whole) else "wrong"] += 1
+                for file, content in before.items():
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    file.write_bytes(content)
+        print(f"{kind}: {outcome}", flush=True)
+
+
+def at_once() -> None:
+    """Two commands that begin the same store at the same instant."""
+    with tempfile.TemporaryDirectory() as name:
+        for _ in range(times(5)):
+            both = [command(Path(name), "--resume", "map.zarr", "--overwrite", points=16) for _ in range(2)]
+            texts = [process.communicate()[0] for process in both]
+            print(sorted(process.returncode for process in both), *[text.strip().splitlines()[-1] for text in texts])
+            assert not any("Traceback" in text for text in texts)
+
+
+if __name__ == "__main__":
+    studies = {"interrupted": interrupted, "killed": killed, "flipped": flipped, "at_once": at_once}
+    for word in sys.argv[1:] or studies:
+        print(f"--- {word}: {studies[word].__doc__}", flush=True)
+        studies[word]()
