@@ -424,7 +424,7 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch, check):
             raise PermissionError(13, "Permission denied")
 
         # An administrator may write to any folder, so the system's refusal is simulated.
-        monkeypatch.setattr(files.tempfile, "NamedTemporaryFile", denied)
+        monkeypatch.setattr(files, "try_to_write", denied)
         with refused(ValueError, str(tmp_path), "cannot be written", "Permission denied"):
             check(tmp_path / "result.nc")
 
