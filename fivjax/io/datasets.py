@@ -65,12 +65,13 @@ def save(result, path: str | Path) -> Path:
         fj.save(fj.bistability_map(scene, mu=…, p=…), "map.nc")
 
     **Arguments:** `result`, an xarray dataset or an object that turns into one: a `Trajectory`, a `Calibration`, sensitivities;
-    `path`, the file, which is replaced if it exists.
+    `path`, the file. One that exists is replaced and keeps its permissions; where the path is a symbolic link, the file that it
+    leads to is written.
 
     **Returns:** the path.
 
-    **Raises:** `TypeError` for an object that is no result, `ValueError` for a path that cannot be written, `OSError` if the
-    disk is full.
+    **Raises:** `TypeError` for an object that is no result, `ValueError` for a path that cannot be written or leads to no
+    file (a folder, a device, a FIFO), `OSError` if the disk is full.
 
     **Example:**
 
