@@ -124,7 +124,7 @@ def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkey
     shown = io.StringIO()
     monkeypatch.setattr(progress, "tqdm", lambda **options: REAL(**{**options, "file": shown, "mininterval": 0}))
 
-    def two_rounds(batch, values, seeding, states, known, t_max, max_steps, verdicts, index, report):
+    def two_rounds(batch, values, seeding, states, known, t_max, max_steps, verdicts, index, report, *_):
         report(0)
         first = shown.getvalue()
         assert "map, compiling …" in first and "trajectories" in first

@@ -100,10 +100,11 @@ MU = ["--free", "mu"]
         (["good.csv", *MU, "--unit", "t=fortnight"], ["fortnight"]),
         (["good.csv", *MU, "--rate", "0"], ["`--rate`", "positive"]),
         (["good.csv", *MU, "--full-scale", "-1"], ["`--full-scale`", "positive"]),
-        (["good.csv", *MU, "--offset", "0.5", "0.1"], ["`offset`", "go up"]),
-        (["good.csv", *MU, "--offset", "0", "0.1", "--regime", "limit cycle"], ["`offset`", '"kick"']),
+        (["good.csv", *MU, "--offset", "0.5", "0.1"], ["`--offset`", "go up"]),
+        (["good.csv", *MU, "--offset", "0", "0.1", "--regime", "limit cycle"], ["`--offset`", '"kick"']),
         (["good.csv", *MU, "--starts", "0"], ["`starts`", "at least 1"]),
-        (["good.csv", *MU, "--belt-speed", "0"], ["`belt_speed`", "zero"]),
+        # In the regime "kick" this is a free decay.
+        (["good.csv", *MU, "--belt-speed", "0", "--regime", "sliding"], ["`belt_speed`", "zero"]),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,
 )  # fmt: skip

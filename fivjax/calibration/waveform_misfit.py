@@ -153,15 +153,22 @@ def _inside(matrix, sampled: Sampled) -> Float[Array, "m m"]:
     return jnp.mean(each, axis=0)
 
 
+def _closest_start(scene: Scene, mine: KickMisfit) -> Float[np.ndarray, " u"]:
+    waves, means, equilibrium = map(np.asarray, _weighted_waves(scene, mine))
+    # By NumPy: columns may depend on each other.
+    return equilibrium + np.linalg.lstsq(waves, means)[0][: len(mine.free)]
+
+
 @compiled
-def _closest_start(scene: Scene, mine: KickMisfit) -> Float[Array, " u"]:
+def _weighted_waves(scene: Scene, mine: KickMisfit):
+    """The beginning of the recording, the free motions that may explain it as columns, and the equilibrium."""
     linear = linear_sliding(scene)
     waves = free_waves(scene, linear.frictionless, mine.sampled, mine.channels)
     # Friction at a standstill shifts the position about which it vibrates.
     waves = jnp.concatenate([waves, zeros_of_displacements(mine.channels, len(mine.means))], axis=2)
     weight = window(mine.edges, jnp.asarray(BEGINNING))[:, None] / mine.sigma
-    found = jnp.linalg.lstsq((weight[..., None] * waves).reshape(-1, waves.shape[-1]), (weight * mine.means).ravel())[0]
-    return linear.equilibrium[jnp.array(mine.free)] + found[: len(mine.free)]
+    columns = (weight[..., None] * waves).reshape(-1, waves.shape[-1])
+    return columns, (weight * mine.means).ravel(), linear.equilibrium[jnp.array(mine.free)]
 
 
 def misfit_of_waveform(

@@ -10,7 +10,6 @@ import tyro
 
 import fivjax as fj
 
-from ..maps.checkpoint import jobs_beside
 from .options import MethodOptions
 from .outputs import Failure, Interrupted, Overwrite, output_paths, say
 from .parsing import axis, number
@@ -66,6 +65,8 @@ class Map:
 
     def run(self) -> None:
         import numpy as np
+
+        from ..maps.checkpoint import jobs_beside
 
         # When the interrupted map was begun, its files were checked already.
         (unfinished,) = output_paths(self.out, True, ".unfinished")
