@@ -23,12 +23,13 @@ def slides_uniquely(mechanics: Mechanics) -> Bool[Array, ""]:
     """Whether the matrix of sliding is a P-matrix for all directions of slip. With more than `ALL` contacts it may say so
     although a principal minor of more than `TOGETHER` contacts is not positive.
     """
+    # Every motion that slides or comes to rest passes through these slip speeds.
+    largest = mechanics.friction.largest(jnp.abs(mechanics.belt_speed))
     if not mechanics.several:
-        static = mechanics.friction.static
-        one = jnp.ones_like(static)
-        return (mechanics.normal_compliance(one, static) > 0) & (mechanics.normal_compliance(-one, static) > 0)
+        one = jnp.ones_like(largest)
+        return (mechanics.normal_compliance(one, largest) > 0) & (mechanics.normal_compliance(-one, largest) > 0)
     _, g_tn, g_nn = mechanics.compliance
-    count, dragged = len(mechanics.places), g_tn.T * mechanics.friction.static
+    count, dragged = len(mechanics.places), g_tn.T * largest
     unique, determinants = jnp.ones((), bool), jax.vmap(jax.vmap(determinant))
     for size in range(1, 1 + (count if count <= ALL else TOGETHER)):
         subsets = np.array(list(itertools.combinations(range(count), size)))

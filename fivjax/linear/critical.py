@@ -1,7 +1,6 @@
 """Where steady sliding loses its stability: critical friction and critical slope of the friction law."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -10,6 +9,7 @@ from ..foundation.compiling import compiled
 from ..foundation.kept_programs import kept
 from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
+from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
@@ -186,7 +186,7 @@ def friction_slope(scene: Scene) -> Float[Array, ""]:
         -0.0389
     """
     scene = as_scene(_a_scene(scene), None, 1)
-    return jax.grad(lambda speed: scene.friction(speed))(jnp.abs(scene.belt_speed))
+    return slope_of(scene.friction, jnp.abs(scene.belt_speed))
 
 
 def _a_scene(scene):

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, Status
 from ..foundation.linear_solve import solve
+from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
 from ..model.structure import Structure
@@ -70,11 +71,14 @@ def linear_sliding(scene: Scene) -> LinearSliding:
     # compliance and d = G_nn M⁻¹e_t - G_nt M⁻¹e_n. Bounds on χ' and χ'' over slip speed follow from those on μ.
     _, g_tn, g_nn = mechanics.compliance
     along = g_nn * mechanics.from_tangential - g_tn * mechanics.from_normal
-    slope, curvature = mechanics.friction.variation(LOWEST_SLIP * jnp.abs(scene.belt_speed))
-    static = mechanics.friction.static
+    speed = jnp.abs(scene.belt_speed)
+    slope, curvature = mechanics.friction.bounds(LOWEST_SLIP * speed)
+    # The bounds hold while slip changes by less than this share of the belt speed, and so friction by no more than this.
+    most = jnp.abs(friction) + slope * LOWEST_SLIP * speed
     compliance = jnp.minimum(
-        mechanics.normal_compliance(direction, jnp.zeros_like(static)), mechanics.normal_compliance(direction, static)
+        mechanics.normal_compliance(direction, jnp.zeros_like(most)), mechanics.normal_compliance(direction, most)
     )
+    compliance = jnp.where(compliance > 0, compliance, 0.0)  # and then there is no bound
     return LinearSliding(
         equilibrium=equilibrium,
         matrix=state_matrix(mass, damping, stiffness),
@@ -90,7 +94,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
         reach=jnp.full_like(compliance, LOWEST_SLIP),
         direction=direction,
         exists=(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
-        solvable=(compliance > 0) & (mechanics.normal_compliance(-direction, static) > 0),
+        solvable=physics.slides_uniquely(mechanics),
     )
 
 
@@ -114,7 +118,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     dragging = direction * mu
     mass, damping, stiffness = sliding_matrices(scene.structure, dragging)
     if not law.constant:
-        _, slopes = jax.jvp(lambda v: law(v), (speed,), (jnp.ones_like(speed),))
+        slopes = slope_of(law, speed)
         free = sliding_coordinates(n, mechanics.normal)
         along = jnp.asarray(free[:, None] == mechanics.tangential, damping.dtype)
         damping = damping + (along * (normal_force * slopes)) @ along.T
@@ -131,7 +135,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     _, g_tn, g_nn = mechanics.compliance
     handed_on = solve(g_nn + g_tn.T * dragging, g_tn.T)
     columns = mechanics.from_tangential - (mechanics.from_tangential * dragging + mechanics.from_normal) @ handed_on
-    slope, curvature = law.variation(LOWEST_SLIP * speed)
+    slope, curvature = law.bounds(LOWEST_SLIP * speed)
     forces = jnp.abs(normal_force)
     changes = jnp.abs(handed_on) * (slope * speed)
     most = LOWEST_SLIP * jnp.max(jnp.sum(changes, axis=1))
@@ -171,7 +175,7 @@ def slope_damping(scene: Scene, normal_force: Float[Array, ""]) -> Float[Array, 
     if scene.friction.constant:
         # With constant friction the sliding motion is linear and the same about any state.
         return jnp.zeros_like(speed)
-    return normal_force * jax.grad(lambda v: scene.friction(v))(speed)
+    return normal_force * slope_of(scene.friction, speed)
 
 
 def tangential_corner(structure: Structure) -> np.ndarray:

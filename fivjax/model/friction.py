@@ -1,41 +1,52 @@
 """Friction laws: the coefficient of friction as a function of slip speed.
 
 A law is a callable of the slip speed |v_rel| ≥ 0 (m/s). The direction of slip, and whether the contact slides at all, are
-worked out in `contact`. Laws are smooth in the slip speed, also a little below zero, so that a step may go past the instant
-where sliding ends.
+worked out in `contact`.
 """
 
-import abc
-import math
+from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.jet import jet
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision, is_known, real
+from ..foundation.smoothness import is_smooth
+from ..foundation.taylor import composed, taylor_coefficients
 from .printing import as_call
 
-# Slip speeds at which a law is checked, in m/s.
-SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 121)])
+# A law is checked at these shares of the fastest slip that is looked at: so many times the belt's speed, or so many m/s where
+# that is zero or unknown.
+SHARES = np.concatenate([[0.0], np.geomspace(1e-9, 1.0, 121)])
+TIMES = 10.0
+# Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
+LOOKED_AT = np.linspace(0.0, 1.0, 33)
+
+# Gives the next Taylor coefficient in time of μ, from those of the slip speed up to the same order and from those of μ so far.
+NextTerm = Callable[[list[Array], list[Array]], Array]
 
 
 class AbstractFriction(eqx.Module):
     r"""A friction law: what `contact` and the verdicts ask of one, and what they rely on.
 
-    - `law(v)` is the coefficient at slip speed $v \ge 0$ in m/s, smooth and also defined a little below zero.
-    - $0 \le μ(v) \le$ `static` for all $v \ge 0$: a contact with less static than sliding friction would chatter without end,
-      and Painlevé's limit is checked with `static`.
+    - `law(v)` is the coefficient at slip speed $v \ge 0$ in m/s: any JAX function that is continuous, with loops, branches
+      and tables if need be. Where it has a kink, steps end there.
+    - `static`, the largest |T|/N that a sticking contact holds, is at least μ(0): a contact with less static than sliding
+      friction would chatter without end. Unless defined, it is μ(0). At higher speeds μ may exceed it.
     - `variation(v)` bounds $|μ'|$ and $|μ''|$ at and above $v$ (in s/m and s²/m²): proofs that sliding goes on rest on it.
+      Unless defined, nothing is known, and such verdicts stay undecided.
     - `constant` says that μ never changes.
+    - `smooth` says whether μ has no kinks, at speeds above zero. Unless said, that is read from the code: a law that compares,
+      clips or takes from a table may have some. Then a bound on $|μ''|$ is worth nothing and is not used.
 
-    A scene checks this where values are known, at slip speeds from 0 to 1e6 m/s, and holds the law's numbers in double
-    precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes by
-    the same name.
+    A scene checks this where values are known, at slip speeds from 0 to ten times the belt's, and holds the law's numbers in
+    double precision. Fields are the law's parameters; what `replace` and maps change must be a field that the constructor takes
+    by the same name.
 
     **Example:**
 
@@ -46,21 +57,48 @@ class AbstractFriction(eqx.Module):
     """
 
     # Constant friction makes the motion in every status linear; exact methods rest on that.
-    constant: eqx.AbstractClassVar[bool]
+    constant: ClassVar[bool] = False
+    smooth: ClassVar[bool | None] = None
 
     @property
-    @abc.abstractmethod
     def static(self) -> Float[Array, ""]:
         """The largest |T|/N that a sticking contact can hold."""
+        return self(jnp.zeros(()))
 
-    @abc.abstractmethod
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         """The coefficient of friction while sliding at this slip speed."""
+        raise NotImplementedError(f"The friction law `{type(self).__name__}` must define `__call__(self, slip_speed)`.")
 
-    def check(self) -> None:
-        """Refuse a law that breaks its contract, where its values are known."""
-        static, speeds = self.static, jnp.asarray(SPEEDS)
-        mu, slope, bend, bounds = _sampled(self, speeds)
+    def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Bounds on |μ'| (s/m) and |μ''| (s²/m²) at and above this slip speed, for proofs about the future."""
+        unknown = jnp.full_like(slip_speed, jnp.inf)
+        return unknown, unknown
+
+    @property
+    def may_have_kinks(self) -> bool:
+        """Whether the law is not certain to be smooth."""
+        return not (is_smooth(self, jnp.zeros(())) if self.smooth is None else self.smooth)
+
+    def bounds(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """`variation` as far as proofs may rely on it: without a bound on |μ''| where the law may have kinks."""
+        slope, bend = self.variation(slip_speed)
+        return slope, jnp.full_like(bend, jnp.inf) if self.may_have_kinks else bend
+
+    def largest(self, fastest: Float[Array, ""]) -> Float[Array, ""]:
+        """The largest coefficient from rest to this slip speed (m/s), as far as looking at some speeds shows."""
+        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(fastest * LOOKED_AT)))
+
+    def in_time(self, slip_speed: Float[Array, ""], order: int) -> NextTerm:
+        """How the Taylor series in time of μ goes on from this slip speed, up to some order."""
+        coefficients, powers = taylor_coefficients(self, slip_speed, order), []
+        return lambda slip, _: composed(coefficients, slip, powers)
+
+    def check(self, belt_speed: Array | float = 0.0) -> None:
+        """Refuse a law that breaks its contract, where its values are known, on a belt of this speed (m/s)."""
+        fastest = float(np.max(np.abs(np.asarray(belt_speed)))) if is_known(belt_speed) else 0.0
+        speeds = TIMES * (fastest or 1.0) * SHARES
+        static = self.static
+        mu, slope, bend, bounds = _sampled(self, jnp.asarray(speeds))
         if not all(map(is_known, (static, mu))):
             return
         static, mu, name = float(static), np.asarray(mu), type(self).__name__
@@ -70,14 +108,14 @@ class AbstractFriction(eqx.Module):
                 at = int(np.argmax(wrong))
                 found, highest = apart(mu[at], static)
                 raise ValueError(
-                    f"The friction law `{name}` must {rule}, but is {found} at a slip speed of {SPEEDS[at]:g} m/s, with "
+                    f"The friction law `{name}` must {rule}, but is {found} at a slip speed of {speeds[at]:g} m/s, with "
                     f"`static` {highest}. See `fivjax.AbstractFriction` for what a law promises."
                 )
 
         refuse(~np.isfinite(mu) | ~np.isfinite(static), "be finite at every slip speed")
         refuse(mu < 0, "not be negative")
         # A law written as a sum may exceed its own largest value by rounding.
-        refuse(mu > static * (1 + 1e-12), "be at most `static` at every slip speed")
+        refuse(mu[:1] > static * (1 + 1e-12), "be at most `static` at rest")
         if self.constant:
             refuse(mu != mu[0], "not change with slip speed where `constant` is true")
         for what, values, bound in (("|μ'|", slope, bounds[0]), ("|μ''|", bend, bounds[1])):
@@ -85,33 +123,25 @@ class AbstractFriction(eqx.Module):
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
             refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
 
-    def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
-        """The next Taylor coefficient in time of μ, from those of the slip speed up to the same order (at least one).
-
-        `friction` has the coefficients of μ that are known already; a law with a recurrence formula may need only these.
-        """
-        del friction
-        order = len(slip) - 1
-        derivatives = [math.factorial(k) * slip[k] for k in range(1, order + 1)]
-        _, series = jet(self.__call__, (slip[0],), (derivatives,))
-        return series[-1] / math.factorial(order)
-
-    @abc.abstractmethod
-    def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Bounds on |μ'| (s/m) and |μ''| (s²/m²) at and above this slip speed, for proofs about the future."""
-
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))
 
 
+def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
+    """dμ/dv at a slip speed, in s/m. Forward, because a law may have loops that JAX cannot differentiate in reverse."""
+    return jax.jvp(law, (slip_speed,), (jnp.ones_like(slip_speed),))[1]
+
+
 @jax.jit
 def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
-    slope = jax.grad(law)
+    def slope(speed):
+        return slope_of(law, speed)
+
     return (
         jax.vmap(law)(speeds),
         jax.vmap(slope)(speeds),
-        jax.vmap(jax.grad(slope))(speeds),
-        jax.vmap(law.variation)(speeds),
+        jax.vmap(lambda speed: jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1])(speeds),
+        jax.vmap(law.bounds)(speeds),
     )
 
 
@@ -147,8 +177,11 @@ class Coulomb(AbstractFriction):
     def static(self) -> Float[Array, ""]:
         return self.mu if self.mu_static is None else self.mu_static
 
-    def check(self) -> None:
+    def check(self, belt_speed: Array | float = 0.0) -> None:
         """Nothing is left to check: the constructor has."""
+
+    def largest(self, fastest: Float[Array, ""]) -> Float[Array, ""]:
+        return self.static
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu
@@ -188,17 +221,23 @@ class ExponentialDecay(AbstractFriction):
     def static(self) -> Float[Array, ""]:
         return self.mu_static
 
-    def check(self) -> None:
+    def check(self, belt_speed: Array | float = 0.0) -> None:
         """Nothing is left to check: the constructor has."""
+
+    def largest(self, fastest: Float[Array, ""]) -> Float[Array, ""]:
+        return self.static
 
     def __call__(self, slip_speed: Float[Array, ""]) -> Float[Array, ""]:
         return self.mu_dynamic + (self.mu_static - self.mu_dynamic) * jnp.exp(-self.decay * slip_speed)
 
-    def next_term(self, slip: list[Float[Array, ""]], friction: list[Float[Array, ""]]) -> Float[Array, ""]:
-        # The recurrence Ė = -d u̇ E takes one more term; the general way computes all orders anew each time.
-        order = len(slip) - 1
-        falling = [friction[0] - self.mu_dynamic, *friction[1:]]
-        return -self.decay / order * sum(j * slip[j] * falling[order - j] for j in range(1, order + 1))
+    def in_time(self, slip_speed: Float[Array, ""], order: int) -> NextTerm:
+        # By the recurrence Ė = -d u̇ E.
+        def next_term(slip, friction):
+            order = len(slip) - 1
+            falling = [friction[0] - self.mu_dynamic, *friction[1:]]
+            return -self.decay / order * sum(j * slip[j] * falling[order - j] for j in range(1, order + 1))
+
+        return next_term
 
     def variation(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         # Both derivatives shrink in size with slip speed, so the bound is the value at the lower end.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from .friction import AbstractFriction
+from .friction import AbstractFriction, NextTerm
 
 
 class FrictionPerContact(AbstractFriction):
@@ -55,22 +55,43 @@ class FrictionPerContact(AbstractFriction):
             laws.append(type(law)(**{**own, **changed}) if changed else law)
         return FrictionPerContact(laws)
 
-    def check(self) -> None:
+    @property
+    def may_have_kinks(self) -> bool:
+        return any(law.may_have_kinks for law in self.laws)
+
+    def check(self, belt_speed: Array | float = 0.0) -> None:
         for law in self.laws:
-            law.check()
+            law.check(belt_speed)
 
     def __call__(self, slip_speed: Float[Array, " c"]) -> Float[Array, " c"]:
-        return jnp.stack([law(slip_speed[..., i]) for i, law in enumerate(self.laws)], axis=-1)
+        return self._of_each(lambda law, slip: law(slip), slip_speed)
 
-    def next_term(self, slip: list[Float[Array, " c"]], friction: list[Float[Array, " c"]]) -> Float[Array, " c"]:
-        def of(law, i):
-            own = [term[..., i] for term in slip], [term[..., i] for term in friction]
-            return jnp.zeros_like(own[0][0]) if law.constant else law.next_term(*own)
+    def largest(self, fastest: Float[Array, "*c"]) -> Float[Array, " c"]:
+        return self._of_each(lambda law, own: law.largest(own), jnp.broadcast_to(fastest, len(self.laws)))
 
-        return jnp.stack([of(law, i) for i, law in enumerate(self.laws)], axis=-1)
+    def in_time(self, slip_speed: Float[Array, " c"], order: int) -> NextTerm:
+        parts = [None if law.constant else law.in_time(slip_speed[..., i], order) for i, law in enumerate(self.laws)]
+
+        def next_term(slip, friction):
+            def of(part, i):
+                own = [term[..., i] for term in slip], [term[..., i] for term in friction]
+                return jnp.zeros_like(own[0][0]) if part is None else part(*own)
+
+            return jnp.stack([of(part, i) for i, part in enumerate(parts)], axis=-1)
+
+        return next_term
 
     def variation(self, slip_speed: Float[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-        slopes, bends = zip(*(law.variation(slip_speed[..., i]) for i, law in enumerate(self.laws)), strict=True)
+        return self._pairs(lambda law, slip: law.variation(slip), slip_speed)
+
+    def bounds(self, slip_speed: Float[Array, " c"]) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+        return self._pairs(lambda law, slip: law.bounds(slip), slip_speed)
+
+    def _of_each(self, function, speeds):
+        return jnp.stack([function(law, speeds[..., i]) for i, law in enumerate(self.laws)], axis=-1)
+
+    def _pairs(self, function, speeds):
+        slopes, bends = zip(*(function(law, speeds[..., i]) for i, law in enumerate(self.laws)), strict=True)
         return jnp.stack(slopes, axis=-1), jnp.stack(bends, axis=-1)
 
     def __repr__(self) -> str:

@@ -82,7 +82,7 @@ class Scene(eqx.Module):
         # Numbers of a law or a load of the user's own may have come in single precision, or as Python's.
         friction = jax.tree.map(real_if_real, friction)
         own_load: AbstractLoad = jax.tree.map(real_if_real, load)
-        friction.check()
+        friction.check(belt_speed)
         own_load.check()
         self.structure = structure
         self.friction = friction
@@ -277,7 +277,8 @@ def refuse_vector_contacts(structure: Structure, who: str) -> None:
 
 def refuse_painleve(scene: Scene) -> None:
     """Refuse friction at which the contact problem has no unique solution, where its value is known."""
-    largest = scene.friction.static
+    # Every motion that slides or comes to rest passes through these slip speeds.
+    largest = scene.friction.largest(steady_slip_speeds(scene))
     if is_known(largest) and len(scene.structure.contacts) > 1:
         g = delassus(scene.structure)
         coefficients = np.broadcast_to(np.asarray(largest), len(scene.structure.contacts))

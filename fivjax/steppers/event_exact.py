@@ -6,7 +6,7 @@ accurate, where a guard is used up first, and the state there. Except for fricti
 """
 
 import math
-from typing import ClassVar, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -17,13 +17,14 @@ from diffrax import AbstractLocalInterpolation
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, ModeForces, State
+from ..contact import Contact, Mechanics, ModeForces, State, Status
 from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
 from ..foundation.polynomial import value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
+from .law_agreement import agreeing
 from .section import before_section, section_speed
 from .step_length import LONGEST_STEP, attainable, fastest_rate, time_unit, trusted
 
@@ -96,8 +97,9 @@ class EventExact(AbstractStepper):
         at_section: bool = False,
     ) -> Advance:
         unit = time_unit(mechanics)
-        states, guards, mode = _series(mechanics, contact, load, y, self.order_, unit)
-        rounding = _rounding(mechanics, contact, load, y, unit, mode)
+        series = _series(mechanics, contact, load, y, self.order_, unit)
+        states, guards = series.states, series.guards
+        rounding = _rounding(mechanics, contact, load, y, unit, series.mode)
         # With several contacts, the two guards of the first, then those of the second, …
         guards, rounding = [guard.ravel() for guard in guards], [row.ravel() for row in rounding]
         exact = physics.exactly_zero(contact).T.ravel()
@@ -109,6 +111,8 @@ class EventExact(AbstractStepper):
             # With several contacts, a small distance from the section is no rounding error.
             rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, mechanics.several)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
+        # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
+        reach = reach * self._agreeing(mechanics, contact, series, reach)
         power, scaled = jnp.ones_like(reach), []
         for guard in guards:
             scaled.append(guard * power)
@@ -133,6 +137,7 @@ class EventExact(AbstractStepper):
         if at_section and not mechanics.several:
             reached = jnp.where((jnp.arange(2 * n) == n + mechanics.tangential) & fires[count], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
+        reached = jnp.where(_impossible(mechanics, contact, series), jnp.nan, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
         return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
@@ -143,7 +148,7 @@ class EventExact(AbstractStepper):
         # The advance uses the same series; compiled together with it, the series is computed once. With this many Gauss points,
         # a product of two series is integrated with an error far below that of the series itself.
         unit = time_unit(mechanics)
-        states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
+        states = _series(mechanics, contact, load, y, self.order_, unit).states
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
         times = 0.5 * (points + 1.0) * h
         inside, _ = value_and_slope([state[None] for state in states], times[:, None] / unit)
@@ -155,8 +160,7 @@ class EventExact(AbstractStepper):
     ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
         """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
         unit = time_unit(mechanics)
-        states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
-        return jnp.stack(states), unit
+        return jnp.stack(_series(mechanics, contact, load, y, self.order_, unit).states), unit
 
     def in_one_mode(
         self,
@@ -172,17 +176,26 @@ class EventExact(AbstractStepper):
 
         def step(carry):
             y, left, _ = carry
-            states, *_ = _series(mechanics, contact, load, y, self.order_, unit)
-            longest = jax.lax.stop_gradient(jnp.minimum(trusted(states, self.tolerance), LONGEST_STEP) * unit)
+            series = _series(mechanics, contact, load, y, self.order_, unit)
+            longest = jax.lax.stop_gradient(jnp.minimum(trusted(series.states, self.tolerance), LONGEST_STEP) * unit)
             longest = jnp.minimum(longest, self.dt)
             last = jnp.abs(left) <= longest
             part = jnp.where(last, left, jnp.sign(left) * longest)
-            reached, _ = value_and_slope(states, part / unit)
-            return reached, left - part, ~last
+            share = self._agreeing(mechanics, contact, series, part / unit)
+            part = part * share
+            reached, _ = value_and_slope(series.states, part / unit)
+            return reached, left - part, ~(last & (share == 1))
 
         # At least one step, so that there is a derivative with respect to `h` at zero, too.
         begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
+
+    def _agreeing(self, mechanics: Mechanics, contact: Contact, series: "_Series", reach) -> Float[Array, ""] | float:
+        """The share of a step of this length, in units of time, over which friction is that of the law."""
+        law = mechanics.friction
+        if law.constant:
+            return 1.0
+        return agreeing(law, contact, series.friction, series.slip, reach, self.tolerance)
 
 
 def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
@@ -199,11 +212,20 @@ def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
     return eqx.tree_at(lambda own: own.dt, stepper, jnp.minimum(stepper.dt, angle / rate))
 
 
+class _Series(NamedTuple):
+    """Taylor coefficients, in time measured in a unit; and the forces of the mode at the start."""
+
+    states: list[State]
+    guards: list[Float[Array, "*contacts 2"]]
+    slip: list[Float[Array, "*contacts"]]
+    friction: list[Float[Array, "*contacts"]]  # of μ; only its value, if it is constant
+    mode: ModeForces
+
+
 def _series(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
-) -> tuple[list[State], list[Float[Array, "*contacts 2"]], ModeForces]:
-    """Taylor coefficients of the state and of the guards, in time measured in `unit` (s); and the forces of the mode at the
-    start.
+) -> _Series:
+    """Taylor coefficients of the motion in one contact mode, in time measured in `unit` (s).
 
     The physics is linear in the state except for T = σμN, so it maps coefficients to coefficients; the constant terms (load,
     belt speed) enter with the first. T = σμN is the product of two series.
@@ -211,6 +233,7 @@ def _series(
     n = y.shape[0] // 2
     slip = physics.slip_speed(mechanics, contact, y)
     friction = [mechanics.friction(slip)]
+    next_term = None if mechanics.friction.constant else mechanics.friction.in_time(slip, order)
     mode = ModeForces(mechanics, contact, friction[0])
     states, guards, slips, normal_forces = [y], [], [], []
     for k in range(order + 1):
@@ -218,8 +241,8 @@ def _series(
         free = physics.free_acceleration(own, force, states[k])
         slips.append(physics.slip_speed(own, contact, states[k]))
         otherwise = None
-        if k > 0 and not mechanics.friction.constant:
-            friction.append(mechanics.friction.next_term(slips, friction))
+        if k > 0 and next_term is not None:
+            friction.append(next_term(slips, friction))
             otherwise = contact.direction * sum(
                 (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
             )
@@ -228,7 +251,18 @@ def _series(
         guards.append(physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k])))
         rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
         states.append(rate * (unit / (k + 1)))
-    return states[: order + 1], guards, mode
+    return _Series(states[: order + 1], guards, slips, friction, mode)
+
+
+def _impossible(mechanics: Mechanics, contact: Contact, series: _Series) -> Bool[Array, ""]:
+    """Whether the law has led out of what the model can say: negative friction, or friction beyond Painlevé's limit."""
+    if mechanics.friction.constant:
+        return jnp.asarray(False)
+    mu = series.friction[0]
+    compliance = mechanics.normal_compliance(contact.direction, mu)
+    if mechanics.several:
+        compliance = jnp.diagonal(compliance)
+    return jnp.any((contact.status == Status.SLIDE) & ~((compliance > 0) & (mu >= 0)))
 
 
 def _rounding(

@@ -1,0 +1,76 @@
+"""How far along a step a Taylor series still follows the friction law.
+
+The last terms of a series do not show everything: they are tiny while $e^{-d u}$ grows from $e^{-80}$ to 1, and they know
+nothing of a kink ahead. So the series of μ is compared with the law itself along the step, at the series' own slip speed.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..contact import Contact, Status
+from ..foundation.polynomial import extremum, value_and_slope
+from ..model.friction import AbstractFriction
+from .step_length import attainable
+
+# Where they are compared, besides where slip is fastest and slowest: at this many equal parts of the step.
+PARTS = 8
+TURNING_STEPS = 5
+# The difference that counts as rounding, in units of the last place of μ.
+ROUNDINGS = 128
+# A step is not cut to less than this share: over so short a time, a kink at its very start has no effect.
+SHORTEST = 1e-8
+MOST_HALVINGS = 80
+
+
+def agreeing(
+    law: AbstractFriction,
+    contact: Contact,
+    friction: list[Float[Array, "*contacts"]],
+    slip: list[Float[Array, "*contacts"]],
+    reach: Float[Array, ""],
+    tolerance: float,
+) -> Float[Array, ""]:
+    """The share of a step of length `reach` over which the series of μ is the law at the series' slip speed.
+
+    Where the two part, because the series ends too soon or the law has a kink there, bisection finds the place. The step then
+    ends just beyond it, so that the next one begins on the other side of a kink.
+    """
+    law, friction, slip, reach = jax.lax.stop_gradient((law, friction, slip, reach))
+    power, mu, u = jnp.ones_like(reach), [], []
+    for own, speed in zip(friction, slip, strict=True):
+        mu.append(own * power)
+        u.append(speed * power)
+        power = power * reach
+    mu, u = jnp.stack(mu), jnp.stack(u)
+    sliding = contact.status == Status.SLIDE
+    eps = float(jnp.finfo(mu.dtype).eps)
+    allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
+
+    def parted(x: Float[Array, ""]) -> Bool[Array, ""]:
+        speed, of_series = value_and_slope(u, x)[0], value_and_slope(mu, x)[0]
+        # Below zero sliding is over.
+        differs = ~(jnp.abs(of_series - law(jnp.maximum(speed, 0.0))) <= allowed)
+        return jnp.any(sliding & (speed >= 0) & differs)
+
+    equal = jnp.arange(1, PARTS + 1, dtype=mu.dtype) / PARTS
+    speeds = jax.vmap(lambda x: value_and_slope(u, x)[0])(equal)
+    ends = [equal[jnp.argmax(sign * speeds, axis=0)] for sign in (1, -1)]
+    turning = [extremum(u, x, 0.0, jnp.ones_like(x), TURNING_STEPS) for x in ends]
+    places = jnp.concatenate([equal, *map(jnp.ravel, turning)])
+    wrong = jax.vmap(parted)(places)
+    high = jnp.min(jnp.where(wrong, places, jnp.inf))
+    low = jnp.max(jnp.where(places < high, places, 0.0))
+
+    def going(carry):
+        low, high, count = carry
+        return jnp.isfinite(high) & (high - low > 4 * eps * high) & (count < MOST_HALVINGS)
+
+    def halved(carry):
+        low, high, count = carry
+        middle = 0.5 * (low + high)
+        beyond = parted(middle)
+        return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high), count + 1
+
+    _, high, _ = jax.lax.while_loop(going, halved, (low, high, jnp.zeros((), jnp.int32)))
+    return jnp.clip(high, SHORTEST, 1.0)
