@@ -49,9 +49,8 @@ def agreeing(
 
     def parted(x: Float[Array, ""]) -> Bool[Array, ""]:
         speed, of_series = value_and_slope(u, x)[0], value_and_slope(mu, x)[0]
-        # Below zero sliding is over.
-        differs = ~(jnp.abs(of_series - law(jnp.maximum(speed, 0.0))) <= allowed)
-        return jnp.any(sliding & (speed >= 0) & differs)
+        # Also below zero, where sliding is over: a kink may lie on the last short way there.
+        return jnp.any(sliding & ~(jnp.abs(of_series - law(speed)) <= allowed))
 
     equal = jnp.arange(1, PARTS + 1, dtype=mu.dtype) / PARTS
     speeds = jax.vmap(lambda x: value_and_slope(u, x)[0])(equal)
