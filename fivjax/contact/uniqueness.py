@@ -10,10 +10,11 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from ..foundation.linear_solve import determinant
 from .mechanics import Mechanics
+from .mode import Contact, Status
 
 # Up to `ALL` contacts, all principal minors are checked; with more contacts, those of up to `TOGETHER` contacts at a time.
 ALL, TOGETHER = 4, 3
@@ -38,3 +39,11 @@ def slides_uniquely(mechanics: Mechanics) -> Bool[Array, ""]:
         matrices = g_nn[rows, columns] + dragged[rows, columns] * signs[:, None, None, :]
         unique = unique & jnp.all(determinants(matrices) > 0)
     return unique
+
+
+def is_beyond_the_model(mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]) -> Bool[Array, ""]:
+    """Whether the law has led a sliding contact to where there is no motion: to negative friction, or past Painlevé's limit."""
+    compliance = mechanics.normal_compliance(contact.direction, mu)
+    if mechanics.several:
+        compliance = jnp.diagonal(compliance)
+    return jnp.any((contact.status == Status.SLIDE) & ~((compliance > 0) & (mu >= 0)))

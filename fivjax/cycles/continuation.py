@@ -18,7 +18,9 @@ from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.contact_coordinates import to_contact_coordinates
+from ..model.scene import Scene, refuse_several_contacts, scene_in_contact_coordinates
+from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
 from .around import seen_around
 from .branch_points import Point, seen
@@ -27,6 +29,7 @@ from .cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_loa
 from .following import follow_branch
 from .meeting_sliding import sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
+from .own_coordinates import cycle_in_own_coordinates, in_own_coordinates
 from .pseudo_arclength import Curve, Family
 from .saddle import saddle_cycle
 from .search import NoLimitCycle, limit_cycle
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 
 @reported("branch")
+@in_own_coordinates
 @in_double_precision
 def continue_cycle(
     scene: Scene,
@@ -167,9 +171,12 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
             f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, "
             f"but is {i!r}."
         ) from None
-    scene = Scene.from_dataset(branch).replace(**{name: value})
-    stepper = EventExact()
-    y = np.asarray(row["state"]) - np.asarray(sliding_state(scene, scene.load.final))
+    given = Scene.from_dataset(branch).replace(**{name: value})
+    scene, stepper = scene_in_contact_coordinates(given), EventExact()
+    state = np.asarray(row["state"])
+    if scene is not given:
+        state = np.asarray(snapped_to_belt(scene, jnp.asarray(to_contact_coordinates(given.structure, state))))
+    y = state - np.asarray(sliding_state(scene, scene.load.final))
     contact = Contact(jnp.asarray(int(row["status"]), jnp.int32), jnp.asarray(float(row["direction"])))
     point = SectionPoint(jnp.asarray(y), contact)
     weights = np.asarray(scene.structure.weights)
@@ -177,7 +184,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     if crossings is None:
         raise NoLimitCycle(f"At point {i} of the branch the motion does not come back to the section.")
     found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
-    return limit_cycle_of(scene, stepper, closed_as(point, crossings, found, jacobian, weights))
+    cycle = limit_cycle_of(scene, stepper, closed_as(point, crossings, found, jacobian, weights))
+    return cycle_in_own_coordinates(given, cycle)
 
 
 def _checked_bounds(bounds) -> tuple[float, float]:

@@ -18,9 +18,11 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
+from ..model.contact_coordinates import from_contact_coordinates
 from ..model.scene import Scene
 from .cycle import LimitCycle, point_of
 from .nearby import next_to
+from .own_coordinates import cycle_in_contact_coordinates
 from .section_map import Point
 
 
@@ -77,7 +79,8 @@ def cycle_derivatives(
             f"{arguments.did_you_mean((unknown or [''])[0], cycle.scene.parameters)}"
         )
     arguments.truth("multipliers", multipliers)
-    slopes = _slopes(cycle.scene, names, point_of(cycle), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))
+    own = cycle_in_contact_coordinates(cycle)
+    slopes = _slopes(own.scene, names, point_of(own), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))
     # The parameters are the last axis.
     period, amplitude, state, moved = (
         dict(zip(names, np.moveaxis(np.asarray(one), -1, 0), strict=True)) for one in slopes
@@ -85,9 +88,14 @@ def cycle_derivatives(
     return CycleDerivatives(
         {name: float(slope) for name, slope in period.items()},
         {name: float(slope) for name, slope in amplitude.items()},
-        state,
+        {name: _in_coordinates_of(cycle, slope) for name, slope in state.items()},
         moved if multipliers else {},
     )
+
+
+def _in_coordinates_of(cycle: LimitCycle, state):
+    structure = cycle.scene.structure
+    return state if structure.contacts_at_coordinates else from_contact_coordinates(structure, state)
 
 
 @compiled

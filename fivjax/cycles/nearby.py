@@ -19,11 +19,12 @@ from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
-from ..model.scene import Scene, refuse_vector_contacts
+from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
 from .around import peak_speed_along
 from .closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
 from .cycle import LimitCycle, point_of, under_final_load
+from .own_coordinates import in_own_coordinates
 from .section_map import MOST_TO_CROSSING, Point, longest_return, mechanics_about_sliding, sliding_state
 
 
@@ -54,6 +55,7 @@ class NearbyCycle(eqx.Module):
         return as_call("NearbyCycle", values)
 
 
+@in_own_coordinates
 @refusing_reverse_in_single_precision
 @in_double_precision
 def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multipliers: bool = False) -> NearbyCycle:
@@ -87,7 +89,6 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
     arguments.instance("cycle", cycle, LimitCycle, "a limit cycle, such as `fivjax.limit_cycle(scene)`")
     arguments.whole_number("stages", stages, minimum=1)
     arguments.truth("multipliers", multipliers)
-    refuse_vector_contacts(scene.structure, "`nearby_cycle`")
     if cycle.kind != "periodic":
         raise ValueError("Argument `cycle` must be periodic, but is a torus, on which no state returns.")
     before, after = cycle.scene, under_final_load(scene)

@@ -14,10 +14,11 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..linear.spectrum import eigenvalues
-from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
+from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
+from .own_coordinates import in_own_coordinates
 from .search import MOST_CROSSINGS, NoLimitCycle, limit_cycle, states_in_contact
 from .section_map import points_along
 from .torus import POINTS, SIDE_BY_SIDE
@@ -35,6 +36,7 @@ UNSTABLE = 1e-6
 
 
 @reported("saddle cycle")
+@in_own_coordinates
 @in_double_precision
 def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: bool | None = None) -> LimitCycle:
     """The unstable cycle on the boundary between steady sliding and a limit cycle, under the final load.
@@ -55,7 +57,6 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
-    refuse_vector_contacts(scene.structure, "`saddle_cycle`")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
     _refuse_unstable_sliding(under_final_load(scene))

@@ -14,12 +14,13 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts, sliding_equilibrium
+from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, under_final_load
+from .own_coordinates import in_own_coordinates
 from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
 from .torus import POINTS, SIDE_BY_SIDE, on_torus, torus_of
 
@@ -64,6 +65,7 @@ class NoLimitCycle(ValueError):
 
 
 @reported("limit cycle")
+@in_own_coordinates
 @in_double_precision
 def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> LimitCycle:
     r"""A limit cycle of the scene under its final load.
@@ -116,6 +118,7 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 
 
 @reported("limit cycles")
+@in_own_coordinates
 @in_double_precision
 def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None = None) -> list[LimitCycle]:
     """All stable limit cycles that a search finds, the one with the largest amplitude first.
@@ -249,7 +252,6 @@ def _merged(parts: list[list[Met]]) -> list[Met]:
 def _check(scene: Scene) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
-    refuse_vector_contacts(scene.structure, "A search for limit cycles")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
 

@@ -12,6 +12,7 @@ from ..io.datasets import labelled
 from ..steppers.event_exact import EventExact
 from .continuation import cycle_at
 from .cycle import LimitCycle
+from .own_coordinates import cycle_in_contact_coordinates
 from .search import attractors_met, states_in_contact
 
 if TYPE_CHECKING:
@@ -94,6 +95,7 @@ def turning(multipliers: np.ndarray, special: np.ndarray) -> np.ndarray:
 
 def _attractor(cycle: LimitCycle) -> LimitCycle | None:
     """The attractor of motions that are released beside a cycle; a torus rather than a cycle."""
+    cycle = cycle_in_contact_coordinates(cycle)
     states = np.stack([(1 + by) * cycle.deviation for by in RELEASED])
     met = attractors_met(cycle.scene, EventExact(), states_in_contact(cycle.scene, jnp.asarray(states)))
     found = [one.cycle for one in met if one.cycle is not None]

@@ -18,6 +18,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.matrix_routines import log_determinant
 from ..foundation.precision import real, returning_numpy
+from ..model.contact_coordinates import in_contact_coordinates
 from ..model.sliding import sliding_matrices
 from ..model.structure import Structure
 from .linearisation import state_matrix, time_scale
@@ -77,7 +78,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
             f"Argument `structure` must have at most {LARGEST_SIZE} coordinates here, but has {structure.size}. Use "
             f"`cea.growth_rate`, which has no such limit."
         )
-    return _margin(structure, real(mu), real(direction))
+    return _margin(in_contact_coordinates(structure), real(mu), real(direction))
 
 
 @compiled

@@ -6,7 +6,7 @@ from ..foundation import arguments
 from ..foundation.precision import is_known
 from ..model.friction import Coulomb
 from ..model.load import ConstantLoad
-from ..model.scene import Scene
+from ..model.scene import Scene, scene_in_contact_coordinates
 from ..model.structure import Structure
 
 
@@ -26,14 +26,19 @@ def as_scene(system: Structure | Scene, mu, direction: int) -> Scene:
     if isinstance(system, Structure):
         if mu is None:
             raise ValueError("Argument `mu` must be given with a structure; a scene carries its own friction.")
-        return Scene(system, Coulomb(mu), belt_speed=float(direction), load=ConstantLoad(0.0))
+        return _with_coordinates(Scene(system, Coulomb(mu), belt_speed=float(direction), load=ConstantLoad(0.0)))
     if mu is not None:
         raise ValueError("Argument `mu` must not be given with a scene; use `scene.replace(mu=...)`.")
     if direction != 1:
         raise ValueError("Argument `direction` must not be given with a scene: the sign of its belt speed says it.")
     if is_known(system.belt_speed) and np.any(np.asarray(system.belt_speed) == 0):
         raise ValueError("Argument `belt_speed` must not be zero: nothing slides steadily on a belt at rest.")
-    return system
+    return _with_coordinates(system)
+
+
+def _with_coordinates(scene: Scene) -> Scene:
+    """The scene with the directions of its contact as coordinates; of several contacts, as it is."""
+    return scene_in_contact_coordinates(scene) if len(scene.structure.contacts) == 1 else scene
 
 
 def with_axes(

@@ -10,7 +10,7 @@ import numpy as np
 from ..batches.results import by_name, not_run
 from ..foundation import arguments
 from ..linear.critical import critical_friction
-from ..model.scene import Scene, refuse_vector_contacts
+from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 
 # The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
@@ -77,7 +77,6 @@ def _memory() -> float:
 def check_run(scene: Scene, method: AbstractStepper, t_max: float | None, memory: float) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
-    refuse_vector_contacts(scene.structure, "A map")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     if t_max is not None:
         arguments.real_number("t_max", t_max, above=0)

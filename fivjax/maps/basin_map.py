@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from ..cycles.cycle import under_final_load
+from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene, sliding_equilibrium
@@ -24,6 +25,7 @@ from .states import state_places
 from .trajectories import Grid
 
 
+@in_own_coordinates
 @in_double_precision
 @with_workers
 def basins(

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from ..batches.results import Verdicts
+from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
@@ -23,6 +24,7 @@ from .resuming import keeper_at
 from .trajectories import Grid
 
 
+@in_own_coordinates
 @in_double_precision
 @with_workers
 def bistability_map(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cycles.kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked
+from ..cycles.own_coordinates import in_own_coordinates
 from ..cycles.section_map import sliding_state
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
@@ -37,6 +38,7 @@ ROUNDS, INSIDE = 2, 15
 
 
 @reported("boundary section")
+@in_own_coordinates
 @in_double_precision
 def boundary_section(
     scene: Scene,

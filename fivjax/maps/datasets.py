@@ -11,6 +11,7 @@ from ..io.datasets import labelled
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
+from ..verdicts.sliding_proof import why_withheld
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
 from .crossing import first_crossings
@@ -71,10 +72,14 @@ def map_dataset(
         dataset["p_crit_high"] = (others, crossing.high.reshape(over))
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
     dataset.attrs.update(kernels_by(method, scene, bool(verdicts.energy)))
+    meaning, withheld = dict(MEANING), why_withheld(scene)
+    if withheld is not None:
+        dataset.attrs["withheld"] = withheld
+        meaning[Verdict.UNDECIDED] = f"{meaning[Verdict.UNDECIDED]}. {withheld}"
     dataset["verdict"].attrs.update(
         flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
-        meaning=json.dumps({verdict.value: sentence for verdict, sentence in MEANING.items()}),
+        meaning=json.dumps({verdict.value: sentence for verdict, sentence in meaning.items()}),
     )
     dataset.attrs.update(linear)
     every = dataset["verdict"].values

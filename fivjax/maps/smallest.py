@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..cycles.own_coordinates import in_own_coordinates
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.compiling import compiled
@@ -95,6 +96,7 @@ def smallest_kick(
 
 
 @reported("smallest kick")
+@in_own_coordinates
 @in_double_precision
 def smallest_kick(
     scene: Scene,

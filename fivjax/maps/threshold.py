@@ -7,6 +7,7 @@ import math
 import numpy as np
 import xarray as xr
 
+from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
@@ -30,6 +31,7 @@ POINTS_PER_ROUND = 15
 
 
 @reported("critical kicks")
+@in_own_coordinates
 @in_double_precision
 @with_workers
 def critical_perturbation(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision
@@ -19,7 +20,7 @@ from ..io.datasets import labelled
 from ..linear.cea import eigenvalues
 from ..model.friction import Coulomb, ExponentialDecay
 from ..model.load import Pulse
-from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
+from ..model.scene import Scene, refuse_painleve
 from ..simulation.energy import EnergyData
 from ..simulation.rows import states_at
 from ..simulation.start import start_state
@@ -44,6 +45,7 @@ def default_methods() -> dict[str, AbstractStepper]:
     return {**switched, "event-exact, order 8, 1e-8": EventExact(8, tolerance=1e-8), "event-exact": EventExact()}
 
 
+@in_own_coordinates
 @in_double_precision
 def tradeoff(
     scene: Scene,
@@ -174,7 +176,6 @@ def table(dataset: xr.Dataset) -> str:
 
 def _check(scene, methods, t1, trajectories, precisions, boundary, refine) -> None:
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_vector_contacts(scene.structure, "`tradeoff`")
     if not isinstance(methods, dict) or not methods:
         raise TypeError("Argument `methods` must be a dict of steppers by name, such as {'exact': fj.EventExact()}.")
     for name, method in methods.items():

@@ -5,13 +5,19 @@ displacement are coordinates. For contacts given by vectors, $q = X z$ replaces 
 directions; the others stay. Energies, forces and eigenvalues do not change.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation.precision import in_double_precision
 from .contact_point import ContactPoint, directions, pivots
-from .structure import Structure
+from .structure import FromParameters, Matrices, Structure
+
+# Of the coordinates that the contacts' directions become.
+KINDS = ("tangential", "normal")
 
 
 def transformation(structure: Structure) -> tuple[np.ndarray, list[int]]:
@@ -43,17 +49,67 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     count = len(structure.contacts)
     suffixes = [""] if count == 1 else [f"_{i}" for i in range(count)]
     names = list(structure.coordinates)
-    for place, name in zip(
-        places, [kind + suffix for kind in ("tangential", "normal") for suffix in suffixes], strict=True
-    ):
+    for place, name in zip(places, [kind + suffix for kind in KINDS for suffix in suffixes], strict=True):
         names[place] = name
-    mass, damping, stiffness, load = structure.matrices
+    contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
+    source = structure.source
+    if not isinstance(source, FromParameters):
+        return Structure(*_turned(x, source), contacts=contacts, coordinates=names)
+    return Structure.from_parameters(
+        TurnedMatrices(source.matrices_of, tuple(map(tuple, x.tolist()))),
+        source.parameters,
+        contacts=contacts,
+        coordinates=names,
+        dampers=source.dampers,
+        builder=None if source.builder is None else TurnedStructure(source.builder),
+    )
+
+
+@dataclass(frozen=True)
+class TurnedMatrices:
+    """The matrices of a structure in contact coordinates, from its parameters."""
+
+    matrices_of: Callable[..., tuple]
+    x: tuple[tuple[float, ...], ...]
+
+    def __call__(self, **parameters) -> Matrices:
+        return _turned(np.array(self.x), self.matrices_of(**parameters))
+
+
+@dataclass(frozen=True)
+class TurnedStructure:
+    """A structure in contact coordinates, from its parameters."""
+
+    builder: Callable[..., Structure]
+
+    def __call__(self, **parameters) -> Structure:
+        return in_contact_coordinates(self.builder(**parameters))
+
+
+def _turned(x: np.ndarray, matrices: tuple) -> Matrices:
+    """Matrices and load in the coordinates z of q = X z."""
+    x = jnp.asarray(x)
+    mass, damping, stiffness, load = map(jnp.asarray, matrices)
 
     def seen(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-        turned = jnp.asarray(x.T) @ matrix @ x
+        turned = x.T @ matrix @ x
         return 0.5 * (turned + turned.T)
 
-    contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
-    return Structure(
-        seen(mass), seen(damping), seen(stiffness), jnp.asarray(x.T) @ load, contacts=contacts, coordinates=names
-    )
+    return Matrices(seen(mass), seen(damping), seen(stiffness), x.T @ load)
+
+
+def to_contact_coordinates(structure: Structure, y: Float[Array, "*k state"]) -> Float[Array, "*k state"]:
+    """States z, with the directions of all contacts as coordinates, of states of a structure."""
+    return _halves(y, np.linalg.inv(transformation(structure)[0]))
+
+
+def from_contact_coordinates(structure: Structure, z: Float[Array, "*k state"]) -> Float[Array, "*k state"]:
+    """States in a structure's own coordinates of states z in contact coordinates."""
+    return _halves(z, transformation(structure)[0])
+
+
+def _halves(y, matrix: np.ndarray):
+    """Displacements and velocities, each times a matrix; NumPy's arrays stay NumPy's."""
+    n = len(matrix)
+    join = np.concatenate if isinstance(y, np.ndarray) else jnp.concatenate
+    return join([y[..., :n] @ matrix.T, y[..., n:] @ matrix.T], axis=-1)

@@ -27,6 +27,9 @@ TIMES = 10.0
 # Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
 LOOKED_AT = np.linspace(0.0, 1.0, 33)
 
+# Halvings of an interval until what is left of a change is a jump.
+HALVINGS = 50
+
 # Gives the next Taylor coefficient in time of μ, from those of the slip speed up to the same order and from those of μ so far.
 NextTerm = Callable[[list[Array], list[Array]], Array]
 
@@ -98,7 +101,7 @@ class AbstractFriction(eqx.Module):
         fastest = float(np.max(np.abs(np.asarray(belt_speed)))) if is_known(belt_speed) else 0.0
         speeds = TIMES * (fastest or 1.0) * SHARES
         static = self.static
-        mu, slope, bend, bounds = _sampled(self, jnp.asarray(speeds))
+        mu, slope, bend, bounds, jumps = _sampled(self, jnp.asarray(speeds))
         if not all(map(is_known, (static, mu))):
             return
         static, mu, name = float(static), np.asarray(mu), type(self).__name__
@@ -118,6 +121,9 @@ class AbstractFriction(eqx.Module):
         refuse(mu[:1] > static * (1 + 1e-12), "be at most `static` at rest")
         if self.constant:
             refuse(mu != mu[0], "not change with slip speed where `constant` is true")
+        if self.may_have_kinks:
+            # Where slip is driven back over a jump, friction would change to and fro without end.
+            refuse(jumps > 1e-9 * np.maximum(static, np.max(mu)), "be continuous: it jumps near this speed")
         for what, values, bound in (("|μ'|", slope, bounds[0]), ("|μ''|", bend, bounds[1])):
             # The largest value at this speed and above.
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
@@ -142,7 +148,23 @@ def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
         jax.vmap(slope)(speeds),
         jax.vmap(lambda speed: jax.jvp(slope, (speed,), (jnp.ones_like(speed),))[1])(speeds),
         jax.vmap(law.bounds)(speeds),
+        jnp.append(jax.vmap(lambda low, high: _jump(law, low, high))(speeds[:-1], speeds[1:]), 0.0),
     )
+
+
+def _jump(law: AbstractFriction, low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, ""]:
+    """By how much a law changes in the shortest interval between two speeds: of the halves, the one in which it changes more."""
+
+    def halved(_, ends):
+        (low, of_low), (high, of_high) = ends
+        middle = 0.5 * (low + high)
+        of_middle = law(middle)
+        below = jnp.abs(of_middle - of_low) >= jnp.abs(of_high - of_middle)
+        ends = (low, of_low), (middle, of_middle), (high, of_high)
+        return jax.tree.map(lambda a, b: jnp.where(below, a, b), ends[:2], ends[1:])
+
+    (_, of_low), (_, of_high) = jax.lax.fori_loop(0, HALVINGS, halved, ((low, law(low)), (high, law(high))))
+    return jnp.abs(of_high - of_low)
 
 
 class Coulomb(AbstractFriction):

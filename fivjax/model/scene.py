@@ -15,6 +15,7 @@ from ..foundation.digits import apart
 from ..foundation.linear_solve import solve
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
+from .contact_coordinates import in_contact_coordinates, transformation
 from .delassus_matrix import delassus, has_one_solution
 from .friction import AbstractFriction
 from .friction_per_contact import FrictionPerContact
@@ -154,6 +155,15 @@ class Scene(eqx.Module):
         return description.as_table(self)
 
 
+def scene_in_contact_coordinates(scene: Scene) -> Scene:
+    """The same scene with the directions of all contacts as coordinates; itself, where they are coordinates already."""
+    structure = scene.structure
+    if structure.contacts_at_coordinates:
+        return scene
+    parts = (scene.friction, scene.belt_speed, scene.load, scene.restitution, scene.impact_law)
+    return Scene(in_contact_coordinates(structure), *parts)
+
+
 def _each_number(name: str, value, count: int, **bounds) -> None:
     """Refuse anything but one number, or one for each contact."""
     if not is_known(value):
@@ -204,6 +214,9 @@ def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, 
     """Displacements (m) and normal force (N) of steady sliding under a load (N), unchecked: not finite where there is no such
     state.
     """
+    if not scene.structure.contacts_at_coordinates:
+        z, normal_force = steady_sliding(scene_in_contact_coordinates(scene), force)
+        return jnp.asarray(transformation(scene.structure)[0]) @ z, normal_force
     structure = scene.structure
     friction = jnp.sign(scene.belt_speed) * scene.friction(steady_slip_speeds(scene))
     _, _, stiffness = sliding_matrices(structure, friction)
@@ -239,14 +252,14 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
     For the belt oscillator this is $(m_2 + m_1 \cos^2θ)/(m_1 \sinθ \cosθ)$: 108.49 at θ = 0.01. Infinite where the
     mass matrix does not couple the two contact coordinates.
 
-    **Raises:** `ValueError` for several contacts, or for one whose directions are no coordinates.
+    **Raises:** `ValueError` for several contacts.
 
     **Example:**
 
         >>> round(float(fj.painleve_friction(structure)), 2)
         108.49
     """
-    return _painleve_friction(structure)
+    return _painleve_friction(in_contact_coordinates(structure))
 
 
 @compiled

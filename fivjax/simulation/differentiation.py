@@ -18,11 +18,12 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, known_to_numpy
 from ..foundation.progress import reported
-from ..model.scene import Scene, refuse_painleve, refuse_vector_contacts
+from ..model.contact_coordinates import to_contact_coordinates
+from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .event_distance import closest_call
-from .start import start_state
+from .start import checked_start, snapped_to_belt, start_state
 from .trajectory import Trajectory, simulate
 
 
@@ -104,7 +105,6 @@ def derivatives(
         >>> found = fj.derivatives(lambda run: run.displacement[-1, 0], scene, ["mu", "k1"], t1=0.4)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    refuse_vector_contacts(scene.structure, "`derivatives`")
     if not callable(functional):
         raise TypeError(
             f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."
@@ -125,12 +125,16 @@ def derivatives(
     method = EventExact() if method is None else method
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
     refuse_painleve(scene)
-    begin = start_state(scene, y0)
     # The equilibrium depends on the parameters, a given start does not. As an array, a start with other numbers is not compiled
     # anew.
-    given = None if y0 is None else begin
+    given = None if y0 is None else checked_start(scene.structure.size, y0)
+    inner, begin = scene_in_contact_coordinates(scene), given
+    if given is not None and inner is not scene:
+        begin = snapped_to_belt(inner, to_contact_coordinates(scene.structure, given))
+    begin = start_state(inner, begin)
+    given = begin if given is not None and inner is scene else given
     value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
-    calls = closest_call(scene, method, begin, float(t1))
+    calls = closest_call(inner, method, begin, float(t1))
     value = jax.tree.map(known_to_numpy, value)
     return Derivatives(
         value=value,

@@ -16,18 +16,18 @@ from ..contact import Mechanics, State, Status
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.digits import apart
-from ..foundation.linear_solve import solve
 from ..foundation.precision import (
     Returned,
     in_double_precision,
     is_known,
+    known_to_numpy,
     real,
     refusing_reverse_in_single_precision,
 )
 from ..foundation.progress import following
 from ..io.datasets import labelled
-from ..model.contact_coordinates import in_contact_coordinates, transformation
-from ..model.scene import Scene, refuse_painleve
+from ..model.contact_coordinates import to_contact_coordinates, transformation
+from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
@@ -94,7 +94,7 @@ class Trajectory(eqx.Module):
     def slip_velocity(self) -> Float[Returned, "T *contacts"]:
         """Tangential velocity relative to the belt, in m/s; negative in steady sliding on a belt that moves forward."""
         along = _at_contacts(self.velocity, self.scene.structure.tangential_directions)
-        return along - np.asarray(self.scene.belt_speed)
+        return along - known_to_numpy(self.scene.belt_speed)
 
     @property
     def gap(self) -> Float[Returned, "T *contacts"]:
@@ -238,18 +238,9 @@ def simulate(
 def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
     """`simulate` for a structure with contacts given by vectors: in contact coordinates, and transformed back."""
     structure = scene.structure
-    inner = Scene(
-        in_contact_coordinates(structure),
-        scene.friction,
-        scene.belt_speed,
-        scene.load,
-        scene.restitution,
-        scene.impact_law,
-    )
-    x, _ = transformation(structure)
+    inner, (x, _) = scene_in_contact_coordinates(scene), transformation(structure)
     if y0 is not None:
-        y = checked_start(structure.size, y0)
-        y0 = snapped_to_belt(inner, jnp.concatenate([solve(x, half) for half in jnp.split(y, 2)]))
+        y0 = snapped_to_belt(inner, to_contact_coordinates(structure, checked_start(structure.size, y0)))
     run = simulate(inner, *how, y0=y0, **options)
     rows = {name: getattr(run, name) @ x.T for name in ("displacement", "velocity", "acceleration")}
     return dataclasses.replace(run, **rows, scene=scene)

@@ -17,7 +17,7 @@ from diffrax import AbstractLocalInterpolation
 from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, ModeForces, State, Status
+from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
 from ..foundation.polynomial import value_and_slope, value_slope_and_bend
@@ -137,7 +137,8 @@ class EventExact(AbstractStepper):
         if at_section and not mechanics.several:
             reached = jnp.where((jnp.arange(2 * n) == n + mechanics.tangential) & fires[count], 0.0, reached)
         reached = physics.on_constraint(mechanics, contact, reached)
-        reached = jnp.where(_impossible(mechanics, contact, series), jnp.nan, reached)
+        if not mechanics.friction.constant:
+            reached = jnp.where(physics.is_beyond_the_model(mechanics, contact, series.friction[0]), jnp.nan, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
         return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
@@ -252,17 +253,6 @@ def _series(
         rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
         states.append(rate * (unit / (k + 1)))
     return _Series(states[: order + 1], guards, slips, friction, mode)
-
-
-def _impossible(mechanics: Mechanics, contact: Contact, series: _Series) -> Bool[Array, ""]:
-    """Whether the law has led out of what the model can say: negative friction, or friction beyond Painlevé's limit."""
-    if mechanics.friction.constant:
-        return jnp.asarray(False)
-    mu = series.friction[0]
-    compliance = mechanics.normal_compliance(contact.direction, mu)
-    if mechanics.several:
-        compliance = jnp.diagonal(compliance)
-    return jnp.any((contact.status == Status.SLIDE) & ~((compliance > 0) & (mu >= 0)))
 
 
 def _rounding(

@@ -17,7 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status
-from ..linear.linearisation import LinearSliding
+from ..linear.linearisation import LOWEST_SLIP, LinearSliding
+from ..model.friction_per_contact import FrictionPerContact
+from ..model.scene import Scene
 from ..model.sliding import sliding_states
 
 ENVELOPE_DECADES = 12.0
@@ -175,6 +177,28 @@ def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], m
     """Of each contact the parts of the modes in a quantity with these shares, and how far it may fall."""
     parts = shares * modal
     return [(parts, margin)] if margin.ndim == 0 else [(parts[i], margin[i]) for i in range(len(margin))]
+
+
+def why_withheld(scene: Scene) -> str | None:
+    """Why no motion of this scene can be proved to slide for ever, as a sentence; None if that may be possible."""
+    friction = scene.friction
+    laws = friction.laws if isinstance(friction, FrictionPerContact) else (friction,)
+    for law, speed in zip(laws, np.broadcast_to(np.abs(np.asarray(scene.belt_speed)), len(laws)), strict=True):
+        name = type(law).__name__
+        if law.constant:
+            continue
+        if law.may_have_kinks:
+            return (
+                f"No motion is proved to slide for ever: the friction law `{name}` may have kinks (it compares, clips or takes "
+                f"from a table), and the proof needs a bound on its second derivative. If it has none, say so: `smooth = True`."
+            )
+        bounds = [float(bound) for bound in law.variation(jnp.asarray(LOWEST_SLIP * speed))]
+        if not np.all(np.isfinite(bounds)):
+            return (
+                f"No motion is proved to slide for ever: the friction law `{name}` has no finite bounds on its derivatives at "
+                f"and above {LOWEST_SLIP * speed:g} m/s, half the belt's speed. Define `variation`."
+            )
+    return None
 
 
 def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:

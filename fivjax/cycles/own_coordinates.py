@@ -1,0 +1,125 @@
+"""Cycles and maps of structures with contacts given by vectors: computed in contact coordinates, given in the structure's own.
+
+Everything about contact is computed where the contacts' directions are coordinates (`model.contact_coordinates`). What a user
+gives and gets, such as the state of a cycle on the section, is in the coordinates of the user's structure.
+"""
+
+import dataclasses
+import functools
+import inspect
+import json
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import equinox as eqx
+import numpy as np
+
+from ..foundation.precision import in_double_precision
+from ..io.datasets import describe
+from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
+from ..model.scene import Scene, scene_in_contact_coordinates
+from ..model.structure import Structure
+from ..simulation.start import checked_start, snapped_to_belt
+from ..simulation.trajectory import Trajectory
+from .cycle import LimitCycle, under_final_load
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
+    """A function of a scene, and perhaps of a `start`, `starts` or a `cycle`, that needs contacts at coordinates: for contacts
+    given by vectors, too.
+    """
+    names = list(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def wrapped(*args, **kwargs):
+        given = dict(zip(names, args, strict=False)) | kwargs
+        scene = given.get("scene")
+        if not isinstance(scene, Scene) or scene.structure.contacts_at_coordinates:
+            return function(*args, **kwargs)
+        for name in {"start", "cycle"} & set(names) & given.keys():
+            given[name] = _inside(scene, given[name])
+        if "starts" in names and "starts" in given:
+            given["starts"] = [_inside(scene, start) for start in given["starts"]]
+        given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
+        return _outside(scene, function(**given))
+
+    return wrapped
+
+
+def cycle_in_contact_coordinates(cycle: LimitCycle) -> LimitCycle:
+    """The same cycle in contact coordinates; itself, if its scene has them already."""
+    structure = cycle.scene.structure
+    if structure.contacts_at_coordinates:
+        return cycle
+    turned = functools.partial(to_contact_coordinates, structure)
+    return _turned(
+        cycle, scene_in_contact_coordinates(cycle.scene), turned, np.linalg.inv(transformation(structure)[0])
+    )
+
+
+def cycle_in_own_coordinates(scene: Scene, cycle: LimitCycle) -> LimitCycle:
+    """A cycle that was computed in contact coordinates, in those of the scene."""
+    if scene.structure.contacts_at_coordinates:
+        return cycle
+    turned = functools.partial(from_contact_coordinates, scene.structure)
+    return _turned(cycle, under_final_load(scene), turned, transformation(scene.structure)[0])
+
+
+def _turned(cycle: LimitCycle, scene: Scene, turned: Callable, matrix: np.ndarray) -> LimitCycle:
+    twice = np.kron(np.eye(2), matrix)
+    return dataclasses.replace(
+        cycle,
+        scene=scene,
+        state=turned(cycle.state),
+        points=turned(cycle.points),
+        harmonics=cycle.harmonics @ matrix.T,
+        return_jacobian=twice @ cycle.return_jacobian @ np.linalg.inv(twice),
+    )
+
+
+@in_double_precision
+def _inside(scene: Scene, start):
+    if isinstance(start, LimitCycle):
+        return cycle_in_contact_coordinates(start)
+    if start is None:
+        return None
+    if isinstance(start, Trajectory):
+        start = np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
+    if isinstance(start, tuple | list) and len(start) == 2:
+        state, status = start
+        return _state_inside(scene, state), status
+    return _state_inside(scene, start)
+
+
+def _state_inside(scene: Scene, state) -> np.ndarray:
+    structure: Structure = scene.structure
+    z = to_contact_coordinates(structure, checked_start(structure.size, state))
+    return np.asarray(snapped_to_belt(scene_in_contact_coordinates(scene), z))
+
+
+@in_double_precision
+def _outside(scene: Scene, found):
+    if isinstance(found, LimitCycle):
+        return cycle_in_own_coordinates(scene, found)
+    if isinstance(found, list):
+        return [_outside(scene, one) for one in found]
+    if hasattr(found, "attrs"):
+        return _dataset_outside(scene, found)
+    # A cycle nearby has a state; what else there is has no coordinates.
+    if isinstance(found, eqx.Module) and hasattr(found, "state"):
+        return dataclasses.replace(found, state=from_contact_coordinates(scene.structure, found.state))
+    return found
+
+
+def _dataset_outside(scene: Scene, dataset):
+    """A dataset with the user's scene; and with states of cycles in its coordinates."""
+    if "scene" in dataset.attrs:
+        dataset.attrs["scene"] = json.dumps(describe(scene))
+    if "state" in dataset.variables and dataset["state"].dims == ("point", "coordinate"):
+        names = scene.structure.coordinates
+        dataset["state"] = (dataset["state"].dims, from_contact_coordinates(scene.structure, dataset["state"].values))
+        dataset = dataset.assign_coords(coordinate=[*names, *(f"d{name}" for name in names)])
+    return dataset
