@@ -9,7 +9,7 @@ import functools
 import inspect
 import json
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import numpy as np
@@ -23,18 +23,17 @@ from ..simulation.start import checked_start, snapped_to_belt
 from ..simulation.trajectory import Trajectory
 from .cycle import LimitCycle, under_final_load
 
-P = ParamSpec("P")
-R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
-def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
+def in_own_coordinates(function: F) -> F:
     """A function of a scene, and perhaps of a `start`, `starts` or a `cycle`, that needs contacts at coordinates: for contacts
     given by vectors, too.
     """
     names = list(inspect.signature(function).parameters)
 
     @functools.wraps(function)
-    def wrapped(*args, **kwargs):
+    def wrapped(*args, **kwargs) -> Any:
         given = dict(zip(names, args, strict=False)) | kwargs
         scene = given.get("scene")
         if not isinstance(scene, Scene) or scene.structure.contacts_at_coordinates:
@@ -46,7 +45,7 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, function(**given))
 
-    return wrapped
+    return cast(F, wrapped)
 
 
 def cycle_in_contact_coordinates(cycle: LimitCycle) -> LimitCycle:

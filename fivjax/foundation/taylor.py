@@ -6,7 +6,7 @@ decided by the values at the centre. So at a kink the coefficients are those of 
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,8 @@ def _applied(equation, operands: list, length: int) -> list:
         return _linear(primitive, params, operands, LINEAR[name], length)
     terms = [_terms(part, length) for part in operands]
     if name in ("mul", "dot_general"):
-        return [Series(_product(*terms, lambda a, b: primitive.bind(a, b, **params)))]
+        a, b = terms
+        return [Series(_product(a, b, lambda a, b: primitive.bind(a, b, **params)))]
     if name in BY_DERIVATIVE:
         (u,) = terms
         (slope,) = _through(BY_DERIVATIVE[name], Series(u))
@@ -142,7 +143,8 @@ def _quotient(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
 
 def _integrated(value: Array, u: Sequence[Array], slope: Sequence[Array]) -> tuple[Array, ...]:
     """v with v' = s u', from its value and the series of s."""
-    return (value, *(sum(j * u[j] * slope[k - j] for j in range(1, k + 1)) / k for k in range(1, len(u))))
+    further: list[Any] = [sum(j * u[j] * slope[k - j] for j in range(1, k + 1)) / k for k in range(1, len(u))]
+    return (value, *further)
 
 
 def _by_itself(value: Array, u: Sequence[Array], a: float, b: float, c: float) -> tuple[Array, ...]:

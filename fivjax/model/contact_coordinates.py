@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..foundation.precision import in_double_precision
+from ..foundation.precision import Returned, in_double_precision
 from .contact_point import ContactPoint, directions, pivots
 from .structure import FromParameters, Matrices, Structure
 
@@ -86,24 +86,24 @@ class TurnedStructure:
         return in_contact_coordinates(self.builder(**parameters))
 
 
-def _turned(x: np.ndarray, matrices: tuple) -> Matrices:
+def _turned(columns: np.ndarray, matrices: tuple) -> Matrices:
     """Matrices and load in the coordinates z of q = X z."""
-    x = jnp.asarray(x)
+    x = jnp.asarray(columns)
     mass, damping, stiffness, load = map(jnp.asarray, matrices)
 
-    def seen(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    def seen(matrix: Array) -> Array:
         turned = x.T @ matrix @ x
         return 0.5 * (turned + turned.T)
 
     return Matrices(seen(mass), seen(damping), seen(stiffness), x.T @ load)
 
 
-def to_contact_coordinates(structure: Structure, y: Float[Array, "*k state"]) -> Float[Array, "*k state"]:
+def to_contact_coordinates(structure: Structure, y: Float[Returned, "*k state"]) -> Float[Returned, "*k state"]:
     """States z, with the directions of all contacts as coordinates, of states of a structure."""
     return _halves(y, np.linalg.inv(transformation(structure)[0]))
 
 
-def from_contact_coordinates(structure: Structure, z: Float[Array, "*k state"]) -> Float[Array, "*k state"]:
+def from_contact_coordinates(structure: Structure, z: Float[Returned, "*k state"]) -> Float[Returned, "*k state"]:
     """States in a structure's own coordinates of states z in contact coordinates."""
     return _halves(z, transformation(structure)[0])
 

@@ -153,7 +153,7 @@ def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
 
 
 def _jump(law: AbstractFriction, low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, ""]:
-    """By how much a law changes in the shortest interval between two speeds: of the halves, the one in which it changes more."""
+    """By how much a law changes in the shortest interval between two speeds: always the half in which it changes more."""
 
     def halved(_, ends):
         (low, of_low), (high, of_high) = ends
