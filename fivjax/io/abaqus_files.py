@@ -221,10 +221,14 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
         raise ValueError(
             f"{place} must list its {count} nodes under `** ELEMENT NODES`, but lists {len(nodes)}. Write it again."
         )
-    labels, current = [], []
+    labels, current, most = [], [], max((len(one) for one in values.values()), default=0)
     for position, node in enumerate(nodes, 1):
         current = directions.get(position, current)
         labels += [Label(node, direction) for direction in current]
+        if len(labels) > max(most, 1):
+            raise ValueError(
+                f"{place}: its nodes have more directions than its matrices have entries, {most}. Write it again."
+            )
     if len(set(labels)) != len(labels):
         double = next(label for label in labels if labels.count(label) > 1)
         raise ValueError(f"{place}: {double} is there twice. Write the substructure with each retained node once.")

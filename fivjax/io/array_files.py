@@ -5,80 +5,59 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from . import numpy_files, sparse_parts
 from .file_matrix import FileMatrix
+from .matlab_files import read_matlab
+from .matrix_market_files import read_matrix_market
+from .reading_limits import unreadable
 
 
 def matrix_market(path: Path) -> dict[str, FileMatrix]:
     """The matrix of a Matrix Market file, by the file's name."""
-    from scipy.io import mmread
-
-    # The reader raises many kinds of errors for damaged files; all become one sentence.
-    try:
-        matrix = mmread(path, spmatrix=False)
-    except (ValueError, OSError, EOFError, OverflowError, IndexError, TypeError) as error:
-        raise _unreadable(path, "Matrix Market", error) from None
-    return {path.stem: FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`")}
+    return {path.stem: FileMatrix(read_matrix_market(path), None, f"File `{path}`")}
 
 
 def matlab(path: Path) -> dict[str, FileMatrix]:
     """The matrices of a MATLAB file, by name; anything else in it is passed over."""
-    import scipy.io
-
-    try:
-        loaded = scipy.io.loadmat(path, spmatrix=False)
-    except NotImplementedError:  # version 7.3 is HDF5
-        loaded = _matlab_73(path)
-    except (ValueError, TypeError, OSError, EOFError, KeyError, scipy.io.matlab.MatReadError) as error:
-        raise _unreadable(path, "MATLAB", error) from None
-    found = {name: value for name, value in loaded.items() if not name.startswith("__")}
-    return _matrices(path, found)
-
-
-def _matlab_73(path: Path) -> dict:
-    import h5py
-
-    found = {}
-    with h5py.File(path) as file:
-        for name, item in file.items():
-            if isinstance(item, h5py.Dataset) and item.ndim == 2:
-                found[name] = np.transpose(item[()])  # stored column by column
-            elif isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
-                # Compressed columns; a matrix of zeros has no data.
-                starts, rows = np.asarray(item["jc"]), int(item.attrs["MATLAB_sparse"])
-                data = np.asarray(item["data"]) if "data" in item else np.zeros(0)
-                entries = np.asarray(item["ir"]) if "ir" in item else np.zeros(0, int)
-                found[name] = sparse.csc_array((data, entries, starts), shape=(rows, len(starts) - 1))
-    return found
+    return _matrices(path, read_matlab(path))
 
 
 def numpy_array(path: Path) -> dict[str, FileMatrix]:
     """The matrix of a `.npy` file, by the file's name."""
-    return {path.stem: _matrix(path, "", _load(path))}
+    return {path.stem: _matrix(path, "", numpy_files.load_array(path))}
 
 
 def numpy_archive(path: Path) -> dict[str, FileMatrix]:
     """The matrices of a `.npz` file: several by name, or a sparse one as `scipy.sparse.save_npz` writes it."""
-    with _load(path) as archive:
-        names = set(archive.files)
-        if {"format", "shape", "data"} <= names:
-            try:
-                return {path.stem: FileMatrix(sparse.csr_array(sparse.load_npz(path)), None, f"File `{path}`")}
-            except (ValueError, KeyError, TypeError) as error:
-                raise _unreadable(path, "NumPy", error) from None
-        try:
-            found = {name: archive[name] for name in archive.files}
-        except (ValueError, OSError, EOFError) as error:
-            raise _unreadable(path, "NumPy", error) from None
+    found = numpy_files.load_archive(path)
+    if {"format", "shape", "data"} <= set(found):
+        return {path.stem: _matrix(path, "", _sparse(path, found))}
     return _matrices(path, found)
 
 
-def _load(path: Path):
-    import zipfile
-
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, "NumPy", error) from None
+def _sparse(path: Path, parts: dict[str, np.ndarray]):
+    """The matrix of which `scipy.sparse.save_npz` wrote these parts."""
+    kind = parts["format"].tolist()
+    kind = kind.decode("latin-1") if isinstance(kind, bytes) else kind
+    wanted = dict.fromkeys(("csr", "csc", "bsr"), ("indices", "indptr"))
+    wanted |= {"dia": ("offsets",), "coo": ("coords",) if "coords" in parts else ("row", "col")}
+    if not isinstance(kind, str) or kind not in wanted or not set(wanted[kind]) <= set(parts):
+        raise unreadable(
+            path, numpy_files.KIND, f"it holds a sparse matrix of format {kind!r}, or not all parts of one"
+        )
+    about = (path, numpy_files.KIND)
+    shape, data, places = sparse_parts.shape_of(*about, parts["shape"]), parts["data"], [parts[n] for n in wanted[kind]]
+    if kind in ("csr", "csc"):
+        return sparse_parts.compressed(*about, kind, data, *places, shape)
+    if kind == "dia":
+        return sparse_parts.diagonals(*about, data, *places, shape)
+    if kind == "bsr":
+        return sparse_parts.blocks(*about, data, *places, shape)
+    if len(places) == 1:
+        if places[0].ndim != 2 or len(places[0]) != 2:
+            raise unreadable(*about, f"the places of its entries have shape {places[0].shape}")
+        places = list(places[0])
+    return sparse_parts.listed(*about, data, *places, shape)
 
 
 def _matrices(path: Path, found: dict) -> dict[str, FileMatrix]:
@@ -103,13 +82,3 @@ def _matrix(path: Path, name: str, value) -> FileMatrix:
                 f"{value.dtype}."
             )
     return FileMatrix(sparse.csr_array(value), None, f"File `{path}`{name}")
-
-
-def _unreadable(path: Path, kind: str, error: Exception) -> ValueError:
-    said = str(error).strip().rstrip(".").splitlines()
-    if said and "pickle" in said[0]:
-        # NumPy takes any file that it does not know for pickled objects.
-        said = ["it holds no arrays of numbers"]
-    return ValueError(
-        f"File `{path}` cannot be read as {kind}: {said[0] if said else type(error).__name__}. Write it again."
-    )

@@ -21,6 +21,8 @@ from .files import check_writable as check_writable
 from .files import replace_whole
 from .files import save_figure as save_figure
 from .files import save_text as save_text
+from .hdf5_files import read_netcdf
+from .reading_limits import unreadable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -91,7 +93,11 @@ def open(path: str | Path) -> "xr.Dataset":
     A trajectory comes back as its dataset (`Trajectory.to_dataset`; `fj.Trajectory.from_dataset` makes a trajectory of it). The
     files can be read without fivjax, too. The scene of a result is `fj.Scene.from_dataset(fj.open(path))`.
 
-    **Raises:** `ValueError` for a path without a file, or a file that is no NetCDF.
+    Opening a file runs nothing that is in it and reads no other file; it is read in a process of its own, which damage may
+    crash.
+
+    **Raises:** `ValueError` for a path without a file, and for a file that is no NetCDF, that is damaged, that refers to other
+    files or needs filters of others, or whose data are larger than its length explains or the memory holds.
 
     **Example:**
 
@@ -106,11 +112,12 @@ def open(path: str | Path) -> "xr.Dataset":
     if not path.is_file():
         raise ValueError(f"File `{path}` does not exist.")
     accessor.register()
+    attributes, variables = read_netcdf(path)
+    # Of damaged or hostile names, sizes and attributes, xarray makes errors of many kinds.
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            return file.load()
-    except (OSError, ValueError, KeyError):
-        raise ValueError(f"File `{path}` cannot be read as NetCDF; `fj.save` writes such files.") from None
+        return xr.decode_cf(xr.Dataset(variables, attrs=attributes)).load()
+    except Exception as error:
+        raise unreadable(path, "NetCDF", f"{error or type(error).__name__}") from None
 
 
 def _as_dataset(result) -> "xr.Dataset":

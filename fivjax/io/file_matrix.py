@@ -6,6 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from .reading_limits import check_length
+
+
+# Of a node or direction: finite-element codes number with 32 bits.
+LARGEST_LABEL = 2**31 - 1
+
 
 class Label(NamedTuple):
     """A degree of freedom of a finite-element model: a node and a direction, 1–3 along x, y, z and 4–6 about them."""
@@ -44,6 +50,7 @@ def text_of(path: Path) -> str:
 
     **Raises:** `ValueError` for a file that is no text.
     """
+    check_length(path)
     content = path.read_bytes()
     if b"\0" in content:
         raise ValueError(f"File `{path}` is not text: byte {content.index(0)} is zero. Write it as text, or again.")
@@ -67,7 +74,7 @@ def from_entries(
     **Raises:** `ValueError` for an entry that comes twice; and, where the file does not say whether it gives one triangle, for
     a matrix with some pairs in both orders and others in only one.
     """
-    rows, columns = np.asarray(rows, np.int64).reshape(-1, 2), np.asarray(columns, np.int64).reshape(-1, 2)
+    rows, columns = _labels(place, rows), _labels(place, columns)
     table, index = np.unique(np.concatenate([rows, columns]), axis=0, return_inverse=True)
     index = index.ravel()
     labels = tuple(Label(int(node), int(direction)) for node, direction in table)
@@ -94,6 +101,17 @@ def from_entries(
     if symmetric:
         i, j, values = np.append(i, j[off]), np.append(j, i[off]), np.append(values, values[off])
     return FileMatrix(sparse.csr_array((values, (i, j)), shape=(n, n)), labels, place)
+
+
+def _labels(place: str, labels) -> np.ndarray:
+    # As floating-point numbers first: too large ones cannot be kept as whole ones, and wrap around.
+    table = np.asarray(labels, np.float64).reshape(-1, 2)
+    if np.any(np.abs(table) > LARGEST_LABEL):
+        raise ValueError(
+            f"{place}: nodes and directions must be at most {LARGEST_LABEL}, but {np.abs(table).max():.17g} is there. Write "
+            f"the file again."
+        )
+    return table.astype(np.int64)
 
 
 def _twice(place, labels, ordered, i, j, lines) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from .file_matrix import FileMatrix, Label, from_entries, text_of
+from .output4_files import output4_matrices
 
 SQUARE, SYMMETRIC = 1, 6
 
@@ -148,21 +149,7 @@ def _real(here: str, field: str) -> float:
 
 def output4(path: Path) -> dict[str, FileMatrix]:
     """The matrices of an OUTPUT4 file, by name; it does not say which node and direction a row belongs to."""
-    try:
-        from pyyeti.nastran import op4
-    except ImportError as error:
-        raise ImportError(
-            f'File `{path}` needs pyyeti to be read. Install it with `pip install "fivjax[fe]"`, or give the '
-            f"matrices as DMIG in a `.pch` file."
-        ) from error
-    # Damaged files fail inside NumPy, struct or pyyeti itself, each in its own way.
-    try:
-        loaded = op4.read(str(path), sparse=True, justmatrix=True)
-    except Exception as error:
-        raise ValueError(
-            f"File `{path}` cannot be read as OUTPUT4 ({type(error).__name__}: {str(error).strip() or 'no more is said'}). "
-            f"Write it again."
-        ) from None
+    loaded = output4_matrices(path)
     found = {
         name.upper(): FileMatrix(sparse.csr_array(matrix), None, f"File `{path}`, matrix `{name.upper()}`")
         for name, matrix in loaded.items()

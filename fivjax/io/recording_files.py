@@ -8,8 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from ..foundation import arguments
+from .matlab_files import read_matlab
+from .numpy_files import load_archive, load_array
+from .reading_limits import check_length, unreadable
 from .recordings import Recording, channel
+from .wav_files import read_wav
 
+# Columns of a table, and characters of a name.
+MOST_TRACKS, LONGEST_NAME = 10_000, 200
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
     "acceleration": {
@@ -106,6 +112,7 @@ def read_recording(
 
 
 def _csv(path: Path):
+    check_length(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -118,7 +125,13 @@ def _csv(path: Path):
     (first, head), *rows = rows
     separator = next((s for s in (";", "\t", ",") if s in head), ",")
     names, units = [], {}
-    for text in head.split(separator):
+    heads = head.split(separator)
+    if len(heads) > MOST_TRACKS or max(map(len, heads)) > LONGEST_NAME:
+        raise ValueError(
+            f"File `{path}`, line {first}: a line of names must come first, at most {MOST_TRACKS} of at most {LONGEST_NAME} "
+            f"characters, but it holds {len(heads)}, the longest of {max(map(len, heads))}."
+        )
+    for text in heads:
         match = re.fullmatch(r"(.*?)\s*(?:[(\[](.*?)[)\]])?", text.strip().strip('"'))
         name = match[1] if match else text
         if _is_number(name):
@@ -128,11 +141,13 @@ def _csv(path: Path):
         names.append(name)
         if match and match[2]:
             units[name] = match[2]
+    # Before room is made for all: a long first line and many short ones would ask for more than the file can fill.
+    for number, line in rows:
+        if (found := line.count(separator) + 1) != len(names):
+            raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {found} found.")
     table = np.empty((len(rows), len(names)))
     for row, (number, line) in enumerate(rows):
         entries = line.split(separator)
-        if len(entries) != len(names):
-            raise ValueError(f"File `{path}`, line {number}: {len(names)} numbers expected, {len(entries)} found.")
         for column, entry in enumerate(entries):
             # A comma can only be a decimal comma where it is not the separator.
             text = entry.strip().replace(",", ".") if separator != "," else entry.strip()
@@ -140,62 +155,39 @@ def _csv(path: Path):
                 table[row, column] = float(text)
             except ValueError:
                 raise ValueError(
-                    f"File `{path}`, line {number}, column `{names[column]}`: {entry.strip()!r} is no number."
+                    f"File `{path}`, line {number}, column `{names[column]}`: {entry.strip()[:60]!r} is no number."
                 ) from None
             if not math.isfinite(table[row, column]):
                 raise ValueError(
-                    f"File `{path}`, line {number}, column `{names[column]}`: must be finite, but is {entry.strip()}."
+                    f"File `{path}`, line {number}, column `{names[column]}`: must be finite, but is {entry.strip()[:60]}."
                 )
     return dict(zip(names, table.T, strict=True)), units, None
 
 
 def _numpy(path: Path):
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            if loaded.dtype.names:
-                return {name: loaded[name] for name in loaded.dtype.names}, {}, None
-            if loaded.ndim not in (1, 2):
-                raise ValueError(f"it has shape {loaded.shape}, not (T,) or (T, k)")
-            table = loaded.reshape(len(loaded), -1)
-            return {str(k): table[:, k] for k in range(table.shape[1])}, {}, None
-        with loaded:
-            return {name: loaded[name] for name in loaded.files}, {}, None
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"File `{path}` cannot be read as NumPy: {str(error).rstrip('.')}.") from None
+    if path.suffix.lower() == ".npz":
+        return load_archive(path), {}, None
+    loaded = load_array(path)
+    if loaded.dtype.names:
+        return {name: loaded[name] for name in loaded.dtype.names}, {}, None
+    if loaded.ndim not in (1, 2) or not len(loaded):
+        raise unreadable(path, "NumPy", f"it has shape {loaded.shape}, not (T,) or (T, k)")
+    return _tracks(path, "NumPy", loaded.reshape(len(loaded), -1)), {}, None
 
 
 def _wav(path: Path):
-    from scipy.io import wavfile
-
-    try:
-        rate, samples = wavfile.read(path)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"File `{path}` cannot be read as WAV: {str(error).rstrip('.')}.") from None
-    # Unsigned samples (8 bit) rest at 128; 24 bits come in the upper part of 32.
-    if samples.dtype.kind == "u":
-        samples = (samples.astype(float) - 128.0) / 128.0
-    elif samples.dtype.kind == "i":
-        samples = samples.astype(float) / (np.iinfo(samples.dtype).max + 1.0)
-    table = samples.reshape(len(samples), -1)
-    return {str(k): table[:, k] for k in range(table.shape[1])}, {}, float(rate)
+    rate, samples = read_wav(path)
+    return _tracks(path, "WAV", samples), {}, rate
 
 
 def _matlab(path: Path):
-    import scipy.io
+    return read_matlab(path), {}, None
 
-    # The reader of MATLAB files also raises errors of its own class.
-    unreadable = (ValueError, TypeError, OSError, EOFError, scipy.io.matlab.MatReadError)
-    try:
-        loaded = scipy.io.loadmat(path, squeeze_me=True, spmatrix=False)
-    except NotImplementedError:  # version 7.3 is HDF5
-        import h5py
 
-        with h5py.File(path) as file:
-            loaded = {name: np.squeeze(item[()]) for name, item in file.items() if isinstance(item, h5py.Dataset)}
-    except unreadable as error:
-        raise ValueError(f"File `{path}` cannot be read as MATLAB: {str(error).rstrip('.')}.") from None
-    return {name: value for name, value in loaded.items() if not name.startswith("__")}, {}, None
+def _tracks(path: Path, kind: str, table: np.ndarray) -> dict[str, np.ndarray]:
+    if table.shape[1] > MOST_TRACKS:
+        raise unreadable(path, kind, f"it has {table.shape[1]} tracks; the most is {MOST_TRACKS}")
+    return {str(k): table[:, k] for k in range(table.shape[1])}
 
 
 def _vector(path: Path, name: str, values) -> np.ndarray:
