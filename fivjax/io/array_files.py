@@ -57,7 +57,8 @@ def _sparse(path: Path, parts: dict[str, np.ndarray]):
         if places[0].ndim != 2 or len(places[0]) != 2:
             raise unreadable(*about, f"the places of its entries have shape {places[0].shape}")
         places = list(places[0])
-    return sparse_parts.listed(*about, data, *places, shape)
+    rows, columns = places
+    return sparse_parts.listed(*about, data, rows, columns, shape)
 
 
 def _matrices(path: Path, found: dict) -> dict[str, FileMatrix]:

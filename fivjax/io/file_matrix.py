@@ -8,7 +8,6 @@ from scipy import sparse
 
 from .reading_limits import check_length
 
-
 # Of a node or direction: finite-element codes number with 32 bits.
 LARGEST_LABEL = 2**31 - 1
 

@@ -14,9 +14,10 @@ import numpy as np
 from scipy import sparse
 
 from .file_matrix import FileMatrix, text_of
+from .reading_limits import check_rows
 
-# How much of a file tells whether it is one.
-HEAD = 400
+# How much of a file tells whether it is one; digits of the longest number in its header.
+HEAD, LONGEST = 400, 12
 
 
 class _Header(NamedTuple):
@@ -53,6 +54,7 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
         _numbers(place, lines, ends[part], ends[part + 1], *header.formats[part], kind, wanted[part])
         for part, kind in enumerate((int, int, float))
     )
+    check_rows(path, "Harwell-Boeing", max(header.shape), header.entries)
     starts = positions - 1
     if starts[0] != 0 or starts[-1] != header.entries or np.any(np.diff(starts) < 0):
         raise ValueError(
@@ -74,16 +76,18 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
 
 
 def _header(place: str, lines: list[str]) -> _Header:
-    counts, (kind, *sizes) = [int(word) for word in lines[1].split()], lines[2].split()
-    kind = kind.upper()
-    rows, columns, entries = (int(word) for word in sizes[:3])
+    kind, *sizes = lines[2].split()
+    kind, words = kind.upper(), lines[1].split()
+    if len(words) < 4 or any(len(word) > LONGEST for word in [*words, *sizes[:3]]):
+        raise ValueError(f"{place}, lines 2 and 3: the numbers of lines and the sizes are damaged. Write it again.")
+    counts, (rows, columns, entries) = [int(word) for word in words], [int(word) for word in sizes[:3]]
     if kind[2] == "E" or kind[0] == "P" or kind[1] in "HZ":
         raise ValueError(
             f"{place} holds a matrix of kind {kind}, but must hold an assembled one with values: RSA, RUA or RRA. Write it so."
         )
     formats = re.findall(r"\(([^()]*)\)", lines[3])[:3]
     fields = [re.search(r"(\d*)[IEDFG](\d+)", text.upper().split("P")[-1]) for text in formats]
-    if len(fields) < 3 or None in fields:
+    if len(fields) < 3 or None in fields or any(len(part) > LONGEST for one in fields if one for part in one.groups()):
         raise ValueError(
             f"{place}, line 4: three Fortran formats expected, such as `(8I10) (8I10) (3E25.16)`. Write it again."
         )
@@ -101,6 +105,8 @@ def _numbers(
     place, lines: list[str], first: int, last: int, count: int, width: int, kind: type, wanted: int
 ) -> np.ndarray:
     """The numbers of some lines, in `count` fields of one width."""
+    # No line has more fields than characters.
+    count = min(count, max(map(len, lines[first:last]), default=0))
     words = " ".join(lines[first:last]).upper().replace("D", "E").split()
     if len(words) != wanted:  # fields that touch each other
         fields = (line[k * width : (k + 1) * width] for line in lines[first:last] for k in range(count))
@@ -113,5 +119,5 @@ def _numbers(
     words = words if kind is int else [re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", word) for word in words]
     try:
         return np.array([kind(word) for word in words], np.int64 if kind is int else np.float64)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{place}, lines {first + 1} to {last}: {error}. Write it again.") from None

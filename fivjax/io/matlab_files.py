@@ -188,7 +188,7 @@ def _old_variables(path: Path, content: bytes) -> dict:
         order, numbers, what = OLD_ORDERS.get(kind // 1000), OLD_NUMBERS.get(kind // 10 % 10), kind % 10
         if kind >= 10_000 or order != mark or kind // 100 % 10 or numbers is None or what > 2 or is_complex > 1:
             raise unreadable(path, KIND, f"no variable begins at byte {at}")
-        dtype, at = np.dtype(order + numbers), at + 20
+        dtype, at = np.dtype(mark + numbers), at + 20
         size = rows * columns * dtype.itemsize * (1 + is_complex)
         if at + length + size > len(content):
             raise unreadable(path, KIND, f"a variable declares {rows} rows and {columns} columns, but is cut off")

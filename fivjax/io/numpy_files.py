@@ -10,6 +10,7 @@ import re
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -92,7 +93,7 @@ def _array(path: Path, where: str, content: bytes) -> np.ndarray:
         raise unreadable(path, KIND, f"{where}{error}") from None
 
 
-def _header(content: bytes) -> tuple[np.dtype, tuple[int, ...], str, int]:
+def _header(content: bytes) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
     """Type, shape and order of the numbers, and where they begin."""
     if not content.startswith(MAGIC):
         raise ValueError("it holds no arrays of numbers")

@@ -26,6 +26,6 @@ def output4_matrices(path: Path) -> dict:
         else:
             parts[about["name"]] = values
     return {
-        name: sparse_parts.listed(path, KIND, *(parts[f"{name}/{part}"] for part in ("data", "row", "col")), shape)
+        name: sparse_parts.listed(path, KIND, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape)
         for name, shape in shapes.items()
     }

@@ -128,7 +128,7 @@ def _send_array(send, about: dict, variable) -> None:
     shape, dtype = tuple(int(size) for size in variable.shape), variable.dtype
     send({"declared": math.prod(shape) * getattr(dtype, "itemsize", 8)})
     array = np.asarray(variable[...])
-    if array.dtype.names and sorted(array.dtype.names) == ["imag", "real"]:  # of MATLAB
+    if sorted(array.dtype.names or ()) == ["imag", "real"]:  # of MATLAB
         array = array["real"] + 1j * array["imag"]
     if array.dtype.kind == "O":
         texts = [_text(value) for value in array.ravel()]
@@ -221,7 +221,7 @@ def limit(memory: int, seconds: int) -> None:
 if __name__ == "__main__":
     # Before the limits, so that it does not count.
     if sys.argv[1] == "output4":
-        import pyyeti.nastran.op4
+        import pyyeti.nastran.op4  # noqa: F401
     else:
         import h5netcdf  # noqa: F401
 

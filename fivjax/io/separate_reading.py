@@ -81,8 +81,8 @@ def _reading(path: Path, what: str, length: int) -> Iterator[IO[bytes]]:
     late = threading.Timer(PATIENCE + 4 * seconds, process.kill)
     late.daemon = True
     late.start()
+    assert process.stdout is not None
     try:
-        assert process.stdout is not None
         yield process.stdout
     finally:
         late.cancel()

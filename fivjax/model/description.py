@@ -97,9 +97,9 @@ def description_in(dataset) -> dict:
     """
     try:
         found = json.loads(dataset.attrs["scene"])
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
         found = None
-    if not isinstance(found, Mapping) or "parameters" not in found:
+    if not isinstance(found, Mapping) or not isinstance(found.get("parameters"), Mapping):
         raise ValueError(
             "Argument `dataset` must carry a scene in its attributes, as what fivjax computed does; this one has none. "
             "Results of arithmetic lose them: `xarray.set_options(keep_attrs=True)` keeps them."
@@ -114,7 +114,7 @@ def arguments_of_scene(description: Mapping) -> dict:
     names of its parameters.
 
     **Raises:** `ValueError` for a friction law or a load whose class is not defined, or whose constructor does not take the
-    numbers that were saved.
+    numbers that were saved; errors of other kinds for a damaged description.
     """
     parameters = description["parameters"]
     return {

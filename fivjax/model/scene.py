@@ -144,9 +144,19 @@ class Scene(eqx.Module):
         Friction laws and loads of your own must be defined or imported first. A structure that a function of your own made
         comes back as its matrices.
 
-        **Raises:** `ValueError` for a dataset without a scene in its attributes, or with parts of unknown classes.
+        **Raises:** `ValueError` for a dataset without a scene in its attributes, with a damaged one, or with parts of unknown
+        classes.
         """
-        return cls(**description.arguments_of_scene(description.description_in(dataset)))
+        found = description.description_in(dataset)
+        try:
+            return cls(**description.arguments_of_scene(found))
+        except ValueError:
+            raise
+        except Exception as error:  # of many kinds: anything can stand in the attributes of a file of others
+            said = f"{type(error).__name__}: {str(error)[:200]}".rstrip(".: ")
+            raise ValueError(
+                f"The scene in the attributes of argument `dataset` is damaged ({said}). Save it again."
+            ) from None
 
     def __repr__(self) -> str:
         return as_call("Scene", {field.name: getattr(self, field.name) for field in dataclasses.fields(self)})

@@ -105,13 +105,28 @@ class Trajectory(eqx.Module):
     def from_dataset(cls, dataset: "xr.Dataset") -> "Trajectory":
         """A trajectory from its dataset, such as `fj.open("run.nc")`; without its energy ledger.
 
-        **Raises:** `ValueError` for a dataset without a scene in its attributes.
+        **Raises:** `ValueError` for a dataset without a scene in its attributes, or one that is not a whole trajectory.
         """
         scene = Scene.from_dataset(dataset)
         rows = ("t", "displacement", "velocity", "acceleration", "status", "normal_force", "friction_force", "load")
-        settings = tuple(json.loads(dataset.attrs.get("settings", "{}")).items())
-        outcome = np.int8(Ending[dataset.attrs["outcome"].upper()])
-        return cls(**{name: dataset[name].values for name in rows}, scene=scene, outcome=outcome, settings=settings)
+        try:
+            settings = tuple(json.loads(dataset.attrs.get("settings", "{}")).items())
+            outcome = np.int8(Ending[dataset.attrs["outcome"].upper()])
+            values = {name: dataset[name].values for name in rows}
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
+            raise ValueError(
+                f"Argument `dataset` must be a saved trajectory: variables {', '.join(rows)} and attributes `settings` and "
+                f"`outcome`, but some are missing or damaged. Save the trajectory again."
+            ) from None
+        count, size = len(values["t"]), len(scene.structure.coordinates)
+        for name, value in values.items():
+            wide = name in ("displacement", "velocity", "acceleration")
+            if value.dtype.kind not in "biuf" or value.shape[:1] != (count,) or (wide and value.shape != (count, size)):
+                raise ValueError(
+                    f"Argument `dataset` must be a saved trajectory of {count} instants and {size} coordinates, but `{name}` "
+                    f"has shape {value.shape} and type {value.dtype}. Save the trajectory again."
+                )
+        return cls(**values, scene=scene, outcome=outcome, settings=settings)
 
     def to_dataset(self) -> "xr.Dataset":
         """The trajectory with names, units and the scene it came from."""
