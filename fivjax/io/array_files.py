@@ -45,20 +45,20 @@ def _sparse(path: Path, parts: dict[str, np.ndarray]):
         raise unreadable(
             path, numpy_files.KIND, f"it holds a sparse matrix of format {kind!r}, or not all parts of one"
         )
-    about = (path, numpy_files.KIND)
-    shape, data, places = sparse_parts.shape_of(*about, parts["shape"]), parts["data"], [parts[n] for n in wanted[kind]]
+    known = numpy_files.KIND
+    shape, data = sparse_parts.shape_of(path, known, parts["shape"]), parts["data"]
+    first, last = parts[wanted[kind][0]], parts[wanted[kind][-1]]
     if kind in ("csr", "csc"):
-        return sparse_parts.compressed(*about, kind, data, *places, shape)
+        return sparse_parts.compressed(path, known, kind, data, first, last, shape)
     if kind == "dia":
-        return sparse_parts.diagonals(*about, data, *places, shape)
+        return sparse_parts.diagonals(path, known, data, first, shape)
     if kind == "bsr":
-        return sparse_parts.blocks(*about, data, *places, shape)
-    if len(places) == 1:
-        if places[0].ndim != 2 or len(places[0]) != 2:
-            raise unreadable(*about, f"the places of its entries have shape {places[0].shape}")
-        places = list(places[0])
-    rows, columns = places
-    return sparse_parts.listed(*about, data, rows, columns, shape)
+        return sparse_parts.blocks(path, known, data, first, last, shape)
+    if "coords" in parts:
+        if first.ndim != 2 or len(first) != 2:
+            raise unreadable(path, known, f"the places of its entries have shape {first.shape}")
+        first, last = first
+    return sparse_parts.listed(path, known, data, first, last, shape)
 
 
 def _matrices(path: Path, found: dict) -> dict[str, FileMatrix]:

@@ -106,7 +106,7 @@ def output4(path: str, send) -> None:
     for name, matrix in op4.read(path, sparse=True, justmatrix=True).items():
         entries = sparse.coo_array(matrix)
         name = _named(name)
-        send({"name": name, "shape": [int(size) for size in entries.shape]})
+        send({"name": name, "shape": [int(size) for size in entries.shape or ()]})
         for part, values in (("row", entries.row), ("col", entries.col), ("data", entries.data)):
             _send_array(send, {"name": f"{name}/{part}"}, values)
 

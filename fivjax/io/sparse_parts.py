@@ -86,7 +86,7 @@ def blocks(path: Path, kind: str, data, indices, starts, shape: tuple[int, int])
     where = compressed(path, kind, "csr", numbers, indices, starts, outer).tocoo()
     rows = (where.row * high)[:, None, None] + np.arange(high)[:, None]
     columns = (where.col * wide)[:, None, None] + np.arange(wide)
-    values = data[where.data - 1]
+    values = np.take(data, np.asarray(where.data, int) - 1, axis=0)
     rows, columns = np.broadcast_to(rows, values.shape), np.broadcast_to(columns, values.shape)
     return sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
