@@ -73,7 +73,7 @@ def test_sizes_that_the_file_cannot_hold(tmp_path):
     with pytest.raises(ValueError, match="declares 1000000000000 rows or columns, but has 1 entries"):
         fj.read_matrices(path)
     with h5py.File(tmp_path / "run.nc", "w") as file:
-        file.create_dataset("x", shape=(10**11,), dtype="f8", chunks=(1000,))
+        file.create_dataset("x", shape=(10**11,), dtype="f8", chunks=(1000,)).make_scale()
     with pytest.raises(ValueError, match="declares 800 GB of data, but holds only"):
         fj.open(tmp_path / "run.nc")
     np.save(tmp_path / "K.npy", np.eye(2))
