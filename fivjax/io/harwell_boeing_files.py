@@ -76,11 +76,12 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
 
 
 def _header(place: str, lines: list[str]) -> _Header:
-    kind, *sizes = lines[2].split()
-    kind, words = kind.upper(), lines[1].split()
-    if len(words) < 4 or any(len(word) > LONGEST for word in [*words, *sizes[:3]]):
+    kind, *sizes = [*(" ".join(lines[2:3])).upper().split(), ""]
+    words, sizes = lines[1].split(), sizes[:3]
+    numbers = all(re.fullmatch(rf"[0-9]{{1,{LONGEST}}}", word) for word in [*words, *sizes])
+    if len(lines) < 4 or len(words) < 4 or len(sizes) < 3 or len(kind) < 3 or not numbers:
         raise ValueError(f"{place}, lines 2 and 3: the numbers of lines and the sizes are damaged. Write it again.")
-    counts, (rows, columns, entries) = [int(word) for word in words], [int(word) for word in sizes[:3]]
+    counts, (rows, columns, entries) = [int(word) for word in words], [int(word) for word in sizes]
     if kind[2] == "E" or kind[0] == "P" or kind[1] in "HZ":
         raise ValueError(
             f"{place} holds a matrix of kind {kind}, but must hold an assembled one with values: RSA, RUA or RRA. Write it so."
