@@ -940,7 +940,7 @@ def _slide_frequency(m):
     return math.sqrt(max(eigh(m.K[np.ix_(i, i)], m.M[np.ix_(i, i)], eigvals_only=True)[0], 0.0)) or m.omega
 
 
-def verdict(model, t_max=20.0, y0=None, rtol=1e-9):
+def verdict(model, t_max=20.0, y0=None, rtol=1e-9, until_event=False):
     """Sliding for ever, on a limit cycle, or undecided.
 
     "sliding" is a proof when friction is constant. The phase that slides forward after the last load jump is
@@ -956,6 +956,8 @@ def verdict(model, t_max=20.0, y0=None, rtol=1e-9):
     A velocity-dependent law runs on `simulate`'s engine at ``rtol``. There "sliding" means a linearly stable
     equilibrium from which the motion differs by less than 1e-6 of its displacement, the returns are asked to close
     to 1e-7, and a torus stays undecided. Constant friction does not use ``rtol``.
+
+    With ``until_event`` a run ends, undecided, at its first contact event: for whether sliding goes on for ever.
     """
     m = _Mechanics(model)
     q, v = _start(model, m, y0)
@@ -983,6 +985,8 @@ def verdict(model, t_max=20.0, y0=None, rtol=1e-9):
             when = seg.event[0]
             first = when if known["events"] == 0 else known["first_event"]
             known = {"events": known["events"] + 1, "first_event": first, "last_event": when}
+            if until_event:
+                break
         if seg.t0 < quiet_load:
             continue
         off = max(np.abs(seg.q - q_eq).max(), np.abs(seg.v).max() / returns.omega)

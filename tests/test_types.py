@@ -65,7 +65,7 @@ contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
 structure = fj.Structure(np.eye(4), 0.1 * np.eye(4), np.diag([1.0, 5.0, 2.0, 5.0]), [0, -1, 0, -1], contacts=contacts)
 with jax.enable_x64(True):
     for law in (fj.Coulomb(0.2), fj.ExponentialDecay(0.21, 0.2, 0.5)):
-        scene = fj.Scene(structure, law, 0.5, fj.ConstantLoad(1.0))
+        scene = fj.Scene(structure, [law, law], 0.5, fj.ConstantLoad(1.0))
         linear = jax.tree.map(np.asarray, linear_sliding(scene))
         for groups in (2, 3):
             modes = sliding_modes(jax.tree.map(lambda leaf: np.stack([leaf] * groups), linear))

@@ -155,7 +155,7 @@ def off_the_curve(path: Float[np.ndarray, "k state"]) -> Float[np.ndarray, " m"]
     return np.where(np.isfinite(distance), distance, np.inf)
 
 
-def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray, "*m"]:
+def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray | np.floating, "*m"]:
     """The root mean square distance of points from their mean."""
     away = weighted - np.mean(weighted, axis=0)
     return np.sqrt(np.einsum("k...j,k...j->...", away, away) / len(away))

@@ -131,7 +131,7 @@ class Trial(NamedTuple):
 
 def trial(
     centre: Float[np.ndarray, " state"],
-    status: int | Int[np.ndarray, " c"],
+    status: int | np.integer | Int[np.ndarray, " c"],
     direction: float | Float[np.ndarray, " c"],
     jacobian: Float[np.ndarray, "state state"],
     weights: Float[np.ndarray, " state"],
