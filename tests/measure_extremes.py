@@ -1,6 +1,6 @@
 """Extreme parameters: the table and figures of `docs/measurements.md`.
 
-    python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [resume] [refusals]
+    python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [rows_apart] [resume] [refusals]
 
 Each word picks one study; without any, all run. `EXTREMES_TRAJECTORIES` sets how many trajectories are drawn (100,000 unless given),
 `EXTREMES_ASKED` of about how many of them `confirm` asks the reference (300 unless given).
@@ -379,6 +379,36 @@ def table() -> None:
         print(f"| {name} | " + " | ".join(columns) + f" | {', '.join(sorted(endings))} |", flush=True)
 
 
+def rows_apart(count: int = int(os.environ.get("EXTREMES_FALLING", "4096")), at_a_time: int = 64) -> None:
+    """Random scenes with laws that fall at 0.1 to 30 s/m: rows 10 ms apart against rows 0.1 ms apart."""
+    rng = np.random.default_rng(7)
+    static = rng.uniform(0.05, 0.6, count)
+    values = {
+        "mu_static": static,
+        "mu_dynamic": static * rng.uniform(0.0, 1.0, count),
+        "decay": 10 ** rng.uniform(-1, np.log10(30), count),
+        "belt_speed": 10 ** rng.uniform(-1, 1, count),
+        "p": 10 ** rng.uniform(-0.3, 0.7, count),
+    }
+
+    def followed(own, instants):
+        scene = extremes.FALLING.replace(**own)
+        return states_at(scene, fj.EventExact(), start_state(scene, None), instants, MOST_ADVANCES)[0]
+
+    with jax.enable_x64(True):
+        batch, apart = jax.jit(jax.vmap(followed, (0, None))), []
+        for k in range(0, count, at_a_time):
+            places = np.minimum(np.arange(k, k + at_a_time), count - 1)
+            own = {name: jnp.asarray(column[places]) for name, column in values.items()}
+            coarse, fine = (np.asarray(batch(own, np.linspace(0.0, 0.3, rows + 1))) for rows in (30, 3000))
+            apart.append(np.abs(coarse - fine[:, ::100]).max(axis=(1, 2)))
+    apart = np.concatenate(apart)[:count]
+    worst = {name: float(column[np.argmax(apart)]) for name, column in values.items()}
+    print(
+        f"{count} scenes: median {np.median(apart):.1e}, worst {apart.max():.1e}, above 1e-10: {np.sum(~(apart <= 1e-10))}; {worst}"
+    )
+
+
 def resume(times: int = 20) -> None:
     """kill -9 at random instants, then the same command again: the maps, byte for byte."""
     same = 0
@@ -417,6 +447,7 @@ STUDIES = {
     "confirm": confirm,
     "energy": energy,
     "table": table,
+    "rows_apart": rows_apart,
     "resume": resume,
     "refusals": refusals,
 }

@@ -379,3 +379,58 @@ def test_simultaneous_events_that_strike_one_another_have_no_derivative():
     found, worst = differs_from_differences(spring_coupled((1.0, 1.1), mass=0.004), 0.2)
     assert found.exist
     assert worst < 1e-7
+
+
+TURN = np.array([[1.0, 0.3, 0.2], [0.1, 1.0, -0.4], [0.2, 0.0, 1.0]])  # q = TURN · z
+SINGLE = fj.belt_oscillator()
+
+
+def turned_matrices(k1):
+    mass, damping, stiffness, load = fj.belt_oscillator(k1=k1).matrices
+    return *(TURN.T @ matrix @ TURN for matrix in (mass, damping, stiffness)), TURN.T @ load
+
+
+def turned(k1=100e3) -> fj.Structure:
+    """The belt oscillator in other coordinates, in which its one contact is given by vectors."""
+    contact = fj.ContactPoint(TURN[SINGLE.tangential], TURN[SINGLE.normal])
+    return fj.Structure.from_parameters(turned_matrices, {"k1": k1}, contacts=[contact], builder=turned)
+
+
+def on_both(make):
+    """Of the scene with the contact at coordinates, and of that with it along vectors."""
+    return [make(fj.Scene(one, fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.2))) for one in (SINGLE, turned())]
+
+
+def test_one_contact_along_vectors_is_the_one_at_coordinates():
+    """Rejects one contact refused where two worked: the same motion, limits and equilibrium in other coordinates."""
+    right, mine = on_both(lambda scene: fj.simulate(scene, 0.2, 1e-2))
+    np.testing.assert_allclose(mine.velocity @ TURN.T, right.velocity, atol=1e-11)
+    np.testing.assert_allclose(mine.normal_force, right.normal_force, rtol=1e-9, atol=1e-9)
+    right, mine = on_both(fj.sliding_equilibrium)
+    np.testing.assert_allclose(TURN @ mine, right, atol=1e-14)
+    for quantity in (
+        lambda scene: fj.painleve_friction(scene.structure),
+        fj.cea.growth_rate,
+        fj.cea.critical_slope,
+        lambda scene: fj.cea.coalescence(scene.structure).mu,
+        lambda scene: fj.cea.critical_friction(scene.structure),
+    ):
+        right, mine = on_both(quantity)
+        assert float(mine) == pytest.approx(float(right), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_one_contact_along_vectors_in_derivatives_maps_and_cycles():
+    """The parameters of a structure are known in contact coordinates, and results come back in the structure's own."""
+    right, mine = on_both(
+        lambda scene: fj.derivatives(lambda run: run.slip_velocity[-1], scene, ["mu", "k1"], 0.15, 1e-2)
+    )
+    assert all(mine[name] == pytest.approx(right[name], rel=1e-9) for name in ("mu", "k1"))
+    right, mine = on_both(lambda scene: fj.bistability_map(scene, k1=[99e3, 1e5], p=[1.0, 3.0], progress=False))
+    assert np.array_equal(right["verdict"], mine["verdict"])
+    assert fj.Scene.from_dataset(mine).structure.places == turned().places
+    right, mine = on_both(fj.limit_cycle)
+    assert mine.period == pytest.approx(right.period, rel=1e-11)
+    np.testing.assert_allclose(np.kron(np.eye(2), TURN) @ mine.state, right.state, atol=1e-12)
+    end = mine.trajectory(4)
+    np.testing.assert_allclose(np.concatenate([end.displacement[-1], end.velocity[-1]]), mine.state, atol=1e-10)

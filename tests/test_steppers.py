@@ -305,3 +305,19 @@ def test_a_load_that_jumps_at_rest_does_not_lengthen_the_first_step():
             often = moved(often, 0.01 / 50)
         often = np.asarray(often)
     np.testing.assert_allclose(once, often, rtol=0, atol=1e-13 * np.max(np.abs(often)))
+
+
+@pytest.mark.parametrize(
+    ("law", "belt_speed", "p"),
+    [
+        ((0.1813749829420785, 0.15860493947766804, 29.617975771010283), 2.737578714968063, 3.295321884578655),
+        ((0.5922, 0.3212, 0.1734), 3.944, 3.7735),
+        ((0.5, 0.1, 12.0), 0.4, 2.5),
+    ],
+)
+def test_a_law_that_falls_fast_does_not_ask_how_often_the_run_is_saved(law, belt_speed, p):
+    """Rejects a step over exp(-d u) as it grows from e^-80 to 1, which the last terms of a series do not show: 7e-6 of error."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(*law), belt_speed, fj.Pulse(100.0, p))
+    coarse, fine = (fj.simulate(scene, 0.3, dt) for dt in (1e-2, 1e-4))
+    np.testing.assert_allclose(coarse.velocity, fine.velocity[::100], atol=1e-11)
+    np.testing.assert_allclose(coarse.displacement, fine.displacement[::100], atol=1e-11)

@@ -9,7 +9,7 @@ import functools
 import inspect
 import json
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -23,18 +23,20 @@ from ..simulation.start import checked_start, snapped_to_belt
 from ..simulation.trajectory import Trajectory
 from .cycle import LimitCycle, under_final_load
 
-F = TypeVar("F", bound=Callable[..., Any])
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-def in_own_coordinates(function: F) -> F:
+def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
     """A function of a scene, and perhaps of a `start`, `starts` or a `cycle`, that needs contacts at coordinates: for contacts
     given by vectors, too.
     """
+    call: Callable = function
     names = list(inspect.signature(function).parameters)
 
     @functools.wraps(function)
-    def wrapped(*args, **kwargs) -> Any:
-        given = dict(zip(names, args, strict=False)) | kwargs
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        given: dict[str, Any] = dict(zip(names, args, strict=False)) | dict(kwargs)
         scene = given.get("scene")
         if not isinstance(scene, Scene) or scene.structure.contacts_at_coordinates:
             return function(*args, **kwargs)
@@ -43,9 +45,9 @@ def in_own_coordinates(function: F) -> F:
         if "starts" in names and "starts" in given:
             given["starts"] = [_inside(scene, start) for start in given["starts"]]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
-        return _outside(scene, function(**given))
+        return _outside(scene, call(**given))
 
-    return cast(F, wrapped)
+    return wrapped
 
 
 def cycle_in_contact_coordinates(cycle: LimitCycle) -> LimitCycle:
@@ -100,7 +102,7 @@ def _state_inside(scene: Scene, state) -> np.ndarray:
 
 
 @in_double_precision
-def _outside(scene: Scene, found):
+def _outside(scene: Scene, found) -> Any:
     if isinstance(found, LimitCycle):
         return cycle_in_own_coordinates(scene, found)
     if isinstance(found, list):

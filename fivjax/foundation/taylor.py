@@ -6,7 +6,7 @@ decided by the values at the centre. So at a kink the coefficients are those of 
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,8 +92,8 @@ def _applied(equation, operands: list, length: int) -> list:
         return _linear(primitive, params, operands, LINEAR[name], length)
     terms = [_terms(part, length) for part in operands]
     if name in ("mul", "dot_general"):
-        a, b = terms
-        return [Series(_product(a, b, lambda a, b: primitive.bind(a, b, **params)))]
+        left, right = terms
+        return [Series(_product(left, right, lambda a, b: primitive.bind(a, b, **params)))]
     if name in BY_DERIVATIVE:
         (u,) = terms
         (slope,) = _through(BY_DERIVATIVE[name], Series(u))
@@ -130,8 +130,14 @@ def _linear(primitive, params, operands: list, values: Sequence[int], length: in
     return [Series(own) for own in zip(*rows, strict=True)]
 
 
-def _product(a: Sequence[Array], b: Sequence[Array], multiply=jnp.multiply) -> tuple[Array, ...]:
-    return tuple(sum((multiply(a[j], b[k - j]) for j in range(1, k + 1)), multiply(a[0], b[k])) for k in range(len(a)))
+def _product(a: Sequence[Array], b: Sequence[Array], multiply: Callable = jnp.multiply) -> tuple[Array, ...]:
+    def term(k: int) -> Array:
+        total = multiply(a[0], b[k])
+        for j in range(1, k + 1):
+            total = total + multiply(a[j], b[k - j])
+        return total
+
+    return tuple(map(term, range(len(a))))
 
 
 def _quotient(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
@@ -143,8 +149,7 @@ def _quotient(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
 
 def _integrated(value: Array, u: Sequence[Array], slope: Sequence[Array]) -> tuple[Array, ...]:
     """v with v' = s u', from its value and the series of s."""
-    further: list[Any] = [sum(j * u[j] * slope[k - j] for j in range(1, k + 1)) / k for k in range(1, len(u))]
-    return (value, *further)
+    return (value, *(jnp.asarray(sum(j * u[j] * slope[k - j] for j in range(1, k + 1))) / k for k in range(1, len(u))))
 
 
 def _by_itself(value: Array, u: Sequence[Array], a: float, b: float, c: float) -> tuple[Array, ...]:

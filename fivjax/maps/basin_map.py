@@ -58,6 +58,9 @@ def basins(
     `share_high` (a 95 % Wilson interval, as if the states were drawn at random); for sliding these are `sliding_share`,
     `sliding_share_low` and `sliding_share_high`. States without a verdict count for neither.
 
+    With contacts given by vectors, the axes are coordinates of `fj.in_contact_coordinates(scene.structure)`: "tangential",
+    "dtangential", …
+
     **Raises:** `ValueError` or `TypeError`, before anything is compiled, for unknown axis names, axes without a coordinate, and
     states below the belt or moving into it.
 

@@ -7,6 +7,7 @@ directions; the others stay. Energies, forces and eigenvalues do not change.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -86,16 +87,15 @@ class TurnedStructure:
         return in_contact_coordinates(self.builder(**parameters))
 
 
-def _turned(columns: np.ndarray, matrices: tuple) -> Matrices:
+def _turned(x: np.ndarray, matrices: tuple) -> Matrices:
     """Matrices and load in the coordinates z of q = X z."""
-    x = jnp.asarray(columns)
     mass, damping, stiffness, load = map(jnp.asarray, matrices)
 
-    def seen(matrix: Array) -> Array:
-        turned = x.T @ matrix @ x
+    def seen(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+        turned = jnp.asarray(x.T) @ matrix @ x
         return 0.5 * (turned + turned.T)
 
-    return Matrices(seen(mass), seen(damping), seen(stiffness), x.T @ load)
+    return Matrices(seen(mass), seen(damping), seen(stiffness), jnp.asarray(x.T) @ load)
 
 
 def to_contact_coordinates(structure: Structure, y: Float[Returned, "*k state"]) -> Float[Returned, "*k state"]:
@@ -108,7 +108,7 @@ def from_contact_coordinates(structure: Structure, z: Float[Returned, "*k state"
     return _halves(z, transformation(structure)[0])
 
 
-def _halves(y, matrix: np.ndarray):
+def _halves(y, matrix: np.ndarray) -> Any:
     """Displacements and velocities, each times a matrix; NumPy's arrays stay NumPy's."""
     n = len(matrix)
     join = np.concatenate if isinstance(y, np.ndarray) else jnp.concatenate

@@ -80,7 +80,10 @@ class AbstractFriction(eqx.Module):
     @property
     def may_have_kinks(self) -> bool:
         """Whether the law is not certain to be smooth."""
-        return not (is_smooth(self, jnp.zeros(())) if self.smooth is None else self.smooth)
+        if self.smooth is not None:
+            return not self.smooth
+        with jax.enable_x64(True):
+            return not is_smooth(self, jnp.zeros(()))
 
     def bounds(self, slip_speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """`variation` as far as proofs may rely on it: without a bound on |μ''| where the law may have kinks."""

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status
+from ..foundation.precision import in_double_precision
 from ..linear.linearisation import LOWEST_SLIP, LinearSliding
 from ..model.friction_per_contact import FrictionPerContact
 from ..model.scene import Scene
@@ -179,6 +180,7 @@ def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], m
     return [(parts, margin)] if margin.ndim == 0 else [(parts[i], margin[i]) for i in range(len(margin))]
 
 
+@in_double_precision
 def why_withheld(scene: Scene) -> str | None:
     """Why no motion of this scene can be proved to slide for ever, as a sentence; None if that may be possible."""
     friction = scene.friction
