@@ -37,9 +37,8 @@ def on_a_floor():
     return fj.Scene(structure, fj.Coulomb(FORCE / 10.0), belt_speed=0.0, load=fj.ConstantLoad(10.0))
 
 
-@pytest.mark.parametrize(
-    "known", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["unknown start", "known start"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [False, True], ids=["unknown start", "known start"])
 def test_friction_and_damping_from_a_free_decay(known):
     """From a displacement and from a velocity, with noise; where the start is not known, it is fitted."""
     t = np.arange(600) / 250.0

@@ -213,7 +213,8 @@ def test_a_cycle_that_only_a_slower_belt_s_leads_to_is_met(monkeypatch):
     assert found.period == pytest.approx(reference["slip_time"] + reference["stick_time"], abs=1e-8)
 
 
-@pytest.mark.parametrize("belt_speed", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("belt_speed", [0.3, 1.0])
 def test_below_the_fold_there_is_none(belt_speed):
     """Just below its fold the cycle's ghost holds trajectories for hundreds of periods; it is no cycle."""
     fold = {0.3: 0.1156, 1.0: 0.1679}[belt_speed]

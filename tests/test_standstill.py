@@ -214,6 +214,7 @@ def ended(code: str, *arguments, threads: int, deadline: float) -> str:
     return ran.stdout
 
 
+@pytest.mark.slow
 def test_groups_of_many_coordinates_do_not_wait_for_each_other():
     """What stood still: two calls of LAPACK, each with 64 matrices, in a pool of two threads."""
     assert ended(PREPARING, threads=2, deadline=120) == "True\n"
