@@ -12,6 +12,7 @@ import tyro
 import fivjax as fj
 
 from ..foundation.progress import in_lines
+from ..foundation.signals import exit_code, handled, handled_as_before
 from .analysis_commands import Calibrate, Cea
 from .branch_command import Branch
 from .compiled_code import keep_compiled_code
@@ -19,7 +20,6 @@ from .cycle_command import Cycle
 from .map_command import Map
 from .outputs import Failure, Interrupted
 from .parsing import numbers
-from .signals import exit_code, handled
 from .simulate_command import Simulate
 from .study_commands import Reproduce, Tradeoff
 
@@ -90,5 +90,4 @@ def _interruptible(received: list[int], interrupt: Callable[[int, FrameType | No
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        handled_as_before(before)

@@ -17,7 +17,7 @@ import time
 from types import FrameType
 from typing import NoReturn
 
-from .signals import SIGNALS, exit_code, handled
+from ..foundation.signals import SIGNALS, exit_code, handled
 
 # The process ends within five seconds of a signal.
 PATIENCE = 4.0  # s

@@ -5,7 +5,6 @@ else may write there. What cannot be kept is made anew by each process: that cos
 """
 
 import contextlib
-import hashlib
 import os
 import stat
 import threading
@@ -13,9 +12,9 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+from .seals import Damaged, sealed, unsealed
 from .whole_files import write_whole
 
-DIGEST_BYTES = 32
 # What others than the owner must not be permitted: writing; and looking inside, which what is below needs to be reached.
 WRITING, ENTERING = 0o022, 0o011
 CONSEQUENCE = "Results are the same, but each start takes longer."
@@ -82,14 +81,12 @@ def read_own(path: Path) -> bytes:
 def read_kept(path: Path) -> bytes | None:
     """The content of a file written by `keep`; none where there is none. A damaged one, or one of somebody else, is removed."""
     try:
-        data = read_own(path)
-        content = data[DIGEST_BYTES:]
-        if hashlib.sha256(content).digest() == data[:DIGEST_BYTES]:
-            os.utime(path)
-            return content
+        content = unsealed(read_own(path))
+        os.utime(path)
+        return content
     except FileNotFoundError:
         return None
-    except OSError:
+    except (OSError, Damaged):
         pass
     with contextlib.suppress(OSError):
         path.unlink()
@@ -99,7 +96,7 @@ def read_kept(path: Path) -> bytes | None:
 def keep(path: Path, content: bytes) -> None:
     """Write a file whole, with a digest; where that is not possible, say so once and leave nothing."""
     try:
-        write_whole(path, hashlib.sha256(content).digest() + content, private=True)
+        write_whole(path, sealed(content), private=True)
     except OSError as error:
         cannot_keep(path.parent, error.strerror or str(error))
 

@@ -38,6 +38,7 @@ R = TypeVar("R")
 FOLDER, LARGEST = "fivjax-traced", 200 * 2**20
 # Libraries whose code may be in a program. What they define is fixed by their versions.
 LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy", "warp-lang")
+# What these packages define is fixed by their versions, or by fivjax's source.
 KNOWN_PACKAGES = ("fivjax", "builtins", "functools", *LIBRARIES)
 
 

@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+from .signals import handled, handled_as_before
+
 # How long threads are waited for once a run is to stop, s.
 PATIENCE = 2.0
 
@@ -34,16 +36,11 @@ def stop_requests() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    # What the caller ignores (`nohup`), or handles outside Python, stays as it is.
-    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    for number in before:
-        signal.signal(number, note)
+    before = handled(note)
     try:
         yield caught
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        handled_as_before(before)
         if caught and before[caught[0]] is not signal.default_int_handler:
             signal.raise_signal(caught[0])
 

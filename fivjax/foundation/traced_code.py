@@ -19,19 +19,8 @@ import jax
 import numpy as np
 from jax.extend import core
 
-# What these packages define is fixed by their versions.
-KNOWN_PACKAGES = (
-    "fivjax",
-    "jax",
-    "jaxlib",
-    "equinox",
-    "diffrax",
-    "optimistix",
-    "lineax",
-    "numpy",
-    "builtins",
-    "functools",
-)
+from .kept_programs import KNOWN_PACKAGES
+
 # Parameters of operations that name things, or that make derivatives of a function only when these are asked for.
 NAMES = ("name", "jvp_jaxpr_thunk", "jvp_jaxpr_fun", "fwd_jaxpr_thunk", "fwd", "bwd", "debug_info", "debug")
 

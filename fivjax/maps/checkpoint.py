@@ -17,8 +17,8 @@ import numpy as np
 
 from ..batches.attractors import Attractors
 from ..batches.results import Verdicts, by_name, not_run
+from ..foundation.seals import Damaged
 from ..io.files import check_writable, replace_whole
-from ..io.seals import Damaged
 from ..verdicts.verdict import Verdict
 from . import checkpoint_file
 from .attractor_files import from_bytes, to_bytes

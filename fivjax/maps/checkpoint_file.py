@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..io.seals import Damaged, sealed, unsealed
+from ..foundation.seals import Damaged, sealed, unsealed
 
 KIND = "fivjax checkpoint"
 # The last bytes of the file, after the length of the list.

@@ -16,8 +16,8 @@ import numpy as np
 
 from ..batches.halfway import Halfway
 from ..batches.results import Verdicts, by_name
+from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
-from ..io.seals import Damaged, sealed, unsealed
 from .attractor_files import from_bytes, to_bytes
 from .trajectories import Places
 

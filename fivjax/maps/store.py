@@ -20,8 +20,8 @@ import numpy as np
 
 from ..batches.attractors import Attractors
 from ..batches.results import Verdicts, by_name, not_run
+from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
-from ..io.seals import Damaged, sealed, unsealed
 from .attractor_files import from_bytes, to_bytes
 from .job_files import file_of
 from .store_folder import check_begun, create, locked, zarr

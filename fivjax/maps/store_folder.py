@@ -9,8 +9,6 @@ import errno
 import json
 import os
 import platform
-import shutil
-import tempfile
 import time
 import warnings
 import zlib
@@ -18,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..foundation.seals import Damaged, sealed, unsealed
+from ..foundation.whole_files import own_folder
 from ..io.files import check_writable, replace_whole
-from ..io.seals import Damaged, sealed, unsealed
 from .checkpoint import refuse_other_run
 from .trajectories import Grid
 
@@ -44,49 +43,42 @@ def create(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dic
     """Create an empty store; it appears under its name only when it is whole. One that another process has begun meanwhile is
     left alone.
     """
-    part = _empty(check_writable(path).parent, run, grid, tile, fields)
-    try:
+    with own_folder(check_writable(path).parent) as part:
+        _fill(part, run, grid, tile, fields)
         mask = os.umask(0)
         os.umask(mask)
         part.chmod(0o777 & ~mask)
-        part.rename(path)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-            raise
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        try:
+            part.rename(path)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
 
 
-def _empty(parent: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> Path:
-    """An empty store in a folder of its own."""
+def _fill(part: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
+    """Make an empty store of a folder."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     codecs = {"compressors": [ZstdCodec(), Crc32cCodec()]}
-    part = Path(tempfile.mkdtemp(dir=parent, prefix=".fivjax."))
-    try:
-        group = zarr().create_group(part, zarr_format=3, attributes={"kind": KIND, "run": json.dumps(run)})
-        for name, values in grid.axes.items():
-            group.create_array(name, data=values, chunks=(len(values),), dimension_names=(name,), **codecs)
-        for name, one in fields.items():
-            group.create_array(
-                name,
-                shape=grid.shape,
-                chunks=tile,
-                dtype=one.dtype,
-                fill_value=one[0],
-                dimension_names=tuple(grid.axes),
-                **codecs,
-            )
-        with warnings.catch_warnings():
-            # Zarr warns that consolidated metadata is not supported everywhere; without it, xarray warns that opening is slow.
-            warnings.simplefilter("ignore", UserWarning)
-            zarr().consolidate_metadata(part)
-        files = {str(file.relative_to(part)): _checksum(file) for file in sorted(part.rglob("*")) if file.is_file()}
-        (part / CHECKSUMS).write_bytes(sealed(json.dumps(files).encode()))
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    return part
+    group = zarr().create_group(part, zarr_format=3, attributes={"kind": KIND, "run": json.dumps(run)})
+    for name, values in grid.axes.items():
+        group.create_array(name, data=values, chunks=(len(values),), dimension_names=(name,), **codecs)
+    for name, one in fields.items():
+        group.create_array(
+            name,
+            shape=grid.shape,
+            chunks=tile,
+            dtype=one.dtype,
+            fill_value=one[0],
+            dimension_names=tuple(grid.axes),
+            **codecs,
+        )
+    with warnings.catch_warnings():
+        # Zarr warns that consolidated metadata is not supported everywhere; without it, xarray warns that opening is slow.
+        warnings.simplefilter("ignore", UserWarning)
+        zarr().consolidate_metadata(part)
+    files = {str(file.relative_to(part)): _checksum(file) for file in sorted(part.rglob("*")) if file.is_file()}
+    (part / CHECKSUMS).write_bytes(sealed(json.dumps(files).encode()))
 
 
 def check_begun(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields: dict[str, np.ndarray]) -> None:
@@ -106,8 +98,8 @@ def check_begun(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields
         refuse_other_run(f"Store `{path}`", json.loads(json.loads(root.read_text())["attributes"]["run"]), run)
     if not damaged:
         return
-    part = _empty(path.parent, run, grid, tile, fields)
-    try:
+    with own_folder(path.parent) as part:
+        _fill(part, run, grid, tile, fields)
         for name in damaged:
             # What is not made again as it was belongs to another run, or was made by another version of Zarr.
             if _checksum(part / name) != files[name]:
@@ -117,8 +109,6 @@ def check_begun(path: Path, run: dict, grid: Grid, tile: tuple[int, ...], fields
             warnings.warn(f"Store `{path}` was damaged: file `{name}` is made anew.", stacklevel=6)
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             replace_whole(path / name, (part / name).read_bytes())
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _refuse_unchecked(path: Path, damaged: bool) -> None:
