@@ -71,13 +71,7 @@ def cycle_derivatives(
             "Argument `cycle` must be periodic, but is a torus, which has no single period to differentiate."
         )
     names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
-    unknown = [name for name in names if name not in cycle.scene.parameters]
-    if unknown or not names:
-        raise ValueError(
-            f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
-            f"{', '.join(sorted(cycle.scene.parameters))}."
-            f"{arguments.did_you_mean((unknown or [''])[0], cycle.scene.parameters)}"
-        )
+    arguments.names_of_parameters("wrt", names, cycle.scene.parameters)
     arguments.truth("multipliers", multipliers)
     own = cycle_in_contact_coordinates(cycle)
     slopes = _slopes(own.scene, names, point_of(own), jnp.asarray(cycle.crossings, jnp.int32), bool(multipliers))

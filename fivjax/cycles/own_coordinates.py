@@ -18,8 +18,7 @@ from ..foundation.precision import in_double_precision
 from ..io.datasets import describe
 from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
 from ..model.scene import Scene, scene_in_contact_coordinates
-from ..model.structure import Structure
-from ..simulation.start import checked_start, snapped_to_belt
+from ..simulation.start import start_in_contact_coordinates
 from ..simulation.trajectory import Trajectory
 from .cycle import LimitCycle, under_final_load
 
@@ -91,14 +90,8 @@ def _inside(scene: Scene, start):
         start = np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
     if isinstance(start, tuple | list) and len(start) == 2:
         state, status = start
-        return _state_inside(scene, state), status
-    return _state_inside(scene, start)
-
-
-def _state_inside(scene: Scene, state) -> np.ndarray:
-    structure: Structure = scene.structure
-    z = to_contact_coordinates(structure, checked_start(structure.size, state))
-    return np.asarray(snapped_to_belt(scene_in_contact_coordinates(scene), z))
+        return np.asarray(start_in_contact_coordinates(scene, state)), status
+    return np.asarray(start_in_contact_coordinates(scene, start))
 
 
 @in_double_precision

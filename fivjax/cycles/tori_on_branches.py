@@ -53,7 +53,8 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
     if not {"multipliers", "special", "parameter"} <= set(getattr(branch, "variables", ())):
         raise ValueError("Argument `branch` must come from `fivjax.continue_cycle`.")
     arguments.whole_number("points", points, minimum=1)
-    places = turning(np.asarray(branch["multipliers"]), branch["special"].values)
+    places = turning(np.asarray(branch["multipliers"]))
+    places = places[branch["special"].values[places] == ""]
     places = (
         places[np.unique(np.linspace(0, len(places) - 1, min(points, len(places))).round().astype(int))]
         if len(places)
@@ -86,11 +87,11 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
     return labelled(dataset, scene).assign_attrs(parameter=branch.attrs["parameter"])
 
 
-def turning(multipliers: np.ndarray, special: np.ndarray) -> np.ndarray:
+def turning(multipliers: np.ndarray) -> np.ndarray:
     """Points with exactly one complex pair of multipliers outside the unit circle."""
     outside = np.abs(multipliers) > 1 + 1e-6
     complex_ = np.abs(multipliers.imag) > 1e-9
-    return np.flatnonzero((outside.sum(axis=1) == 2) & ((outside & complex_).sum(axis=1) == 2) & (special == ""))
+    return np.flatnonzero((outside.sum(axis=1) == 2) & ((outside & complex_).sum(axis=1) == 2))
 
 
 def _attractor(cycle: LimitCycle) -> LimitCycle | None:

@@ -5,7 +5,7 @@ are bad ends in a named status instead.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import jax
 import numpy as np
@@ -131,6 +131,18 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """ " Did you mean `k1`?", for a name that is none of those known but close to one; else nothing."""
     near = difflib.get_close_matches(name, known, n=1)
     return f" Did you mean `{near[0]}`?" if near else ""
+
+
+def names_of_parameters(name: str, names: Collection[str], known: Iterable[str]) -> None:
+    """Refuse an empty list of names, and any that is not a parameter of the scene."""
+    known = sorted(known)
+    unknown = next((one for one in names if one not in known), None)
+    if unknown is not None or not names:
+        near = "" if unknown is None else did_you_mean(unknown, known)
+        raise ValueError(
+            f"Argument `{name}` must name parameters of the scene, but has {'none' if unknown is None else unknown!r}; they "
+            f"are: {', '.join(known)}.{near}"
+        )
 
 
 def describe(value) -> str:

@@ -71,7 +71,7 @@ def _kinds(one: xr.Dataset) -> np.ndarray:
     """For each point of a branch which of `STYLES` it is drawn in."""
     kinds = np.where(one["stable"].values, 0, 1)
     # At special points multipliers are those of a neighbour, or not known.
-    kinds[turning(one["multipliers"].values, np.full(one.sizes["point"], ""))] = 2
+    kinds[turning(one["multipliers"].values)] = 2
     return kinds
 
 

@@ -18,12 +18,11 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.precision import in_double_precision, known_to_numpy
 from ..foundation.progress import reported
-from ..model.contact_coordinates import to_contact_coordinates
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .event_distance import closest_call
-from .start import checked_start, snapped_to_belt, start_state
+from .start import checked_start, start_in_contact_coordinates, start_state
 from .trajectory import Trajectory, simulate
 
 
@@ -112,12 +111,7 @@ def derivatives(
     if isinstance(wrt, str):
         raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
     names = tuple(wrt)
-    unknown = [name for name in names if name not in scene.parameters]
-    if unknown or not names:
-        raise ValueError(
-            f"Argument `wrt` must name parameters of the scene, but has {(unknown or ['none'])[0]!r}; they are: "
-            f"{', '.join(sorted(scene.parameters))}.{arguments.did_you_mean((unknown or [''])[0], scene.parameters)}"
-        )
+    arguments.names_of_parameters("wrt", names, scene.parameters)
     arguments.one_of("mode", mode, ("forward", "reverse"))
     arguments.real_number("margin", margin, minimum=0)
     arguments.real_number("t1", t1, above=0)
@@ -127,12 +121,10 @@ def derivatives(
     refuse_painleve(scene)
     # The equilibrium depends on the parameters, a given start does not. As an array, a start with other numbers is not compiled
     # anew.
-    given = None if y0 is None else checked_start(scene.structure.size, y0)
-    inner, begin = scene_in_contact_coordinates(scene), given
-    if given is not None and inner is not scene:
-        begin = snapped_to_belt(inner, to_contact_coordinates(scene.structure, given))
-    begin = start_state(inner, begin)
-    given = begin if given is not None and inner is scene else given
+    inner, given = scene_in_contact_coordinates(scene), None
+    begin = start_state(inner, None if y0 is None else start_in_contact_coordinates(scene, y0))
+    if y0 is not None:
+        given = begin if inner is scene else checked_start(scene.structure.size, y0)
     value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
     calls = closest_call(inner, method, begin, float(t1))
     value = jax.tree.map(known_to_numpy, value)

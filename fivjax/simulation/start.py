@@ -6,7 +6,8 @@ import numpy as np
 from ..contact import State
 from ..foundation import arguments
 from ..foundation.precision import is_known, real
-from ..model.scene import Scene, sliding_equilibrium, steady_sliding
+from ..model.contact_coordinates import to_contact_coordinates
+from ..model.scene import Scene, scene_in_contact_coordinates, sliding_equilibrium, steady_sliding
 from ..model.sliding import contact_coordinates
 
 
@@ -58,6 +59,14 @@ def checked_start(n: int, y0) -> State:
     if is_known(y) and not np.all(np.isfinite(y)):
         raise ValueError("Argument `y0` must be finite.")
     return y
+
+
+def start_in_contact_coordinates(scene: Scene, y0) -> State:
+    """A given start, checked, with the directions of all contacts as coordinates."""
+    y, structure = checked_start(scene.structure.size, y0), scene.structure
+    if structure.contacts_at_coordinates:
+        return y
+    return snapped_to_belt(scene_in_contact_coordinates(scene), jnp.asarray(to_contact_coordinates(structure, y)))
 
 
 def snapped_to_belt(scene: Scene, y: State) -> State:

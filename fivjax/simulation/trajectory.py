@@ -26,7 +26,7 @@ from ..foundation.precision import (
 )
 from ..foundation.progress import following
 from ..io.datasets import labelled
-from ..model.contact_coordinates import to_contact_coordinates, transformation
+from ..model.contact_coordinates import transformation
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.description import describe_method
@@ -34,7 +34,7 @@ from ..steppers.event_exact import EventExact
 from .ending import ENDING, Ending
 from .energy import Energy
 from .rows import rows_at, rows_in_parts, with_step_as_array
-from .start import checked_start, snapped_to_belt, start_state
+from .start import start_in_contact_coordinates, start_state
 from .stretches import MODES
 
 if TYPE_CHECKING:
@@ -255,7 +255,7 @@ def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
     structure = scene.structure
     inner, (x, _) = scene_in_contact_coordinates(scene), transformation(structure)
     if y0 is not None:
-        y0 = snapped_to_belt(inner, to_contact_coordinates(structure, checked_start(structure.size, y0)))
+        y0 = start_in_contact_coordinates(scene, y0)
     run = simulate(inner, *how, y0=y0, **options)
     rows = {name: getattr(run, name) @ x.T for name in ("displacement", "velocity", "acceleration")}
     return dataclasses.replace(run, **rows, scene=scene)
