@@ -116,8 +116,9 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
     # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
     finite = jnp.logical_not(ended) & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
     highest = jnp.maximum(highest, jnp.max(jnp.abs(load)))
-    grown = finite & (jnp.cumsum(_grown(scene, start, saved, highest, y)) > 0)
-    kept = finite & ~grown
+    beyond = jax.vmap(lambda t, y: grown(scene, start, t, highest, y))(saved, y)
+    unbounded = finite & (jnp.cumsum(beyond) > 0)
+    kept = finite & ~unbounded
 
     def known(rows):
         return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.nan)
@@ -125,7 +126,7 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
     y = known(y)
     # A row at a jump of the load shows the load and the contact just after it.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
-    contacts = jax.vmap(lambda c, f, x, now: _settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
+    contacts = jax.vmap(lambda c, f, x, now: settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
         contacts, load, y
@@ -140,17 +141,17 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
         "normal_force": known(normal_force),
         "friction_force": known(friction_force),
         "load": load,
-        "grown": grown,
+        "grown": unbounded,
         "energy": None
         if energy_data is None
         else accounts.along_rows(energy_data, mechanics, contacts, load, y, ledgers),
     }
 
 
-def _grown(
-    scene: Scene, start: State, t: Float[Array, " T"], highest: Float[Array, ""], y: Float[Array, "T state"]
-) -> Bool[Array, " T"]:
-    """Which states are `GROWTH` times larger than the start, the belt's motion and the effect of the highest load."""
+def grown(
+    scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array, ""], y: State
+) -> Bool[Array, ""]:
+    """Whether a state is `GROWTH` times larger than the start, the belt's motion and the effect of the highest load."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
     tangential, _ = contact_coordinates(structure)
@@ -158,10 +159,10 @@ def _grown(
     # A free structure is accelerated by a load for as long as it lasts.
     pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * highest * t
     expected = jnp.max(jnp.abs(weights * start)) + belt + pushed
-    return jnp.max(jnp.abs(weights * y), axis=-1) > GROWTH * expected
+    return jnp.max(jnp.abs(weights * y)) > GROWTH * expected
 
 
-def _settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
+def settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
     """The contact mode after a jump of the load, if there is a jump `now`."""
     ended = now & (physics.guards(mechanics, contact, load, y) < 0)
     after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))

@@ -96,6 +96,18 @@ class EventExact(AbstractStepper):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
+        return self.advance_with_series(mechanics, contact, load, y, h, at_section)[0]
+
+    def advance_with_series(
+        self,
+        mechanics: Mechanics,
+        contact: Contact,
+        load: Float[Array, ""],
+        y: State,
+        h: Float[Array, ""],
+        at_section: bool = False,
+    ) -> tuple[Advance, list[State], Float[Array, ""]]:
+        """The same, with the Taylor coefficients of the motion on the way, and the unit of their time, in s."""
         unit = time_unit(mechanics)
         series = _series(mechanics, contact, load, y, self.order_, unit)
         states, guards = series.states, series.guards
@@ -141,7 +153,8 @@ class EventExact(AbstractStepper):
             reached = jnp.where(physics.is_beyond_the_model(mechanics, contact, series.friction[0]), jnp.nan, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        return advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
+        after = advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
+        return after, states, unit
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]

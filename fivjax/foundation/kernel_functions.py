@@ -1,0 +1,328 @@
+"""JAX functions of one trajectory that kernels compute, for one trajectory or many, with their derivatives.
+
+A `KernelFunction` is traced, written as C++ (`kernel_text`) and compiled by Warp's own compiler, once for arguments of one
+form; the kernel is kept for later processes. With known values it takes and gives arrays of NumPy, and XLA compiles nothing.
+Inside JAX's transformations it is a primitive: `jit` calls the kernel, `vmap` makes more trajectories of one call, and `jvp`,
+`jacfwd` and `grad` use a kernel that computes tangents beside values, one direction for each number that is perturbed.
+"""
+
+import functools
+import hashlib
+import linecache
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+from jaxtyping import Float
+
+from .kept_programs import kept_value
+from .kernel_text import Form, Place, text, written
+from .precision import is_known
+from .warp_library import ONE_AT_A_TIME, load, warp
+
+# Directions side by side in one kernel: as few of these as serve, or several calls with the most.
+WIDTHS = (1, 2, 4, 8, 16)
+# Parts of a call's work for each thread, because some trajectories take longer.
+AT_A_TIME = 4
+# The arrays of every kernel, with their axes: over trajectories, then as said.
+GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
+FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
+
+
+class KernelFunction:
+    """A JAX function `function(args, instants)` of a tree of arrays and other values, and of instants (shape `(k,)`).
+
+    It gives two trees of arrays: results at the end, and results with one row for each instant. The instants may only be what
+    one `scan` goes along, so that one kernel serves any number of them. Real numbers are in double precision.
+    """
+
+    def __init__(self, function: Callable, differentiated: Callable | None = None):
+        """`differentiated` is the function whose derivatives are taken, if it is another: with shorter steps, say."""
+        self.function = function
+        self.differentiated = function if differentiated is None else differentiated
+
+    def __call__(self, args, instants):
+        """The results: arrays of NumPy where all values are known, else traced ones.
+
+        **Raises:** `NotImplementedError` for a function that cannot be written as C++.
+        """
+        form, arrays = Form.of(args)
+        if all(map(is_known, (*arrays, instants))):
+            given = np.concatenate([np.ravel(np.asarray(array)).astype(np.float64) for array in arrays])
+            kernel = kernel_of(self, form)
+            ends, rows, _, _ = kernel.launched(given[None], np.asarray(instants)[None])
+            return kernel.results(ends[0], rows[0])
+        return kernel_of(self, form).results(*_values(self, form, tuple(arrays), instants))
+
+    def of_many(self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants, pool: Executor | None = None):
+        """The results for many trajectories, of which each has a row: all arrays of its arguments, one after the other. The
+        instants are one row, or one for each trajectory.
+        """
+        kernel = kernel_of(self, form)
+        return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
+
+
+class Kernel:
+    """A compiled kernel."""
+
+    def __init__(self, function: KernelFunction, form: Form, wide: tuple[bool, ...], width: int):
+        own = function.differentiated if width else function.function
+        self.form, self.width = form, width
+        self.text = text(kept_value(written, own, form, wide))
+        self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
+        self.numbers = sum(array.size for array in form.arrays)
+        with ONE_AT_A_TIME:
+            self.kernel = _compiled(self.text.source, self.text.widths(), self.directions, width)
+
+    def launched(self, given, instants, dots=None, pool: Executor | None = None):
+        """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
+        # Tangents that do not depend on what is perturbed are not written: they are zero.
+        found = tuple(np.zeros(shape) for shape in self.shapes(given.shape[:-1], instants.shape[-1]))
+        width = max(self.width, 1)
+        dots = np.zeros((1, 1, width)) if dots is None else np.ascontiguousarray(dots)
+        self.launch([np.ascontiguousarray(given), dots, np.ascontiguousarray(instants)], list(found), pool)
+        return found
+
+    def shapes(self, batch: tuple[int, ...], count: int) -> tuple[tuple[int, ...], ...]:
+        """Those of what is found, for a batch of trajectories with so many instants."""
+        ends, rows, end_dots, row_dots = self.text.widths()
+        width = max(self.width, 1)
+        of_rows = count * row_dots if self.width else 1
+        return (*batch, ends), (*batch, count * rows), (*batch, end_dots, width), (*batch, of_rows, width)
+
+    def launch(self, given: list, found: list, pool: Executor | None = None) -> None:
+        """Run the kernel for all rows of these arrays, and fill those that are `found`."""
+        wp = warp()
+        arrays = [wp.array(part, dtype=wp.float64, device="cpu", copy=False) for part in (*given, *found)]
+        lanes = len(found[0])
+
+        def run(part: tuple[int, int]) -> None:
+            wp.launch(self.kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
+
+        if pool is None or lanes == 1:
+            run((0, lanes))
+            return
+        parts = min(lanes, AT_A_TIME * getattr(pool, "_max_workers", 2))
+        for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
+            pass
+
+    def results(self, ends, rows):
+        """The function's results from rows of numbers; these may have more axes before their own."""
+        total = self.text.widths()[1]
+        parts = (
+            [place.of(ends) for place in self.text.ends],
+            [place.of(rows, rows.shape[-1] // total) for place in self.text.rows],
+        )
+        return tuple(map(jax.tree.unflatten, self.text.structures, parts))
+
+
+_KERNELS: dict = {}
+
+
+def kernel_of(function: KernelFunction, form: Form, wide: tuple[bool, ...] = (), width: int = 0) -> Kernel:
+    """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`."""
+    key = function, form, wide, width
+    if key not in _KERNELS:
+        with ONE_AT_A_TIME:
+            if key not in _KERNELS:
+                _KERNELS[key] = Kernel(function, form, wide, width)
+    return _KERNELS[key]
+
+
+def _compiled(source: str, widths: tuple[int, ...], directions: int, width: int):
+    """The Warp kernel with this code."""
+    wp = warp()
+    name = hashlib.sha256(repr((source, widths, directions, width)).encode()).hexdigest()[:16]
+    ends, rows, end_dots, row_dots = widths
+    wide = f"double wide __attribute__((ext_vector_type({width}), aligned(8)))" if width > 1 else "double wide"
+    body = f"""
+typedef {wide};
+const long lane_ = lane;
+const int count = instants_.shape[1];
+const double* given = given_.data + lane_ * given_.shape[1];
+const wide* dots = (const wide*)dots_.data;
+const double* instants = instants_.data + (instants_.shape[0] == 1 ? 0 : lane_) * count;
+double* ends = ends_.data + lane_ * {ends};
+double* rows = rows_.data + lane_ * count * {rows};
+wide* end_dots = (wide*)end_dots_.data + lane_ * {end_dots};
+wide* row_dots = (wide*)row_dots_.data + lane_ * {f"count * {row_dots}" if width else 1};
+{source}
+"""
+    arrays = {**GIVEN, **FOUND}
+    signature = ", ".join(f"{own}_: A{axes}" for own, axes in arrays.items())
+    names = ", ".join(f"{own}_" for own in arrays)
+    code = (
+        f"@wp.func_native(body)\ndef run(lane: int, {signature}): ...\n\n"
+        f"def followed({signature}, first: int):\n    run(first + wp.tid(), {names})\n"
+    )
+    # Warp reads a kernel's source by `inspect`, which looks here.
+    place = f"<fivjax kernel {name}>"
+    linecache.cache[place] = (len(code), None, code.splitlines(keepends=True), place)
+    space = {"wp": wp, "body": body, **{f"A{axes}": wp.array(dtype=wp.float64, ndim=axes) for axes in (2, 3, 4)}}
+    exec(compile(code, place, "exec"), space)
+    module = wp.get_module(f"fivjax.kernel_{name}")
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast"
+    module.options.update(max_unroll=1, cpu_compiler_flags=flags, enable_backward=False)
+    kernel = wp.kernel(space["followed"], enable_backward=False, module=module)
+    load(module, ["cpu"])
+    return kernel
+
+
+# Inside JAX's transformations.
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _values(function: KernelFunction, form: Form, arrays: tuple, instants):
+    """Numbers at the end, and in rows."""
+    ends, rows, _, _ = _bind(function, form, arrays, instants, (), 0, None)
+    return ends, rows
+
+
+@functools.partial(_values.defjvp, symbolic_zeros=True)
+def _values_jvp(function: KernelFunction, form: Form, primals, tangents):
+    arrays, instants = primals
+    dots, of_instants = tangents
+    if not isinstance(of_instants, SymbolicZero):
+        raise NotImplementedError("Rows have no derivative with respect to their instants here.")
+    wide = tuple(not isinstance(dot, SymbolicZero) and _is_real(dot) for dot in dots)
+    if not any(wide):
+        ends, rows = _values(function, form, arrays, instants)
+        return (ends, rows), (jnp.zeros_like(ends), jnp.zeros_like(rows))
+    moving = jnp.concatenate([jnp.ravel(dot) for dot, is_wide in zip(dots, wide, strict=True) if is_wide])
+    total, start, ends, rows, of_ends, of_rows = len(moving), 0, None, None, 0.0, 0.0
+    while start < total:
+        left = total - start
+        width = next((width for width in WIDTHS if width >= left), WIDTHS[-1])
+        # One direction for each number that is perturbed.
+        directions = np.eye(total)[:, start : start + width]
+        directions = np.pad(directions, ((0, 0), (0, width - directions.shape[1])))
+        ends, rows, end_dots, row_dots = _bind(function, form, arrays, instants, wide, width, directions)
+        part = moving[start : start + width]
+        of_ends = of_ends + end_dots[..., : len(part)] @ part
+        of_rows = of_rows + row_dots[..., : len(part)] @ part
+        start += width
+    code, count = kernel_of(function, form, wide, width).text, instants.shape[-1]
+    return (ends, rows), (
+        _spread(ends, of_ends, code.ends, code.end_dots, 1),
+        _spread(rows, of_rows, code.rows, code.row_dots, count),
+    )
+
+
+def _spread(values, dots, places: Sequence[Place], dot_places: Sequence[Place], repeated: int):
+    """Tangents of all numbers, from those of the real ones; each array is there so many times."""
+    real, parts = iter(dot_places), []
+    for place in places:
+        if np.issubdtype(np.dtype(place.dtype), np.floating):
+            own = next(real)
+            parts.append(dots[own.start * repeated : (own.start + own.size) * repeated])
+        else:
+            parts.append(jnp.zeros(place.size * repeated))
+    return jnp.concatenate(parts) if parts else jnp.zeros_like(values)
+
+
+def _is_real(array) -> bool:
+    return jnp.issubdtype(array.dtype, jnp.floating)
+
+
+def _bind(function, form: Form, arrays: Sequence, instants, wide: tuple[bool, ...], width: int, directions):
+    given = jnp.concatenate([jnp.ravel(jnp.asarray(array)).astype(jnp.float64) for array in arrays])
+    dots = jnp.zeros((1, 1)) if directions is None else jnp.asarray(directions)
+    return kernel_p.bind(given, dots, jnp.asarray(instants), kernel=_Hashed(kernel_of(function, form, wide, width)))
+
+
+class _Hashed:
+    """A kernel as a parameter of the primitive."""
+
+    def __init__(self, kernel: Kernel):
+        self.kernel = kernel
+
+    def __eq__(self, other) -> bool:
+        return self.kernel is other.kernel
+
+    def __hash__(self) -> int:
+        return id(self.kernel)
+
+
+kernel_p = Primitive("fivjax_kernel")
+kernel_p.multiple_results = True
+
+
+@kernel_p.def_abstract_eval
+def _abstract(given, dots, instants, *, kernel: _Hashed):
+    return [jax.core.ShapedArray(shape, np.dtype("float64")) for shape in kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])]
+
+
+@kernel_p.def_impl
+def _known(given, dots, instants, *, kernel: _Hashed):
+    given, dots, instants = map(np.asarray, (given, dots, instants))
+    own, batch = kernel.kernel, given.shape[:-1]
+    found = own.launched(
+        given.reshape(-1, given.shape[-1]), instants.reshape(-1, instants.shape[-1]), dots.reshape(-1, *dots.shape[-2:])
+    )
+    return [jnp.asarray(part.reshape(batch + part.shape[1:])) for part in found]
+
+
+def _batched(operands, axes, *, kernel: _Hashed):
+    given, dots, instants = operands
+    of_given, of_dots, of_instants = axes
+    size = next(part.shape[axis] for part, axis in zip(operands, axes, strict=True) if axis is not None)
+    if of_dots is not None:
+        raise NotImplementedError("Directions of a kernel's tangents are not batched.")
+    given = jnp.moveaxis(given, of_given, 0) if of_given is not None else jnp.broadcast_to(given, (size, *given.shape))
+    if of_instants is not None:
+        instants = jnp.moveaxis(instants, of_instants, 0)
+        instants = jnp.broadcast_to(
+            instants.reshape(size, *[1] * (given.ndim - instants.ndim), *instants.shape[1:]),
+            (*given.shape[:-1], instants.shape[-1]),
+        )
+    elif instants.ndim > 1:
+        instants = jnp.broadcast_to(instants, (size, *instants.shape))
+    return kernel_p.bind(given, dots, instants, kernel=kernel), [0] * 4
+
+
+batching.primitive_batchers[kernel_p] = _batched
+
+
+def _lowered(given, dots, instants, *, kernel: _Hashed):
+    shapes = kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])
+    lanes = math.prod(given.shape[:-1])
+    flat = (
+        given.reshape(lanes, given.shape[-1]),
+        dots[None],
+        instants.reshape(-1, instants.shape[-1]),
+    )
+    call = _callable(kernel)
+    dims = {f"{name}_": (lanes, *shape[given.ndim - 1 :]) for name, shape in zip(FOUND, shapes, strict=True)}
+    return [found.reshape(shape) for found, shape in zip(call(*flat, output_dims=dims), shapes, strict=True)]
+
+
+@functools.cache
+def _callable(kernel: _Hashed):
+    """A function of JAX arrays that launches the kernel."""
+    wp, own = warp(), kernel.kernel
+
+    def launch(given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_):
+        for part in (rows_, end_dots_, row_dots_):
+            part.zero_()
+        wp.launch(
+            own.kernel,
+            dim=given_.shape[0],
+            inputs=[given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_, 0],
+            device="cpu",
+            block_dim=1,
+        )
+
+    launch.__annotations__ = {
+        f"{name}_": wp.array(dtype=wp.float64, ndim=axes) for name, axes in {**GIVEN, **FOUND}.items()
+    }
+    return wp.jax_callable(launch, num_outputs=len(FOUND), graph_mode=wp.JaxCallableGraphMode.NONE)
+
+
+mlir.register_lowering(kernel_p, mlir.lower_fun(_lowered, multiple_results=True), platform="cpu")

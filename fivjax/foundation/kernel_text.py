@@ -1,0 +1,231 @@
+"""The code of a kernel: a JAX function of one trajectory, in C++, with what its arrays hold."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+from jax.interpreters import partial_eval
+
+from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers
+from .cpp_code import WIDE, Writer, kind_of, scan
+from .plain_trees import from_text, structure_to_text
+
+
+class Form(NamedTuple):
+    """What all calls have in common that one kernel serves: everything but numbers."""
+
+    structure: Any
+    leaves: tuple  # shapes and types of arrays, and what is no array
+
+    @classmethod
+    def of(cls, args) -> tuple["Form", list]:
+        """The form of some arguments, and their arrays."""
+        leaves, structure = jax.tree.flatten(args)
+        told = tuple(Array(np.shape(leaf), _dtype(leaf)) if _is_array(leaf) else leaf for leaf in leaves)
+        return cls(structure, told), [leaf for leaf in leaves if _is_array(leaf)]
+
+    def args(self, arrays: Sequence) -> Any:
+        """The arguments with these arrays."""
+        remaining = iter(arrays)
+        leaves = [next(remaining) if isinstance(leaf, Array) else leaf for leaf in self.leaves]
+        return jax.tree.unflatten(self.structure, leaves)
+
+    @property
+    def arrays(self) -> list["Array"]:
+        """Those of the arguments, in order."""
+        return [leaf for leaf in self.leaves if isinstance(leaf, Array)]
+
+
+class Array(NamedTuple):
+    """An array of a form."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+    @property
+    def size(self) -> int:
+        return count_of(self.shape)
+
+
+def _is_array(leaf) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic | float)
+
+
+def _dtype(leaf) -> str:
+    own = np.result_type(leaf)
+    return "float64" if np.issubdtype(own, np.floating) else own.name
+
+
+class Place(NamedTuple):
+    """Where an array is in a row of numbers."""
+
+    start: int
+    shape: tuple[int, ...]
+    dtype: str
+
+    @property
+    def size(self) -> int:
+        return count_of(self.shape)
+
+    def of(self, numbers, count: int | None = None):
+        """The array, in such rows of numbers; or so many of it, one after the other."""
+        repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))
+        part = numbers[..., self.start * repeated : (self.start + self.size) * repeated]
+        return part.reshape((*numbers.shape[:-1], *shape)).astype(self.dtype, copy=False)
+
+
+class Text(NamedTuple):
+    """A kernel's code, and what its arrays hold: values, then tangents of those that are real numbers."""
+
+    structures: tuple  # of the function's results
+    source: str
+    ends: tuple[Place, ...]
+    rows: tuple[Place, ...]
+    end_dots: tuple[Place, ...]
+    row_dots: tuple[Place, ...]
+
+    def widths(self) -> tuple[int, int, int, int]:
+        """How many numbers each of these rows has, at least one."""
+        return tuple(
+            max(sum(place.size for place in places), 1)
+            for places in (self.ends, self.rows, self.end_dots, self.row_dots)
+        )
+
+
+def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
+    """A `Text`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its arrays
+    that are `wide`.
+    """
+    like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
+    instants = jax.ShapeDtypeStruct((2,), np.dtype("float64"))
+
+    structures = []
+
+    def values(arrays, instants):
+        found = function(form.args(arrays), instants)
+        structures.append([structure_to_text(jax.tree.structure(part)) for part in found])
+        return tuple(tuple(jax.tree.leaves(part)) for part in found)
+
+    def with_tangents(arrays, dots, instants):
+        def of(some):
+            remaining = iter(some)
+            whole = [next(remaining) if is_wide else array for array, is_wide in zip(arrays, wide, strict=True)]
+            return values(whole, instants)
+
+        some = [array for array, is_wide in zip(arrays, wide, strict=True) if is_wide]
+        found, moved = jax.jvp(of, (some,), (dots,))
+        return found, tuple(tuple(dot for dot in dots if dot.dtype != jax.dtypes.float0) for dots in moved)
+
+    moving = [array for array, is_wide in zip(like, wide, strict=False) if is_wide]
+    with jax.enable_x64(True):
+        if moving:
+            traced, shapes = jax.make_jaxpr(with_tangents, return_shape=True)(like, moving, instants)
+            (ends, rows), (end_dots, row_dots) = shapes
+        else:
+            traced, (ends, rows) = jax.make_jaxpr(values, return_shape=True)(like, instants)
+            end_dots, row_dots = (), ()
+        # What is asked for: no more is written.
+        jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
+        lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
+        writer = _WriterOfKernel(jaxpr, len(like), len(moving), lengths)
+        source = writer.source(traced.consts)
+    places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
+    return structures[-1], source, *(tuple(map(tuple, those)) for those in places)
+
+
+def text(plain: tuple) -> Text:
+    """A `Text` from what was `written`."""
+    structures, source, *places = plain
+    structures = tuple(from_text(structure) for structure in structures)
+    return Text(structures, source, *(tuple(Place(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places))
+
+
+def _places(avals, leading: int = 0) -> tuple[Place, ...]:
+    found, start = [], 0
+    for aval in avals:
+        shape = tuple(aval.shape)[leading:]
+        found.append(Place(start, shape, np.dtype(aval.dtype).name))
+        start += count_of(shape)
+    return tuple(found)
+
+
+class _WriterOfKernel:
+    """Writes a traced function whose results are at the end, and in rows: values, and tangents."""
+
+    def __init__(self, jaxpr, given: int, moving: int, lengths):
+        self.jaxpr, self.given, self.moving = jaxpr, given, moving
+        self.ends, self.rows, self.end_dots, self.row_dots = (
+            jaxpr.outvars[start:end] for start, end in zip([0, *lengths], [*lengths, None], strict=True)
+        )
+        self.writer = Writer(
+            {"given": "double", "dots": WIDE, "instants": "double", "rows": "double", "row_dots": WIDE}
+        )
+
+    def source(self, consts) -> str:
+        writer, jaxpr = self.writer, self.jaxpr
+        *numbers, instants = jaxpr.invars
+        loops = [equation for equation in jaxpr.eqns if instants in equation.invars]
+        if len(loops) > 1 or any(loop.primitive.name != "scan" for loop in loops):
+            raise NotImplementedError(
+                "A kernel's function must go along its instants by one `scan`, and use them nowhere else."
+            )
+        known = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
+        known |= dict(zip(numbers[: self.given], _given(writer, "given", numbers[: self.given]), strict=True))
+        known |= dict(zip(numbers[self.given :], _given(writer, "dots", numbers[self.given :]), strict=True))
+        known[instants] = View("instants", (0,), (2,), (1,), "double")
+
+        def read(atom) -> Value:
+            return of_numbers(atom.val) if isinstance(atom, Literal) else known[atom]
+
+        for equation in jaxpr.eqns:
+            operands = list(map(read, equation.invars))
+            if equation in loops:
+                found = scan(writer, equation, operands, "count", functools.partial(self._rows_of, equation))
+            else:
+                found = writer.applied(equation, operands)
+            known.update(zip(equation.outvars, found, strict=True))
+        along = {variable for loop in loops for variable in loop.outvars[loop.params["num_carry"] :]}
+        for variable in (*self.rows, *self.row_dots):
+            # Tangents that do not depend on what is perturbed are zero, as their array is from the start.
+            if variable not in along and not (is_known(read(variable)) and not np.any(read(variable))):
+                raise NotImplementedError("Rows of a kernel's function must be results of its `scan`.")
+        for name, variables, kind in (("ends", self.ends, "double"), ("end_dots", self.end_dots, WIDE)):
+            start = 0
+            for variable in variables:
+                for entry in writer.entries(read(variable)).ravel():
+                    writer.put(f"{name}[{start}] = {writer.as_type(entry, kind)};")
+                    start += 1
+        return "\n".join(writer.lines)
+
+    def _rows_of(self, loop, k: int, kind: str) -> View:
+        """Where the loop's rows of results with this number are written."""
+        variable = loop.outvars[loop.params["num_carry"] + k]
+        for name, variables in (("rows", self.rows), ("row_dots", self.row_dots)):
+            sizes = [count_of(own.aval.shape[1:]) for own in variables]
+            # One result may be asked for twice, but is written once.
+            for place, own in enumerate(variables):
+                if own is variable:
+                    shape = own.aval.shape[1:]
+                    # All rows of one result lie side by side.
+                    start = (0, f"count * {sum(sizes[:place])}")
+                    return View(name, start, (2, *shape), (sizes[place], *natural(shape)), self.writer.types[name])
+        return self.writer.new(variable.aval.shape, kind)
+
+
+def _given(writer: Writer, base: str, variables) -> list[Value]:
+    """Arrays that are given, from one row of numbers in double precision."""
+    found, start = [], 0
+    for variable in variables:
+        shape, kind = variable.aval.shape, kind_of(variable.aval)
+        view = View(base, (start,), shape, natural(shape), writer.types[base])
+        start += view.size
+        if kind == "double":
+            found.append(writer.small(view))
+        else:
+            typed = [writer.line(f"({kind})({entry})", kind) for entry in view.entries().ravel()]
+            found.append(np.array(typed, object).reshape(shape))
+    return found

@@ -1,0 +1,224 @@
+"""A trajectory from its start to its last saved instant, by steps that instants do not shorten: rows are read off the series of
+the step that they lie in.
+
+It is written for kernels, where a step's branches and loops cost only what is gone through.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State
+from ..foundation.carried import depending_on
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.polynomial import value_and_slope
+from ..model.scene import Scene
+from ..steppers.base import advance_between
+from ..steppers.core import Segment
+from ..steppers.event_exact import EventExact, for_derivatives
+from . import energy as accounts
+from .ending import Ending
+from .energy import EnergyData, Ledger
+from .rows import grown, settled
+
+
+class How(eqx.Module):
+    """How a motion is followed, fixed when it is traced."""
+
+    method: EventExact = eqx.field(static=True)
+    energy: bool = eqx.field(static=True)
+
+
+class Step(NamedTuple):
+    """One step of a motion, and where it ended."""
+
+    t: Float[Array, ""]  # s
+    y: State
+    contact: Contact
+    load: Float[Array, ""]  # N
+    series: Float[Array, "k state"]  # Taylor coefficients, in time measured in the unit
+    unit: Float[Array, ""]  # s
+    ledger: Ledger | None
+    end: Float[Array, ""]  # s
+    y_end: State
+    contact_end: Contact
+    ledger_end: Ledger | None
+    highest: Float[Array, ""]  # the largest load so far, N
+    # Since the last row.
+    count: Int[Array, ""]
+    events: Int[Array, ""]
+
+
+def motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
+    """How a motion ended (an `Ending`), and its rows.
+
+    `args`: the scene, the state at the first instant, the most steps between two rows, and a `How`.
+    """
+    return _followed(args, instants, args[3].method)
+
+
+def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
+    return _followed(args, instants, for_derivatives(args[3].method, Mechanics(args[0])))
+
+
+motion_by_kernel = KernelFunction(motion, _differentiated)
+
+
+def _followed(args, instants, method: EventExact):
+    scene, y0, most, how = args
+    mechanics = Mechanics(scene)
+    accounts_of = EnergyData(scene) if how.energy else None
+    begin = _begun(scene, mechanics, y0, method, accounts_of)
+    none = jnp.zeros((), bool)
+
+    def step(now: Step) -> Step:
+        return _next_step(scene, mechanics, method, accounts_of, now)
+
+    def to_row(carry, instant):
+        now, lost, unbounded, ending = carry
+
+        def going(now: Step) -> Bool[Array, ""]:
+            return (now.end < instant) & (now.count < most)
+
+        now = jax.lax.while_loop(going, step, now)
+        y, ledger = _at(mechanics, method, accounts_of, now, instant)
+        finite = jnp.all(jnp.isfinite(y))
+        # Too few steps, or a step of no length: the series does not reach the row.
+        short = now.end < instant
+        load = scene.load(instant)
+        highest = jnp.maximum(now.highest, jnp.abs(load))
+        beyond = ~lost & finite & ~short & grown(scene, y0, instant, highest, y)
+        failure = jnp.where(
+            beyond,
+            Ending.UNBOUNDED,
+            jnp.where(
+                ~finite,
+                Ending.NOT_FINITE,
+                jnp.where(2 * now.events > most, Ending.TOO_MANY_EVENTS, Ending.STEP_FAILURE),
+            ),
+        )
+        failing = ~lost & (beyond | ~finite | short)
+        ending = jnp.where(failing, failure, ending).astype(jnp.int32)
+        lost, unbounded = lost | failing, unbounded | beyond
+        y, ledger = jax.tree.map(
+            lambda leaf: jnp.where(lost, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
+        )
+        # A row at a jump of the load shows the load and the contact just after it.
+        on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
+        contact = settled(mechanics, now.contact, load, y, on_jump)
+        row = _row(mechanics, accounts_of, contact, load, y, ledger, lost)
+        now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
+        return (now, lost, unbounded, ending), row
+
+    instants_begin = begin.t
+    start = begin, none, none, jnp.asarray(Ending.FINISHED, jnp.int32)
+    (_, _, _, ending), rows = jax.lax.scan(to_row, start, instants)
+    return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
+
+
+def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:
+    """A step of no length at the start."""
+    none, no = jnp.zeros((), y0.dtype), jnp.zeros((), jnp.int32)
+    load = _load_from(scene, none)
+    contact = physics.status_from_forces(mechanics, load, y0)
+    ledger = None if accounts_of is None else accounts.open_ledger(accounts_of, y0)
+    series = jnp.zeros((method.order_ + 1, y0.shape[0]), y0.dtype).at[0].set(y0)
+    begin = Step(
+        t=none,
+        y=y0,
+        contact=contact,
+        load=load,
+        series=series,
+        unit=jnp.ones_like(none),
+        ledger=ledger,
+        end=none,
+        y_end=y0,
+        contact_end=contact,
+        ledger_end=ledger,
+        highest=jnp.abs(load),
+        count=no,
+        events=no,
+    )
+    return depending_on((scene, method), begin)
+
+
+def _load_from(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+    """The load from an instant up to its next jump."""
+    until = _next_jump(scene, t)
+    return scene.load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
+
+
+def _next_jump(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+    jumps = scene.load.jumps
+    return jnp.min(jnp.where(jumps > t, jumps, jnp.inf), initial=jnp.inf)
+
+
+def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_of, now: Step) -> Step:
+    t, y, contact = now.end, now.y_end, now.contact_end
+    until = _next_jump(scene, t)
+    load = _load_from(scene, t)
+    h = until - t
+    # Equal parts, if steps are limited. The 1e-6 keeps rounding from adding another part of vanishing length.
+    parts = jnp.where(jnp.isfinite(h), jnp.maximum(jnp.ceil(h / method.dt - 1e-6), 1.0), 1.0)
+    after, states, unit = method.advance_with_series(mechanics, contact, load, y, h / parts)
+    arrived = (parts == 1) & (after.h >= h)
+    ledger = None
+    if accounts_of is not None:
+        ledger = accounts.enter(accounts_of, method, mechanics, now.ledger_end, Segment(t, load, contact, y, after))
+    return Step(
+        t=t,
+        y=y,
+        contact=contact,
+        load=load,
+        series=jnp.stack(states),
+        unit=unit,
+        ledger=now.ledger_end,
+        end=jnp.where(arrived, until, t + after.h),
+        y_end=after.y,
+        contact_end=after.contact,
+        ledger_end=ledger,
+        highest=jnp.maximum(now.highest, jnp.abs(load)),
+        count=now.count + 1,
+        events=now.events + jnp.any(after.ended),
+    )
+
+
+def _at(mechanics: Mechanics, method: EventExact, accounts_of, now: Step, instant) -> tuple[State, Ledger | None]:
+    """The state and the ledger within a step."""
+    y, _ = value_and_slope(now.series, (instant - now.t) / now.unit)
+    y = physics.on_constraint(mechanics, now.contact, y)
+    if accounts_of is None:
+        return y, None
+    none = jnp.zeros((*now.contact.status.shape, 2), bool)
+    after = advance_between(now.y, y, none, y, now.contact, instant - now.t, mechanics)
+    segment = Segment(now.t, now.load, now.contact, now.y, after)
+    return y, accounts.enter(accounts_of, method, mechanics, now.ledger, segment)
+
+
+def _row(mechanics: Mechanics, accounts_of, contact: Contact, load, y: State, ledger, lost) -> dict:
+    n = y.shape[0] // 2
+    friction_force, normal_force = physics.contact_forces(mechanics, contact, load, y)
+    acceleration = physics.acceleration(mechanics, contact, load, y)
+
+    def known(value):
+        return jnp.where(lost, jnp.nan, value)
+
+    energy = None
+    if accounts_of is not None:
+        of_one = jax.tree.map(lambda leaf: leaf[None], (contact, load, y, ledger))
+        energy = jax.tree.map(lambda leaf: leaf[0], accounts.along_rows(accounts_of, mechanics, *of_one))
+    return {
+        "displacement": y[:n],
+        "velocity": y[n:],
+        # What a contact mode forbids is zero whatever the state.
+        "acceleration": known(acceleration),
+        "status": contact.status.astype(jnp.int32),
+        "normal_force": known(normal_force),
+        "friction_force": known(friction_force),
+        "load": load,
+        "energy": energy,
+    }
