@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..foundation.carried import depending_on
 from ..foundation.linear_solve import solve
 from .mechanics import Mechanics
 from .mode_forces import mode_matrix
@@ -107,12 +108,17 @@ def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Arra
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """By trying all combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking."""
     every = np.array(sorted(itertools.product(range(4), repeat=len(problem.slips)), key=_preference), np.int32)
-    violations = jax.vmap(lambda state: jnp.max(_judged(problem, state)))(jnp.asarray(every))
-    # A contact that has just lifted off may be admissible on the belt as well; it stays off.
-    changes = jnp.sum(every != start, axis=1) * (0.1 * TIE[violations.dtype.name])
-    best = jax.lax.argmin(violations + changes, 0, jnp.int32)
-    # The best row as a masked sum: an index would become a gather in a batch.
-    return jnp.sum(jnp.where((jnp.arange(len(every)) == best)[:, None], every, 0), axis=0).astype(jnp.int32)
+
+    def tried(best, state):
+        # A contact that has just lifted off may be admissible on the belt as well; it stays off.
+        changes = jnp.sum(state != start) * (0.1 * TIE[problem.normal.dtype.name])
+        violation = jnp.max(_judged(problem, state)) + changes
+        better = violation < best[0]
+        return (jnp.where(better, violation, best[0]), jnp.where(better, state, best[1])), None
+
+    # One after the other: what tries all at once takes long to compile.
+    begin = jnp.asarray(jnp.inf, problem.normal.dtype), jnp.asarray(every[0])
+    return jax.lax.scan(tried, depending_on(problem, begin), every)[0][1]
 
 
 def _preference(states: tuple[int, ...]) -> tuple[int, int]:

@@ -29,7 +29,8 @@ def modes_from_forces(
     guess = jnp.where(away, OPEN, jnp.where(slips, jnp.where(slip < 0, FORWARD, BACKWARD), STICK))
     if before is not None:
         going_on = state_of(before)
-        guess = jnp.where(jnp.take_along_axis(problem.allowed, going_on[:, None], 1)[:, 0], going_on, guess)
+        may_go_on = jnp.any(problem.allowed & (going_on[:, None] == np.arange(4)), axis=-1)
+        guess = jnp.where(may_go_on, going_on, guess)
     found = settled_states(problem, guess.astype(jnp.int32))
     status = jnp.where(found == STICK, Status.STICK, jnp.where(found == OPEN, Status.DETACH, Status.SLIDE))
     return Contact(status.astype(jnp.int32), jnp.where(found == BACKWARD, -1.0, 1.0).astype(y.dtype))

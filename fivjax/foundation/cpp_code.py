@@ -305,6 +305,10 @@ class Writer:
                 return of_numbers(np.ones(operands[0].shape))
             form = " * ".join(["{0}"] * abs(power))
             form = form if power > 0 else f"1.0 / ({form})"
+        elif name == "rem":
+            form = "__builtin_fmod({}, {})" if kind == "double" else "({} % {})"
+        elif name == "round":
+            form = "wp::round({})" if params["rounding_method"] == jax.lax.RoundingMethod.AWAY_FROM_ZERO else "wp::rint({})"
         elif name in BY_NUMBER:
             form = BY_NUMBER[name]
         else:
@@ -327,7 +331,7 @@ class Writer:
     def _each_in_loops(self, name: str, form: str, operands: Sequence[Value], kind: str, shape) -> View:
         own = [kind] * len(operands) if name not in ("select_n", *COMPARISONS) else None
         views = []
-        for position, part in enumerate(operands):
+        for position, part in enumerate(map(_without_repeats, operands)):
             if part.size == 1:
                 views.append(self.entries(part).ravel()[0])
             else:
@@ -396,44 +400,47 @@ class Writer:
         return self.small(into)
 
     def product(self, left: Value, right: Value, numbers, kind: str) -> Value:
-        """A product of matrices or vectors."""
-        ((along_left,), (along_right,)), batch = numbers
-        if any(batch):
-            raise NotImplementedError("Matrix products of batches have no C++ here; write them as sums.")
-        kept_left = [axis for axis in range(left.ndim) if axis != along_left]
-        kept_right = [axis for axis in range(right.ndim) if axis != along_right]
-        shape = [left.shape[axis] for axis in kept_left] + [right.shape[axis] for axis in kept_right]
-        length = left.shape[along_left]
-        if count_of(shape) * length > FEW:
-            a, b = self.view(left, kind), self.view(right, kind)
-            into = self.new(shape, WIDE if WIDE in (a.kind, b.kind) else kind)
+        """A product of matrices, vectors or batches of them."""
+        along, batch = numbers
+        kept = [
+            [axis for axis in range(part.ndim) if axis not in (*own, *shared)]
+            for part, own, shared in zip((left, right), along, batch, strict=True)
+        ]
+        shape = [left.shape[axis] for axis in (*batch[0], *kept[0])] + [right.shape[axis] for axis in kept[1]]
+        lengths = [left.shape[axis] for axis in along[0]]
+
+        def at(result, step):
+            """The places of both factors, for that of a result and the summand's."""
+            shared, own = result[: len(batch[0])], result[len(batch[0]) :]
+            ends = own[: len(kept[0])], own[len(kept[0]) :]
+            for part, axes, free, common, end in zip((left, right), along, kept, batch, ends, strict=True):
+                place = dict(zip(axes, step, strict=True)) | dict(zip(free, end, strict=True))
+                place |= dict(zip(common, shared, strict=True))
+                yield tuple(place[axis] for axis in range(part.ndim))
+
+        if count_of(shape) * count_of(lengths) > FEW:
+            factors = self.view(left, kind), self.view(right, kind)
+            into = self.new(shape, WIDE if WIDE in (factors[0].kind, factors[1].kind) else kind)
             every = self.name("int", "i")
             self.put(
                 f"for (int {every} = 0; {every} < {into.size}; ++{every}) {into.base}[{every}] = ({into.kind})(0.0);"
             )
             # The sum outside: then the loop over the results is one of vectors.
-            (step,) = self.loops([length])
-            names = self.loops(shape)
-            at_left = dict(zip(kept_left, names[: len(kept_left)], strict=True)) | {along_left: step}
-            at_right = dict(zip(kept_right, names[len(kept_left) :], strict=True)) | {along_right: step}
-            factors = (
-                a.at([at_left[axis] for axis in range(a.ndim)]),
-                b.at([at_right[axis] for axis in range(b.ndim)]),
-            )
-            self.put(f"{into.at(names)} += {' * '.join(factors)};")
-            self.close(1 + len(names))
+            step, names = self.loops(lengths), self.loops(shape)
+            texts = [factor.at(place) for factor, place in zip(factors, at(names, step), strict=True)]
+            self.put(f"{into.at(names)} += {' * '.join(texts)};")
+            self.close(len(step) + len(names))
             return self.small(into)
-        rows = np.moveaxis(self.entries(left), along_left, -1).reshape(-1, length)
-        columns = np.moveaxis(self.entries(right), along_right, -1).reshape(-1, length)
-        found = np.empty((len(rows), len(columns)), object)
-        for i, j in np.ndindex(found.shape):
+        left, right = self.entries(left), self.entries(right)
+        found = np.empty(shape, object)
+        for place in np.ndindex(*shape):
             total = 0.0
-            for pair in zip(rows[i], columns[j], strict=True):
-                total = self.one(
-                    "add", BY_NUMBER["add"], [total, self.one("mul", BY_NUMBER["mul"], list(pair), kind)], kind
-                )
-            found[i, j] = total
-        return found.reshape(shape)
+            for step in np.ndindex(*lengths):
+                a, b = at(place, step)
+                term = self.one("mul", BY_NUMBER["mul"], [left[a], right[b]], kind)
+                total = self.one("add", BY_NUMBER["add"], [total, term], kind)
+            found[place] = total
+        return found
 
     def place(self, entry, most: int):
         """An index, kept between zero and the most, as JAX keeps it."""
@@ -514,6 +521,19 @@ def text_of(entry) -> str:
     return f"({entry!r})"
 
 
+def _without_repeats(value: Value) -> Value:
+    """The value with one entry along axes along which it has been broadcast."""
+    if isinstance(value, View) or value.size == 0:
+        return value
+    if all(entry is value.flat[0] or _equal(entry, value.flat[0]) for entry in value.flat):
+        return value[(slice(0, 1),) * value.ndim]
+    return value[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in value.strides)]
+
+
+def _equal(one, other) -> bool:
+    return type(one) is type(other) and one == other
+
+
 def _converted(text: str, own: str, kind: str) -> str:
     return text if own == kind else f"({kind})({text})"
 
@@ -542,7 +562,7 @@ def _simpler(name: str, parts: list):
         which, first, second = parts
         if not isinstance(which, str):
             return second if which else first
-        return first if type(first) is type(second) and first == second else None
+        return first if _equal(first, second) else None
     if name in ("add", "add_any", "mul", "and", "or"):
         for own, other in (parts, parts[::-1]):
             if name in ("add", "add_any") and _is(own, 0):

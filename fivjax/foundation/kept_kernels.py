@@ -22,6 +22,8 @@ from .whole_files import own_folder
 
 # The folder inside Warp's, and the file with the digests of a kernel's other files.
 FOLDER, DIGESTS = "fivjax", "digests.json"
+# The folder inside that for the code of kernels before it is compiled.
+TEXTS = "texts"
 # Room for building a kernel (bytes): it needs a hundredth of that.
 ROOM = 2**25
 
@@ -36,6 +38,12 @@ def load(wp, module, names: list[str]) -> None:
         missing = [name for name in names if folder is None or not _loaded(wp, module, name, folder)]
         if missing:
             _build_and_load(wp, module, missing, folder)
+
+
+def folder_of_texts(wp) -> Path | None:
+    """The folder for what is told of kernels besides their compiled code."""
+    folder = _folder(Path(wp.config.kernel_cache_dir))
+    return None if folder is None else folder_to_keep_in(folder / TEXTS)
 
 
 def _folder(of_warp: Path) -> Path | None:

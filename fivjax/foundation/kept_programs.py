@@ -72,10 +72,11 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
     return call
 
 
-def kept_value(make: Callable[..., R], *args) -> R:
-    """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs."""
-    folder = _folder()
-    path = None if folder is None else _place(make, folder, None, args)
+def kept_value(make: Callable[..., R], *args, folder: Path | None = None) -> R:
+    """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs, or in a
+    folder that has been checked.
+    """
+    path = _place(make, _folder() or "", None, args) if folder is None else _named(make, folder, None, args)
     if path is None:
         return make(*args)
     found = _found(path, from_text)
@@ -133,10 +134,13 @@ def _program(
 
 def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
     """The file for what a function makes of such arguments; none where these cannot be named, or nothing can be kept."""
+    place = folder_to_keep_in(folder) if folder else None
+    return None if place is None else _named(function, place, structure, rest)
+
+
+def _named(function: Callable, folder: Path, structure, rest: tuple) -> Path | None:
     try:
-        name = f"{function.__name__}-{_digest(function, structure, rest)}"
-        place = folder_to_keep_in(folder)
-        return None if place is None else place / name
+        return folder / f"{function.__name__}-{_digest(function, structure, rest)}"
     except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
         return None
 

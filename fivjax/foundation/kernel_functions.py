@@ -22,10 +22,11 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Float
 
+from .forking import refuse_if_forked
 from .kept_programs import kept_value
 from .kernel_text import Form, Place, text, written
 from .precision import is_known
-from .warp_library import ONE_AT_A_TIME, load, warp
+from .warp_library import ONE_AT_A_TIME, folder_of_texts, load, warp
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
 WIDTHS = (1, 2, 4, 8, 16)
@@ -53,6 +54,7 @@ class KernelFunction:
 
         **Raises:** `NotImplementedError` for a function that cannot be written as C++.
         """
+        refuse_if_forked()
         form, arrays = Form.of(args)
         if all(map(is_known, (*arrays, instants))):
             given = np.concatenate([np.ravel(np.asarray(array)).astype(np.float64) for array in arrays])
@@ -75,7 +77,7 @@ class Kernel:
     def __init__(self, function: KernelFunction, form: Form, wide: tuple[bool, ...], width: int):
         own = function.differentiated if width else function.function
         self.form, self.width = form, width
-        self.text = text(kept_value(written, own, form, wide))
+        self.text = text(kept_value(written, own, form, wide, folder=folder_of_texts()))
         self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
         self.numbers = sum(array.size for array in form.arrays)
         with ONE_AT_A_TIME:
@@ -322,6 +324,8 @@ def _callable(kernel: _Hashed):
     launch.__annotations__ = {
         f"{name}_": wp.array(dtype=wp.float64, ndim=axes) for name, axes in {**GIVEN, **FOUND}.items()
     }
+    # The module that Warp looks whether it is loaded.
+    launch.__module__ = own.kernel.module.name
     return wp.jax_callable(launch, num_outputs=len(FOUND), graph_mode=wp.JaxCallableGraphMode.NONE)
 
 

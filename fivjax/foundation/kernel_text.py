@@ -56,7 +56,7 @@ def _is_array(leaf) -> bool:
 
 
 def _dtype(leaf) -> str:
-    own = np.result_type(leaf)
+    own = leaf.dtype if hasattr(leaf, "dtype") else np.dtype(float)
     return "float64" if np.issubdtype(own, np.floating) else own.name
 
 
@@ -132,7 +132,9 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
         jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
         lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
         writer = _WriterOfKernel(jaxpr, len(like), len(moving), lengths)
-        source = writer.source(traced.consts)
+        # Numbers that are known are computed now, whatever is being traced around this.
+        with jax.ensure_compile_time_eval():
+            source = writer.source(traced.consts)
     places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
     return structures[-1], source, *(tuple(map(tuple, those)) for those in places)
 

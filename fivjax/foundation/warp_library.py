@@ -11,6 +11,7 @@ import os
 import sys
 import tempfile
 import threading
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -74,6 +75,11 @@ def _init_elsewhere(wp) -> None:
             wp.init()
         finally:
             wp.config.kernel_cache_dir = before
+
+
+def folder_of_texts() -> Path | None:
+    """Where the code of kernels is kept, if it can be."""
+    return kept_kernels.folder_of_texts(warp())
 
 
 def devices() -> list[str]:

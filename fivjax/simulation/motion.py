@@ -9,6 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
@@ -16,14 +17,28 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_slope
-from ..model.scene import Scene
-from ..steppers.base import advance_between
+from ..foundation.warp_library import is_installed
+from ..foundation.precision import is_known
+from ..model.scene import (
+    Scene,
+    refuse_belt_at_rest,
+    refuse_beyond_limit,
+    refuse_without_equilibrium,
+    steady_sliding,
+    steady_slip_speeds,
+)
+from ..steppers.base import AbstractStepper, advance_between
 from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
 from .rows import grown, settled
+
+
+# Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
+LARGEST, MOST_CONTACTS = 24, 3
+PACKAGE = __name__.partition(".")[0]
 
 
 class How(eqx.Module):
@@ -53,24 +68,76 @@ class Step(NamedTuple):
     events: Int[Array, ""]
 
 
-def motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
-    """How a motion ended (an `Ending`), and its rows.
+def motion(args, instants: Float[Array, " T"]) -> tuple["Start", dict]:
+    """What a run began with and how it ended, and its rows.
 
-    `args`: the scene, the state at the first instant, the most steps between two rows, and a `How`.
+    `args`: the scene, the state at the first instant (none: sliding equilibrium), the most steps between two rows, a `How`.
     """
     return _followed(args, instants, args[3].method)
 
 
-def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
+def _differentiated(args, instants: Float[Array, " T"]) -> tuple["Start", dict]:
     return _followed(args, instants, for_derivatives(args[3].method, Mechanics(args[0])))
 
 
-motion_by_kernel = KernelFunction(motion, _differentiated)
+_by_kernel = KernelFunction(motion, _differentiated)
+
+
+def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
+    """Whether a kernel follows the motions of such scenes by this method."""
+    return (
+        isinstance(method, EventExact)
+        and is_installed()
+        and jax.default_backend() == "cpu"
+        and scene.structure.size <= LARGEST
+        and len(scene.structure.places) <= MOST_CONTACTS
+        and _has_cpp(scene)
+    )
+
+
+def _has_cpp(scene: Scene) -> bool:
+    """Whether the scene's laws can be written as C++, as all of fivjax's own can."""
+    return all(type(own).__module__.partition(".")[0] == PACKAGE for own in (scene.friction, scene.load, scene.structure))
+
+
+class Start(NamedTuple):
+    """What a run begins with, for checks, and how it ended."""
+
+    ending: Int[Array, ""]  # an `Ending`
+    q: Float[Array, " n"]  # m
+    normal_force: Float[Array, "*contacts"]  # N, of steady sliding; zero for a run from elsewhere
+    friction: Float[Array, "*contacts"]  # the largest that it may meet
+    limit: Float[Array, ""]  # Painlevé's, for one contact
+
+
+def rows_by_kernel(
+    scene: Scene, method: EventExact, y0: State | None, saved: Float[Array, " T"], most: int, energy: bool
+) -> tuple[Int[Array, ""], dict]:
+    """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`).
+
+    Without `y0` it starts from sliding equilibrium at rest.
+
+    **Raises:** `ValueError` for known friction beyond Painlevé's limit, and without that equilibrium.
+    """
+    if y0 is None:
+        refuse_belt_at_rest(scene)
+    start, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), How(method, energy)), saved)
+    if is_known(start.q):
+        if len(scene.structure.contacts) == 1:
+            refuse_beyond_limit(start.friction, start.limit)
+        if y0 is None:
+            refuse_without_equilibrium(start.q, start.normal_force)
+    rows["status"] = rows["status"].astype(np.int8)
+    return start.ending, {"t": saved, **rows}
 
 
 def _followed(args, instants, method: EventExact):
     scene, y0, most, how = args
     mechanics = Mechanics(scene)
+    normal_force = jnp.zeros_like(mechanics.belt_speed)
+    if y0 is None:
+        q, normal_force = steady_sliding(scene, scene.load.force)
+        y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     accounts_of = EnergyData(scene) if how.energy else None
     begin = _begun(scene, mechanics, y0, method, accounts_of)
     none = jnp.zeros((), bool)
@@ -117,7 +184,13 @@ def _followed(args, instants, method: EventExact):
     instants_begin = begin.t
     start = begin, none, none, jnp.asarray(Ending.FINISHED, jnp.int32)
     (_, _, _, ending), rows = jax.lax.scan(to_row, start, instants)
-    return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
+    ending = jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32)
+    limit = jnp.inf
+    if not mechanics.several:
+        _, g_tn, g_nn = mechanics.compliance
+        limit = jnp.where(g_tn == 0, jnp.inf, g_nn / jnp.where(g_tn == 0, 1.0, jnp.abs(g_tn)))
+    friction = scene.friction.largest(steady_slip_speeds(scene))
+    return Start(ending, y0[: scene.structure.size], normal_force, friction, jnp.asarray(limit)), rows
 
 
 def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:

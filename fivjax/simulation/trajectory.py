@@ -33,6 +33,7 @@ from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
 from .ending import ENDING, Ending
 from .energy import Energy
+from .motion import has_kernel, rows_by_kernel
 from .rows import rows_at, rows_in_parts, with_step_as_array
 from .start import start_in_contact_coordinates, start_state
 from .stretches import MODES
@@ -213,7 +214,10 @@ def simulate(
             f"Argument `dt_save` must be at least the method's step, but is {saved} s and `dt` is {step} s. Steps "
             f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
         )
-    refuse_painleve(scene)
+    by_kernel = has_kernel(scene, method)
+    # A kernel tells what one contact's limit is.
+    if not (by_kernel and len(scene.structure.contacts) == 1):
+        refuse_painleve(scene)
     if not scene.structure.contacts_at_coordinates:
         return _in_contact_coordinates(
             scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
@@ -225,21 +229,26 @@ def simulate(
             f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
         )
     start = "sliding equilibrium" if y0 is None else "given by y0"
-    y0 = start_state(scene, y0)
+    if not (by_kernel and y0 is None):
+        y0 = start_state(scene, y0)
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
     # By NumPy, because JAX would compile a small program for each operation.
-    saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1)).astype(y0.dtype)
+    saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1))
     stepper = with_step_as_array(method)
+    if by_kernel:
+        with following("simulate", shown=progress):
+            ending, found = rows_by_kernel(scene, method, y0, saved, most, bool(energy))
     # Runs with known values are not differentiated.
-    if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
+    elif all(map(is_known, jax.tree.leaves((scene, method, y0)))):
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
     else:
         modes = None if derivatives == "none" else derivatives
         found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
-    grown = found.pop("grown")
+    if "grown" in found:
+        ending = _ending(scene, stepper, found, found.pop("grown"), most)
     settings = (
         ("method", describe_method(method)),
         ("dt", float(method.dt)),
@@ -247,7 +256,7 @@ def simulate(
         ("t1", float(t1)),
         ("start", start),
     )
-    return Trajectory(**found, scene=scene, outcome=_ending(scene, stepper, found, grown, most), settings=settings)
+    return Trajectory(**found, scene=scene, outcome=ending.astype(np.int8), settings=settings)
 
 
 def _in_contact_coordinates(scene: Scene, *how, y0, **options) -> Trajectory:
