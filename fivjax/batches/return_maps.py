@@ -26,6 +26,7 @@ from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
+from .series_kernels import SeriesKernels
 from .sharing import Batch
 from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, in_rows_of_several, moved_in_windows, no_path, with_newest
 
@@ -74,7 +75,7 @@ class Images(NamedTuple):
 class ReturnMaps:
     """The return maps of all groups of a batch."""
 
-    def __init__(self, batch: Batch, shared: Flattened, kernels: Kernels | None = None):
+    def __init__(self, batch: Batch, shared: Flattened, kernels: Kernels | SeriesKernels | None = None):
         tree, self.kernels = shared.tree, kernels
         longest = np.asarray(tree.longest_return)
         self.mechanics = flatten((tree.mechanics, longest))
@@ -159,12 +160,15 @@ class ReturnMaps:
         """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
         if self.windows is not None:
             return self._differences(group, at, crossings)
+        if isinstance(self.kernels, SeriesKernels) and len(group):
+            (*section, time), derivatives = self.kernels.derived(group, *at, crossings)
+            return Section(*section), time, derivatives
         (*section, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
         return Section(*section), time, derivatives
 
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
-        if self.windows is not None:
+        if self.windows is not None or self.kernels is not None:
             return self.returns(group, at, crossings, peaks=True).peak
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 

@@ -24,6 +24,7 @@ from .parting import followed_on
 from .progress import Progress
 from .results import CHAOTIC, NO_ATTRACTOR, Ended, Verdicts, record
 from .return_maps import ReturnMaps
+from .series_kernels import SeriesKernels
 from .sharing import Batch, grouped, shared_by
 from .tori import TUBES, Torus
 from .uncaptured import fates
@@ -75,9 +76,9 @@ def follow_all(
     # What trajectories share is worked out for finished ones too: the rest is then the same as without an interruption.
     pending = np.flatnonzero(verdicts.pending(index))
     trajectories = begun(batch, shared, group[pending], columns[pending])
-    if batch.by_kernel and len(pending):
+    if (batch.by_kernel or batch.by_series) and len(pending):
         compile_conclusions(batch, shared, trajectories)
-    kernels = Kernels(shared, batch.pool) if batch.by_kernel else None
+    kernels = kernels_for(batch, shared)
     basins = Basins(batch, shared, kernels, of_groups, group, seeds)
     known_from = KNOWN_FROM * batch.method.round
     own_from = OWN_FROM * batch.method.round
@@ -137,6 +138,13 @@ def follow_all(
         done += steps
 
 
+def kernels_for(batch: Batch, shared: Flattened) -> Kernels | SeriesKernels | None:
+    """The kernels that follow the trajectories of a batch, if any do."""
+    if batch.by_kernel:
+        return Kernels(shared, batch.pool)
+    return SeriesKernels(batch, shared) if batch.by_series else None
+
+
 def with_seeding(
     of_groups: Float[np.ndarray, "g k"], seeding: Float[np.ndarray, "g k"]
 ) -> tuple[Float[np.ndarray, "more k"], Int[np.ndarray, " g"]]:
@@ -182,7 +190,7 @@ class Basins:
         self,
         batch: Batch,
         shared: Flattened,
-        kernels: Kernels | None,
+        kernels: Kernels | SeriesKernels | None,
         of_groups: np.ndarray,
         group: np.ndarray,
         seeds: Int[np.ndarray, " g"],

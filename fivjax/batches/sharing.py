@@ -24,6 +24,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_advance import MOST_COORDINATES
+from ..steppers.kernel_scope import has_kernel
 from ..steppers.propagation import MATRIX_ROWS
 from ..steppers.windowed import Windowed
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
@@ -65,8 +66,13 @@ class Batch(NamedTuple):
 
     @property
     def by_kernel(self) -> bool:
-        """Whether kernels follow the trajectories."""
+        """Whether kernels follow the trajectories by matrices prepared for each group."""
         return isinstance(self.method, Windowed) and self.method.by_kernel
+
+    @property
+    def by_series(self) -> bool:
+        """Whether kernels follow the trajectories by Taylor series, as `simulate` does."""
+        return isinstance(self.method, EventExact) and has_kernel(self.scene, self.method)
 
 
 def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
@@ -76,13 +82,16 @@ def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed
         return method
     small = scene.structure.size <= MOST_COORDINATES
     # Only of a law that is known can it be said that a kernel can be made of it.
-    return Windowed(by_kernel=small and isinstance(scene.friction, Coulomb) and is_installed())
+    if small and isinstance(scene.friction, Coulomb) and is_installed():
+        return Windowed(by_kernel=True)
+    return method if has_kernel(scene, method) else Windowed()
 
 
 def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
     """The version of Warp, where its kernels follow the trajectories of such a run."""
     by = method if energy else in_bulk(method, scene)
-    return {"warp": metadata.version("warp-lang")} if isinstance(by, Windowed) and by.by_kernel else {}
+    by_kernel = by.by_kernel if isinstance(by, Windowed) else has_kernel(scene, by)
+    return {"warp": metadata.version("warp-lang")} if by_kernel else {}
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:

@@ -108,6 +108,29 @@ def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: C
     return functools.reduce(jnp.maximum, of_contacts)
 
 
+def higher_peak(
+    mechanics: Mechanics, coefficients: Float[Array, "k state"], h, end, before: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The largest tangential speed in m/s within an advance, or the one from `before` if that was larger.
+
+    `coefficients` are those of the motion's Taylor series, `h` is the advance's duration in s and `end` the same in the unit
+    of the series.
+    """
+    n, powers = coefficients.shape[1] // 2, end ** np.arange(len(coefficients))
+    for tangential, _ in mechanics.places:
+        speeds = coefficients[:, n + tangential]
+        # Most advances have no higher peak than those before them.
+        most = jnp.sum(jnp.abs(speeds) * powers)
+        before = jax.lax.cond(
+            most <= before,
+            lambda speeds, before: before,
+            lambda speeds, before: jnp.maximum(before, _peak_of_series(speeds, h, end)),
+            speeds,
+            before,
+        )
+    return before
+
+
 def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
     samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
     values, _ = value_and_slope(speeds, samples)

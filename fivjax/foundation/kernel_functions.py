@@ -71,6 +71,19 @@ class KernelFunction:
         return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
 
 
+    def derived_of_many(self, form: Form, given, instants, wide: tuple[bool, ...], directions, pool: Executor | None = None):
+        """The same, and the derivatives of real results at the end along each direction (the last axis): `directions` has one
+        column for each, of the numbers of those arrays that are `wide`.
+        """
+        kernel = kernel_of(self, form, wide, directions.shape[1])
+        ends, rows, dots, _ = kernel.launched(given, np.atleast_2d(instants), directions[None], pool)
+        slopes = [
+            dots[:, place.start : place.start + place.size].reshape(len(given), *place.shape, -1)
+            for place in kernel.text.end_dots
+        ]
+        return kernel.results(ends, rows), slopes
+
+
 class Kernel:
     """A compiled kernel."""
 

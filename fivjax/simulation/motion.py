@@ -17,7 +17,6 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_slope
-from ..foundation.warp_library import is_installed
 from ..foundation.precision import is_known
 from ..model.scene import (
     Scene,
@@ -27,18 +26,13 @@ from ..model.scene import (
     steady_sliding,
     steady_slip_speeds,
 )
-from ..steppers.base import AbstractStepper, advance_between
+from ..steppers.base import advance_between
 from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
 from .rows import grown, settled
-
-
-# Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
-LARGEST, MOST_CONTACTS = 24, 3
-PACKAGE = __name__.partition(".")[0]
 
 
 class How(eqx.Module):
@@ -81,23 +75,6 @@ def _differentiated(args, instants: Float[Array, " T"]) -> tuple["Start", dict]:
 
 
 _by_kernel = KernelFunction(motion, _differentiated)
-
-
-def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
-    """Whether a kernel follows the motions of such scenes by this method."""
-    return (
-        isinstance(method, EventExact)
-        and is_installed()
-        and jax.default_backend() == "cpu"
-        and scene.structure.size <= LARGEST
-        and len(scene.structure.places) <= MOST_CONTACTS
-        and _has_cpp(scene)
-    )
-
-
-def _has_cpp(scene: Scene) -> bool:
-    """Whether the scene's laws can be written as C++, as all of fivjax's own can."""
-    return all(type(own).__module__.partition(".")[0] == PACKAGE for own in (scene.friction, scene.load, scene.structure))
 
 
 class Start(NamedTuple):

@@ -31,9 +31,10 @@ from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
+from ..steppers.kernel_scope import has_kernel
 from .ending import ENDING, Ending
 from .energy import Energy
-from .motion import has_kernel, rows_by_kernel
+from .motion import rows_by_kernel
 from .rows import rows_at, rows_in_parts, with_step_as_array
 from .start import start_in_contact_coordinates, start_state
 from .stretches import MODES

@@ -1,0 +1,209 @@
+"""Trajectories followed, and return maps evaluated, by kernels that step by Taylor series: for any friction, and several contacts.
+
+A kernel does for one trajectory what `progress.step` says, and what `to_crossing` does on the section.
+"""
+
+from concurrent.futures import Executor
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..contact import Contact, Mechanics
+from ..cycles.around import higher_peak
+from ..cycles.section_map import MOST_TO_CROSSING
+from ..foundation.carried import depending_on
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.kernel_text import Form
+from ..model.scene import Scene
+from ..steppers.event_exact import EventExact, for_derivatives
+from .flattened import Flattened
+from .kernels import for_conclusions
+from .progress import Progress, Setting, step
+from .sharing import Batch, Shared, with_values
+
+# Rows of numbers for a kernel are put together for so many bytes at a time.
+AT_A_TIME = 2**26
+# Directions side by side in the derivative of a return map: as few of these as serve, or several calls with the most.
+WIDTHS = (1, 2, 4, 8, 16)
+
+
+class Following(eqx.Module):
+    """What is the same for all trajectories of a batch."""
+
+    scene: Scene
+    names: tuple[str, ...] = eqx.field(static=True)
+    history: tuple[str, ...] = eqx.field(static=True)
+    method: EventExact = eqx.field(static=True)
+
+
+class Way(NamedTuple):
+    """A motion from one crossing of the section to the next ones."""
+
+    y: Float[Array, " state"]
+    contact: Contact
+    left: Float[Array, ""]  # of the longest time, s
+    crossed: Int[Array, ""]
+    events: Int[Array, ""]
+    count: Int[Array, ""]
+    peak: Float[Array, ""]  # m/s
+
+
+class Asked(eqx.Module):
+    """What is asked of a motion on the section besides its state there."""
+
+    peaks: bool = eqx.field(static=True)
+
+
+def _followed(args, instants):
+    """A trajectory so many steps further."""
+    of_all, (values, mechanics, weights, longest), row, now, steps = args
+    scene = with_values(with_values(of_all.scene, of_all.names, values), of_all.history, row)
+    shared = Shared(values, mechanics, mechanics, None, None, weights, longest)
+    setting = Setting(scene, of_all.method, shared)
+    begin = depending_on((scene, mechanics), now)
+    after = jax.lax.fori_loop(0, steps, lambda _, now: step(setting, now), begin)
+    return jax.tree.leaves(after), ()
+
+
+def _returned(args, instants):
+    return _to_crossings(args, instants, EventExact())
+
+
+def _returned_to_derive(args, instants):
+    return _to_crossings(args, instants, for_derivatives(EventExact(), args[1][0]))
+
+
+def _to_crossings(args, instants, method: EventExact):
+    """The motion from a state of the section to a later one, with a row for each of the last states there."""
+    asked, (mechanics, longest), y, status, direction, crossings = args
+    none, zero = jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype)
+    begin = Way(y, Contact(status.astype(jnp.int32), direction), longest * crossings, none, none, none, zero)
+    begin = depending_on(mechanics, begin)
+
+    def further(way: Way) -> Way:
+        after, states, unit = method.advance_with_series(mechanics, way.contact, zero, way.y, way.left, True)
+        peak = way.peak
+        if asked.peaks:
+            peak = higher_peak(mechanics, jnp.stack(states), after.h, after.h / unit, peak)
+        return Way(
+            after.y,
+            after.contact,
+            jnp.where(after.h >= way.left, 0.0, way.left - after.h),
+            way.crossed + after.rise.happened,
+            way.events + jnp.any(after.ended),
+            way.count + 1,
+            peak,
+        )
+
+    def until(way: Way, crossed) -> Way:
+        def going(way: Way):
+            return (way.left > 0) & (way.crossed < crossed) & (way.count < MOST_TO_CROSSING)
+
+        return jax.lax.while_loop(going, further, way)
+
+    def row(way: Way, place):
+        # The last row is the last crossing; there are fewer crossings than rows, or more.
+        wanted = crossings - place.astype(jnp.int32)
+        way = until(way, wanted)
+        there = (wanted > 0) & (way.crossed >= wanted)
+        return way, jnp.where(there, way.y, jnp.nan)
+
+    way, path = jax.lax.scan(row, begin, instants)
+    arrived = (way.crossed >= crossings) & jnp.all(jnp.isfinite(way.y))
+    y = jnp.where(arrived, way.y, jnp.nan)
+    peak = jnp.where(arrived, way.peak, jnp.nan)
+    time = longest * crossings - way.left
+    return (y, way.contact.status, way.contact.direction, way.events, time, peak), path
+
+
+_follow, _return = KernelFunction(_followed), KernelFunction(_returned, _returned_to_derive)
+
+
+class SeriesKernels:
+    """The kernels for a batch, with the data of its groups."""
+
+    def __init__(self, batch: Batch, shared: Flattened):
+        tree = shared.tree
+        self.batch, self.pool, self.tree = batch, batch.pool, tree
+        self.for_conclusions = for_conclusions(shared)
+        self.of_all = Following(batch.scene, batch.names, batch.history, batch.method)
+        self.of_group = (tree.values, tree.mechanics, tree.weights, tree.longest_return)
+        self.table = _table(self.of_group)
+        self.on_section = (tree.mechanics, tree.longest_return)
+        self.section_table = _table(self.on_section)
+
+    def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
+        """Trajectories so many steps further, in place."""
+        columns, now = trajectories.tree
+        now = eqx.tree_at(lambda now: now.steps, now, None, is_leaf=lambda leaf: leaf is None)
+        steps = np.asarray(steps, np.int32)
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.of_group, columns, now))
+        form, _ = Form.of((self.of_all, *first, steps))
+        of_all = _row((self.of_all,))
+        own = trajectories.numbers
+        size, begin = own.shape[1], columns.shape[-1]
+
+        def found(rows: slice) -> None:
+            count = len(group[rows])
+            given = [np.broadcast_to(of_all, (count, len(of_all))), self.table[group[rows]], own[rows]]
+            ends, _ = _follow.of_many(
+                form, np.concatenate([*given, np.full((count, 1), float(steps))], axis=1), np.zeros(1), self.pool
+            )
+            own[rows, begin:size] = np.concatenate([part.reshape(count, -1) for part in ends], axis=1)
+
+        for rows in _parts(len(group), 8 * (len(of_all) + self.table.shape[1] + size)):
+            found(rows)
+
+    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
+        """The `crossings`-th crossing from each row, as `Kernels.returns` gives it."""
+        form, given = self._section_rows(group, y, status, direction, crossings, peaks)
+        places = np.arange(kept, dtype=float)[::-1]
+        parts = [
+            _return.of_many(form, given[rows], places, self.pool)
+            for rows in _parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
+        ]
+        (y, status, direction, events, time, peak), path = jax.tree.map(lambda *part: np.concatenate(part), *parts)
+        return y, status.astype(np.int32), direction, events, time, path, peak
+
+    def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
+        """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
+        form, given = self._section_rows(group, y, status, direction, crossings, False)
+        size = y.shape[1]
+        wide = tuple(array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays))
+        found, slopes = None, []
+        width = next((width for width in WIDTHS if width >= size), WIDTHS[-1])
+        for start in range(0, size, width):
+            directions = np.eye(size, size + width)[:, start : start + width]
+            found, dots = _return.derived_of_many(form, given, np.zeros(1), wide, directions, self.pool)
+            slopes.append(dots[0])
+        (y, status, direction, _, time, _), _ = found
+        return (y, status.astype(np.int32), direction, time), np.concatenate(slopes, axis=-1)[..., :size]
+
+    def _section_rows(self, group, y, status, direction, crossings, peaks: bool):
+        crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))
+        rows = (np.asarray(y), np.asarray(status, np.int32), np.asarray(direction, float), crossings)
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.on_section, *rows))
+        form, _ = Form.of((Asked(peaks), *first))
+        self._place_of_state = len(jax.tree.leaves(self.on_section))
+        own = [part.reshape(len(y), -1).astype(float) for part in rows]
+        return form, np.concatenate([self.section_table[group], *own], axis=1)
+
+
+def _table(tree) -> Float[np.ndarray, "g k"]:
+    """All numbers of each group's part of a tree, in a row."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return np.concatenate([leaf.reshape(len(leaf), -1).astype(float) for leaf in leaves], axis=1)
+
+
+def _row(tree) -> Float[np.ndarray, " k"]:
+    leaves = [np.ravel(np.asarray(leaf)).astype(float) for leaf in jax.tree.leaves(tree)]
+    return np.concatenate([np.zeros(0), *leaves])
+
+
+def _parts(count: int, each: int) -> list[slice]:
+    size = max(1, AT_A_TIME // each)
+    return [slice(start, start + size) for start in range(0, count, size)]
