@@ -253,10 +253,3 @@ def test_arithmetic_written_out_is_that_of_jax():
         expected = np.array([everything(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(x, y, strict=True)])
     assert np.any(np.isnan(expected))
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-13, atol=1e-13)
-
-
-def test_loops_are_refused():
-    with pytest.raises(NotImplementedError, match=r"jnp\.where"):
-        scalar_source(lambda x: jax.lax.fori_loop(0, 3, lambda _, x: 2 * x, x), x=1)
-    with pytest.raises(NotImplementedError, match="primitive `cos`"):
-        scalar_source(jnp.cos, x=1)

@@ -13,8 +13,8 @@ from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .conclusion import conclude, may_be_concluded
 from .flattened import Flattened, flatten
 from .kernels import Kernels, for_conclusions
-from .series_kernels import SeriesKernels
 from .progress import Progress, Setting, begin, placed, released, step
+from .series_kernels import SeriesKernels
 from .sharing import Batch, Shared, with_values
 
 # Trajectories that kernels have followed and that are asked for a verdict at a time.
@@ -36,7 +36,12 @@ def begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarra
 
 
 def follow(
-    batch: Batch, kernels: Kernels | SeriesKernels | None, shared: Flattened, group: np.ndarray, trajectories: Flattened, steps: int
+    batch: Batch,
+    kernels: Kernels | SeriesKernels | None,
+    shared: Flattened,
+    group: np.ndarray,
+    trajectories: Flattened,
+    steps: int,
 ) -> None:
     """Trajectories so many steps further, in place."""
     if kernels is not None:
@@ -51,7 +56,12 @@ def follow(
 
 
 def _follow_by_kernel(
-    batch: Batch, kernels: Kernels | SeriesKernels, shared: Flattened, group: np.ndarray, trajectories: Flattened, steps: int
+    batch: Batch,
+    kernels: Kernels | SeriesKernels,
+    shared: Flattened,
+    group: np.ndarray,
+    trajectories: Flattened,
+    steps: int,
 ) -> None:
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events

@@ -1,9 +1,8 @@
-"""Trajectories followed, and return maps evaluated, by kernels that step by Taylor series: for any friction, and several contacts.
+"""Trajectories followed, and return maps evaluated, by kernels that step by Taylor series: any friction, several contacts.
 
 A kernel does for one trajectory what `progress.step` says, and what `to_crossing` does on the section.
 """
 
-from concurrent.futures import Executor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..contact import Contact, Mechanics
+from ..contact import Contact
 from ..cycles.around import higher_peak
 from ..cycles.section_map import MOST_TO_CROSSING
 from ..foundation.carried import depending_on
@@ -22,7 +21,7 @@ from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
 from .flattened import Flattened
 from .kernels import for_conclusions
-from .progress import Progress, Setting, step
+from .progress import Setting, step
 from .sharing import Batch, Shared, with_values
 
 # Rows of numbers for a kernel are put together for so many bytes at a time.
@@ -85,7 +84,7 @@ def _to_crossings(args, instants, method: EventExact):
     begin = depending_on(mechanics, begin)
 
     def further(way: Way) -> Way:
-        after, states, unit = method.advance_with_series(mechanics, way.contact, zero, way.y, way.left, True)
+        after, states, unit = method.with_series(mechanics, way.contact, zero, way.y, way.left, True)
         peak = way.peak
         if asked.peaks:
             peak = higher_peak(mechanics, jnp.stack(states), after.h, after.h / unit, peak)
@@ -173,7 +172,9 @@ class SeriesKernels:
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
         form, given = self._section_rows(group, y, status, direction, crossings, False)
         size = y.shape[1]
-        wide = tuple(array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays))
+        wide = tuple(
+            array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays)
+        )
         found, slopes = None, []
         width = next((width for width in WIDTHS if width >= size), WIDTHS[-1])
         for start in range(0, size, width):

@@ -70,8 +70,9 @@ class KernelFunction:
         kernel = kernel_of(self, form)
         return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
 
-
-    def derived_of_many(self, form: Form, given, instants, wide: tuple[bool, ...], directions, pool: Executor | None = None):
+    def derived_of_many(
+        self, form: Form, given, instants, wide: tuple[bool, ...], directions, pool: Executor | None = None
+    ):
         """The same, and the derivatives of real results at the end along each direction (the last axis): `directions` has one
         column for each, of the numbers of those arrays that are `wide`.
         """
@@ -271,7 +272,10 @@ kernel_p.multiple_results = True
 
 @kernel_p.def_abstract_eval
 def _abstract(given, dots, instants, *, kernel: _Hashed):
-    return [jax.core.ShapedArray(shape, np.dtype("float64")) for shape in kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])]
+    return [
+        jax.core.ShapedArray(shape, np.dtype("float64"))
+        for shape in kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])
+    ]
 
 
 @kernel_p.def_impl

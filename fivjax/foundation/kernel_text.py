@@ -5,13 +5,15 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 from jax.interpreters import partial_eval
 
 from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers
-from .cpp_code import WIDE, Writer, kind_of, scan
+from .cpp_code import writer
+from .cpp_loops import scan
+from .cpp_numbers import WIDE, kind_of
+from .cpp_writer import Writer
 from .plain_trees import from_text, structure_to_text
 
 
@@ -131,10 +133,10 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
         # What is asked for: no more is written.
         jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
         lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
-        writer = _WriterOfKernel(jaxpr, len(like), len(moving), lengths)
+        of_kernel = _WriterOfKernel(jaxpr, len(like), len(moving), lengths)
         # Numbers that are known are computed now, whatever is being traced around this.
         with jax.ensure_compile_time_eval():
-            source = writer.source(traced.consts)
+            source = of_kernel.source(traced.consts)
     places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
     return structures[-1], source, *(tuple(map(tuple, those)) for those in places)
 
@@ -143,7 +145,11 @@ def text(plain: tuple) -> Text:
     """A `Text` from what was `written`."""
     structures, source, *places = plain
     structures = tuple(from_text(structure) for structure in structures)
-    return Text(structures, source, *(tuple(Place(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places))
+    return Text(
+        structures,
+        source,
+        *(tuple(Place(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places),
+    )
 
 
 def _places(avals, leading: int = 0) -> tuple[Place, ...]:
@@ -163,7 +169,7 @@ class _WriterOfKernel:
         self.ends, self.rows, self.end_dots, self.row_dots = (
             jaxpr.outvars[start:end] for start, end in zip([0, *lengths], [*lengths, None], strict=True)
         )
-        self.writer = Writer(
+        self.writer = writer(
             {"given": "double", "dots": WIDE, "instants": "double", "rows": "double", "row_dots": WIDE}
         )
 

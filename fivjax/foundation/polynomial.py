@@ -20,6 +20,11 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
     return value, slope, bend
 
 
+def ratio(above: Array, below: Array, otherwise: float) -> Array:
+    """A ratio, or something else where the divisor is not positive."""
+    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), otherwise)
+
+
 def extremum(c: Sequence[Array] | Array, x: Array, low: Array | float, high: Array, steps: int) -> Array:
     """Where a polynomial's slope is zero, by `steps` steps of Newton's method from `x`, kept between `low` and `high`."""
 

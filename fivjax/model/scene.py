@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from ..foundation.compiling import compiled
 from ..foundation.digits import apart
 from ..foundation.linear_solve import solve
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
 from . import description
 from .contact_coordinates import in_contact_coordinates, transformation
@@ -202,31 +202,22 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
         >>> fj.sliding_equilibrium(scene).round(6)  # x2, y1 and y2, which is closed
         array([ 0.000217, -0.000988,  0.      ])
     """
-    refuse_belt_at_rest(scene)
-    q, normal_force = _compiled_steady_sliding(scene, scene.load.force)
-    if is_known(q):
-        refuse_without_equilibrium(q, normal_force)
-    return q
-
-
-def refuse_belt_at_rest(scene: Scene) -> None:
-    """Refuse steady sliding on a belt that is known not to move."""
     if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
-
-
-def refuse_without_equilibrium(q, normal_force) -> None:
-    """Refuse what `steady_sliding` gives (m and N) where there is no such state."""
-    if not np.all(np.isfinite(np.asarray(q))):
-        raise ValueError(
-            "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
-            "the friction or the springs, or give `y0` to start elsewhere."
-        )
-    if np.any(np.asarray(normal_force) < 0):
-        raise ValueError(
-            f"There is no sliding equilibrium: the belt would have to pull with {-float(np.min(normal_force)):.3g} N. "
-            f"Change the load, its direction or the friction."
-        )
+    q, normal_force = _steady_sliding(scene, scene.load.force)
+    if is_known(q):
+        normal_force = np.asarray(normal_force)
+        if not np.all(np.isfinite(np.asarray(q))):
+            raise ValueError(
+                "There is no sliding equilibrium: the sliding stiffness matrix is singular at this friction. Change "
+                "the friction or the springs, or give `y0` to start elsewhere."
+            )
+        if np.any(normal_force < 0):
+            raise ValueError(
+                f"There is no sliding equilibrium: the belt would have to pull with {-float(np.min(normal_force)):.3g} N. "
+                f"Change the load, its direction or the friction."
+            )
+    return q
 
 
 def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:
@@ -261,7 +252,7 @@ def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
     return speed if count == 1 else jnp.broadcast_to(speed, count)
 
 
-_compiled_steady_sliding = compiled(steady_sliding)
+_steady_sliding = by_numpy(steady_sliding)
 
 
 @returning_numpy
@@ -281,7 +272,7 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
     return _painleve_friction(in_contact_coordinates(structure))
 
 
-@compiled
+@by_numpy
 def _painleve_friction(structure: Structure):
     columns = jnp.eye(structure.size)[:, jnp.array([structure.tangential, structure.normal])]
     compliance = columns.T @ solve(structure.mass, columns)
@@ -323,15 +314,9 @@ def refuse_painleve(scene: Scene) -> None:
         return
     if is_known(largest):
         limit = painleve_friction(scene.structure)
-        if is_known(limit):
-            refuse_beyond_limit(largest, limit)
-
-
-def refuse_beyond_limit(friction, limit) -> None:
-    """Refuse friction of one contact at or beyond Painlevé's limit."""
-    if float(friction) >= limit:
-        friction, limit = apart(friction, limit, digits=4)
-        raise ValueError(
-            f"The contact problem has no unique solution at friction {friction}: Painlevé's limit of this "
-            f"structure is {limit}. Lower the friction or the coupling in the mass matrix."
-        )
+        if is_known(limit) and float(largest) >= limit:
+            friction, limit = apart(largest, limit, digits=4)
+            raise ValueError(
+                f"The contact problem has no unique solution at friction {friction}: Painlevé's limit of this "
+                f"structure is {limit}. Lower the friction or the coupling in the mass matrix."
+            )

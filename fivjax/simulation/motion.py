@@ -17,15 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_slope
-from ..foundation.precision import is_known
-from ..model.scene import (
-    Scene,
-    refuse_belt_at_rest,
-    refuse_beyond_limit,
-    refuse_without_equilibrium,
-    steady_sliding,
-    steady_slip_speeds,
-)
+from ..model.scene import Scene
 from ..steppers.base import advance_between
 from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -62,59 +54,33 @@ class Step(NamedTuple):
     events: Int[Array, ""]
 
 
-def motion(args, instants: Float[Array, " T"]) -> tuple["Start", dict]:
-    """What a run began with and how it ended, and its rows.
+def _motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
+    """How a motion ended (an `Ending`), and its rows.
 
-    `args`: the scene, the state at the first instant (none: sliding equilibrium), the most steps between two rows, a `How`.
+    `args`: the scene, the state at the first instant, the most steps between two rows, and a `How`.
     """
     return _followed(args, instants, args[3].method)
 
 
-def _differentiated(args, instants: Float[Array, " T"]) -> tuple["Start", dict]:
+def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
     return _followed(args, instants, for_derivatives(args[3].method, Mechanics(args[0])))
 
 
-_by_kernel = KernelFunction(motion, _differentiated)
-
-
-class Start(NamedTuple):
-    """What a run begins with, for checks, and how it ended."""
-
-    ending: Int[Array, ""]  # an `Ending`
-    q: Float[Array, " n"]  # m
-    normal_force: Float[Array, "*contacts"]  # N, of steady sliding; zero for a run from elsewhere
-    friction: Float[Array, "*contacts"]  # the largest that it may meet
-    limit: Float[Array, ""]  # Painlevé's, for one contact
+_by_kernel = KernelFunction(_motion, _differentiated)
 
 
 def rows_by_kernel(
-    scene: Scene, method: EventExact, y0: State | None, saved: Float[Array, " T"], most: int, energy: bool
+    scene: Scene, method: EventExact, y0: State, saved: Float[Array, " T"], most: int, energy: bool
 ) -> tuple[Int[Array, ""], dict]:
-    """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`).
-
-    Without `y0` it starts from sliding equilibrium at rest.
-
-    **Raises:** `ValueError` for known friction beyond Painlevé's limit, and without that equilibrium.
-    """
-    if y0 is None:
-        refuse_belt_at_rest(scene)
-    start, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), How(method, energy)), saved)
-    if is_known(start.q):
-        if len(scene.structure.contacts) == 1:
-            refuse_beyond_limit(start.friction, start.limit)
-        if y0 is None:
-            refuse_without_equilibrium(start.q, start.normal_force)
+    """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`)."""
+    ending, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), How(method, energy)), saved)
     rows["status"] = rows["status"].astype(np.int8)
-    return start.ending, {"t": saved, **rows}
+    return ending, {"t": saved, **rows}
 
 
 def _followed(args, instants, method: EventExact):
     scene, y0, most, how = args
     mechanics = Mechanics(scene)
-    normal_force = jnp.zeros_like(mechanics.belt_speed)
-    if y0 is None:
-        q, normal_force = steady_sliding(scene, scene.load.force)
-        y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     accounts_of = EnergyData(scene) if how.energy else None
     begin = _begun(scene, mechanics, y0, method, accounts_of)
     none = jnp.zeros((), bool)
@@ -161,13 +127,7 @@ def _followed(args, instants, method: EventExact):
     instants_begin = begin.t
     start = begin, none, none, jnp.asarray(Ending.FINISHED, jnp.int32)
     (_, _, _, ending), rows = jax.lax.scan(to_row, start, instants)
-    ending = jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32)
-    limit = jnp.inf
-    if not mechanics.several:
-        _, g_tn, g_nn = mechanics.compliance
-        limit = jnp.where(g_tn == 0, jnp.inf, g_nn / jnp.where(g_tn == 0, 1.0, jnp.abs(g_tn)))
-    friction = scene.friction.largest(steady_slip_speeds(scene))
-    return Start(ending, y0[: scene.structure.size], normal_force, friction, jnp.asarray(limit)), rows
+    return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
 
 
 def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:
@@ -214,7 +174,7 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
     h = until - t
     # Equal parts, if steps are limited. The 1e-6 keeps rounding from adding another part of vanishing length.
     parts = jnp.where(jnp.isfinite(h), jnp.maximum(jnp.ceil(h / method.dt - 1e-6), 1.0), 1.0)
-    after, states, unit = method.advance_with_series(mechanics, contact, load, y, h / parts)
+    after, states, unit = method.with_series(mechanics, contact, load, y, h / parts)
     arrived = (parts == 1) & (after.h >= h)
     ledger = None
     if accounts_of is not None:

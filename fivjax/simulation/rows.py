@@ -148,9 +148,7 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
     }
 
 
-def grown(
-    scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array, ""], y: State
-) -> Bool[Array, ""]:
+def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array, ""], y: State) -> Bool[Array, ""]:
     """Whether a state is `GROWTH` times larger than the start, the belt's motion and the effect of the highest load."""
     structure = scene.structure
     weights, n = structure.weights, structure.size

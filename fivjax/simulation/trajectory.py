@@ -24,7 +24,7 @@ from ..foundation.precision import (
     real,
     refusing_reverse_in_single_precision,
 )
-from ..foundation.progress import following
+from ..foundation.progress import following, tick
 from ..io.datasets import labelled
 from ..model.contact_coordinates import transformation
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
@@ -215,10 +215,7 @@ def simulate(
             f"Argument `dt_save` must be at least the method's step, but is {saved} s and `dt` is {step} s. Steps "
             f"end on saved instants, so no step would be as long as `dt`. Save less often, or lower `dt`."
         )
-    by_kernel = has_kernel(scene, method)
-    # A kernel tells what one contact's limit is.
-    if not (by_kernel and len(scene.structure.contacts) == 1):
-        refuse_painleve(scene)
+    refuse_painleve(scene)
     if not scene.structure.contacts_at_coordinates:
         return _in_contact_coordinates(
             scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
@@ -230,17 +227,17 @@ def simulate(
             f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
         )
     start = "sliding equilibrium" if y0 is None else "given by y0"
-    if not (by_kernel and y0 is None):
-        y0 = start_state(scene, y0)
+    y0 = start_state(scene, y0)
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
     # By NumPy, because JAX would compile a small program for each operation.
     saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1))
     stepper = with_step_as_array(method)
-    if by_kernel:
-        with following("simulate", shown=progress):
+    if has_kernel(scene, method):
+        with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             ending, found = rows_by_kernel(scene, method, y0, saved, most, bool(energy))
+            tick(len(saved) - 1)
     # Runs with known values are not differentiated.
     elif all(map(is_known, jax.tree.leaves((scene, method, y0)))):
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):

@@ -20,7 +20,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
-from ..foundation.polynomial import value_and_slope, value_slope_and_bend
+from ..foundation.polynomial import ratio, value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
@@ -83,7 +83,7 @@ class EventExact(AbstractStepper):
         # Steps end at jumps of the load, so the load at mid-step is that of the whole step.
         load = args.load(0.5 * (t0 + t1))
         after = follow(self, mechanics, contact, load, y0, t1 - t0)
-        dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
+        dense_info = dict(y0=y0, contact=contact, mechanics=mechanics, load=load, stepper=self)
         result = diffrax.RESULTS.where(after.enough, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
         return after.y, None, dense_info, StepperState(mechanics, after.contact), result
 
@@ -96,9 +96,9 @@ class EventExact(AbstractStepper):
         h: Float[Array, ""],
         at_section: bool = False,
     ) -> Advance:
-        return self.advance_with_series(mechanics, contact, load, y, h, at_section)[0]
+        return self.with_series(mechanics, contact, load, y, h, at_section)[0]
 
-    def advance_with_series(
+    def with_series(
         self,
         mechanics: Mechanics,
         contact: Contact,
@@ -117,7 +117,7 @@ class EventExact(AbstractStepper):
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
         if at_section:
-            # One more row for the tangential velocity's rise through zero, which is no event of the contact.
+            # One more row for the rise through zero of the tangential velocity, no event of the contact.
             rows = [-section_speed(mechanics, state) for state in states]
             guards = [jnp.append(guard, row) for guard, row in zip(guards, rows, strict=True)]
             # With several contacts, a small distance from the section is no rounding error.
@@ -153,8 +153,8 @@ class EventExact(AbstractStepper):
             reached = jnp.where(physics.is_beyond_the_model(mechanics, contact, series.friction[0]), jnp.nan, reached)
         resting = RESTING[y.dtype.name] * reach * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
-        after = advance_between(y, reached, ended, y_next, next_contact, x * reach * unit, mechanics)
-        return after, states, unit
+        h = x * reach * unit
+        return advance_between(y, reached, ended, y_next, next_contact, h, mechanics), states, unit
 
     def within(
         self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]
@@ -353,8 +353,8 @@ def _march_to_roots(
         root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
         # Two forms of the same root, each used where it has no cancellation.
         falls = slope < 0
-        quadratic = _ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
-        cubic = _ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
+        quadratic = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
+        cubic = ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
         onward = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(quadratic, cubic), quadratic)
         onward = jnp.where(open_(x, step), onward, step)
         return jnp.where(open_(x, step), x + onward, x), onward, count + 1
@@ -362,10 +362,6 @@ def _march_to_roots(
     x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
     found = spent | ((x < 1) & (step <= 2 * eps * x))
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
-
-
-def _ratio(above, below, otherwise):
-    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), otherwise)
 
 
 def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,0 +1,148 @@
+"""Loops and branches as C++, and which of the numbers that they carry are tangents."""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from .cpp_arrays import Value, View
+from .cpp_numbers import WIDE, kind_of, text_of
+from .cpp_writer import Writer
+from .taylor import within
+
+
+def _while(writer: Writer, equation, operands) -> list[Value]:
+    condition, body = equation.params["cond_jaxpr"], equation.params["body_jaxpr"]
+    asked = operands[: equation.params["cond_nconsts"]]
+    fixed = operands[len(asked) :][: equation.params["body_nconsts"]]
+    begin = operands[len(asked) + len(fixed) :]
+    kinds, _ = _types_carried(writer, body.jaxpr, fixed, begin, [], equation.outvars)
+    carry = [writer.changed(value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    writer.open("for (;;)")
+    (going,) = writer.run(condition.jaxpr, condition.consts, [*asked, *carry])
+    writer.put(f"if (!({text_of(writer.entries(going).item())})) break;")
+    writer.assign(carry, writer.run(body.jaxpr, body.consts, [*fixed, *carry]))
+    writer.close()
+    return carry
+
+
+def _scan(writer: Writer, equation, operands) -> list[Value]:
+    shapes = [variable.aval.shape for variable in equation.outvars[equation.params["num_carry"] :]]
+    return scan(writer, equation, operands, str(equation.params["length"]), lambda k, kind: writer.new(shapes[k], kind))
+
+
+def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int, str], View]) -> list[Value]:
+    """A loop along arrays, of a length that may be a variable; `rows_of` gives the array for each of its rows of results, by
+    number and type.
+    """
+    params, body = equation.params, equation.params["jaxpr"]
+    fixed, begin = operands[: params["num_consts"]], operands[params["num_consts"] :][: params["num_carry"]]
+    along = operands[len(fixed) + len(begin) :]
+    kinds, wide = _types_carried(writer, body.jaxpr, fixed, begin, along, equation.outvars[: len(begin)])
+    along = [
+        writer.view(value, kind_of(atom.aval))
+        for value, atom in zip(along, equation.invars[len(fixed) + len(begin) :], strict=True)
+    ]
+    carry = [writer.changed(value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    rows = [
+        rows_of(k, WIDE if wide[len(begin) + k] else kind_of(variable.aval))
+        for k, variable in enumerate(equation.outvars[len(begin) :])
+    ]
+    own = writer.name("int", "i")
+    writer.open(f"for (int {own} = 0; {own} < {length}; ++{own})")
+    at = writer.line(f"{length} - 1 - {own}", "int") if params["reverse"] else own
+
+    def row(view: View) -> Value:
+        offset = (*view.offset, f"{at} * {view.strides[0]}")
+        return writer.small(view.selected(offset, range(1, view.ndim)))
+
+    found = writer.run(body.jaxpr, body.consts, [*fixed, *carry, *map(row, along)])
+    for view, value in zip(rows, found[len(begin) :], strict=True):
+        start = " + ".join([*view.offset[1:], f"{at} * {view.strides[0]}", str(view.offset[0])])
+        writer.copy(value, view.base, view.kind, start, view.strides[1:])
+    writer.assign(carry, found[: len(begin)])
+    writer.close()
+    return [*carry, *map(writer.small, rows)]
+
+
+def _cond(writer: Writer, equation, operands) -> list[Value]:
+    index, *rest = operands
+    branches, which = equation.params["branches"], writer.entries(index).item()
+    last = len(branches) - 1
+    if not isinstance(which, str):
+        chosen = branches[min(max(int(which), 0), last)]
+        return writer.run(chosen.jaxpr, chosen.consts, rest)
+    flags = list(map(writer.is_wide, rest))
+    wide = [any(each) for each in zip(*(moved(branch.jaxpr, flags) for branch in branches), strict=True)]
+    found = [
+        writer.unset(variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
+        for variable, is_wide in zip(equation.outvars, wide, strict=True)
+    ]
+    for k, branch in enumerate(branches):
+        test = f"if ({which} <= 0)" if k == 0 else f"else if ({which} == {k})" if k < last else "else"
+        writer.open(test)
+        writer.assign(found, writer.run(branch.jaxpr, branch.consts, rest))
+        writer.close()
+    return found
+
+
+def _solved(writer: Writer, equation, operands) -> list[Value]:
+    """`custom_linear_solve`, by the solution that it was given."""
+    lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
+    ends = np.cumsum(lengths).tolist()
+    place = list(lengths._fields).index("solve")
+    own = operands[ends[place] - lengths.solve : ends[place]]
+    return writer.run(solve.jaxpr, solve.consts, [*own, *operands[ends[-1] :]])
+
+
+RULES: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _solved}
+
+
+def _types_carried(writer: Writer, body: Jaxpr, fixed, begin, along, variables) -> tuple[list[str], list[bool]]:
+    """The types of what a loop carries, and which of the body's results are wide."""
+    wide = list(map(writer.is_wide, begin))
+    wide, after = _carried(body, list(map(writer.is_wide, fixed)), wide, list(map(writer.is_wide, along)))
+    kinds = [WIDE if is_wide else kind_of(variable.aval) for is_wide, variable in zip(wide, variables, strict=True)]
+    return kinds, after
+
+
+def _carried(body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool]) -> tuple[list[bool], list[bool]]:
+    """Which of the numbers that a loop carries are wide, from its first turn or a later one, and which of its results."""
+    while True:
+        after = moved(body, [*fixed, *begin, *along])
+        more = [one or other for one, other in zip(begin, after[: len(begin)], strict=True)]
+        if more == begin:
+            return begin, after
+        begin = more
+
+
+def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
+    """Which results of a traced function are wide if these of its operands are: real numbers that depend on one."""
+    moves = dict(zip(jaxpr.invars, wide, strict=True))
+
+    def reads(atom) -> bool:
+        return not isinstance(atom, Literal) and moves.get(atom, False)
+
+    for equation in jaxpr.eqns:
+        flags, name, params = list(map(reads, equation.invars)), equation.primitive.name, equation.params
+        if name == "while":
+            asked, fixed = params["cond_nconsts"], params["body_nconsts"]
+            begin = flags[asked + fixed :]
+            found, _ = _carried(params["body_jaxpr"].jaxpr, flags[asked:][:fixed], begin, [])
+        elif name == "scan":
+            fixed, carried = params["num_consts"], params["num_carry"]
+            begin, after = _carried(
+                params["jaxpr"].jaxpr, flags[:fixed], flags[fixed:][:carried], flags[fixed + carried :]
+            )
+            found = [*begin, *after[carried:]]
+        elif name == "cond":
+            ways = (moved(branch.jaxpr, flags[1:]) for branch in params["branches"])
+            found = [any(each) for each in zip(*ways, strict=True)]
+        elif name not in RULES and isinstance(called := within(params), ClosedJaxpr):
+            found = moved(called.jaxpr, flags)
+        else:
+            found = [any(flags)] * len(equation.outvars)
+        for variable, is_wide in zip(equation.outvars, found, strict=True):
+            moves[variable] = is_wide and jnp.issubdtype(variable.aval.dtype, jnp.inexact)
+    return list(map(reads, jaxpr.outvars))

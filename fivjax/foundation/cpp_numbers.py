@@ -1,0 +1,187 @@
+"""Numbers in C++ code that is being written: their types, the text of arithmetic, and what is known of it beforehand."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .cpp_arrays import Value, View, of_numbers
+
+# Types in C++. What is wide is declared by the kernel: so many numbers in double precision.
+WIDE = "wide"
+TYPES = {
+    "float64": "double",
+    "bool": "bool",
+    "int32": "int",
+    "int8": "int",
+    "int64": "long long",
+    "uint32": "unsigned",
+    "uint64": "unsigned long long",
+}
+
+# C++ for the primitives that act on each number.
+BY_NUMBER = {
+    "add": "{} + {}",
+    "add_any": "{} + {}",
+    "sub": "{} - {}",
+    "mul": "{} * {}",
+    "div": "{} / {}",
+    "neg": "-{}",
+    "abs": "wp::abs({})",
+    "sign": "({0} > 0.0 ? 1.0 : ({0} < 0.0 ? -1.0 : {0}))",
+    "sqrt": "wp::sqrt({})",
+    "rsqrt": "1.0 / wp::sqrt({})",
+    "cbrt": "wp::cbrt({})",
+    "square": "{0} * {0}",
+    "exp": "wp::exp({})",
+    "exp2": "wp::pow(2.0, {})",
+    "log": "wp::log({})",
+    "log1p": "__builtin_log1p({})",
+    "expm1": "__builtin_expm1({})",
+    "erf": "wp::erf({})",
+    "erfc": "wp::erfc({})",
+    "pow": "wp::pow({}, {})",
+    "sin": "wp::sin({})",
+    "cos": "wp::cos({})",
+    "tan": "wp::tan({})",
+    "asin": "wp::asin({})",
+    "acos": "wp::acos({})",
+    "atan": "wp::atan({})",
+    "atan2": "wp::atan2({}, {})",
+    "sinh": "wp::sinh({})",
+    "cosh": "wp::cosh({})",
+    "tanh": "wp::tanh({})",
+    "logistic": "1.0 / (1.0 + wp::exp(-{}))",
+    "floor": "wp::floor({})",
+    "ceil": "wp::ceil({})",
+    "max": "({0} > {1} ? {0} : {1})",
+    "min": "({0} < {1} ? {0} : {1})",
+    "clamp": "({1} < {0} ? {0} : ({1} > {2} ? {2} : {1}))",
+    "lt": "{} < {}",
+    "le": "{} <= {}",
+    "gt": "{} > {}",
+    "ge": "{} >= {}",
+    "eq": "{} == {}",
+    "ne": "{} != {}",
+    "and": "{} & {}",
+    "or": "{} | {}",
+    "xor": "{} ^ {}",
+    "not": "!{}",
+    "is_finite": "({0} - {0} == 0.0)",
+}
+# What leaves each number as it is.
+SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
+# The commonest arithmetic of numbers that are known; the rest is left to JAX, which compiles a program for each.
+OF_NUMBERS: dict[str, Callable] = {
+    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
+    "convert_element_type": lambda a, p: a.astype(p["new_dtype"]),
+    "add": lambda a, b, _: a + b,
+    "sub": lambda a, b, _: a - b,
+    "mul": lambda a, b, _: a * b,
+    "neg": lambda a, _: -a,
+    "abs": lambda a, _: np.abs(a),
+    "square": lambda a, _: a * a,
+    "max": lambda a, b, _: np.maximum(a, b),
+    "min": lambda a, b, _: np.minimum(a, b),
+    "eq": lambda a, b, _: a == b,
+    "ne": lambda a, b, _: a != b,
+    "lt": lambda a, b, _: a < b,
+    "le": lambda a, b, _: a <= b,
+    "gt": lambda a, b, _: a > b,
+    "ge": lambda a, b, _: a >= b,
+    "and": lambda a, b, _: a & b,
+    "or": lambda a, b, _: a | b,
+}
+
+
+COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne", "is_finite")
+
+
+def kind_of(aval) -> str:
+    """The type in C++ of numbers of an array."""
+    return "bool" if aval.dtype == jax.dtypes.float0 else TYPES[np.dtype(aval.dtype).name]
+
+
+def text_of(entry) -> str:
+    if isinstance(entry, str):
+        return entry
+    if isinstance(entry, bool):
+        return "true" if entry else "false"
+    if isinstance(entry, float) and not np.isfinite(entry):
+        return "(0.0 / 0.0)" if np.isnan(entry) else "(1.0 / 0.0)" if entry > 0 else "(-1.0 / 0.0)"
+    if isinstance(entry, int) and abs(entry) >= 2**31:
+        return f"({entry}{'ull' if entry > 0 else 'll'})"
+    return f"({entry!r})"
+
+
+def without_repeats(value: Value) -> Value:
+    """The value with one entry along axes along which it has been broadcast."""
+    if isinstance(value, View) or value.ndim == 0 or value.size == 0:
+        return value
+    if all(entry is value.flat[0] or equal(entry, value.flat[0]) for entry in value.flat):
+        return value[(slice(0, 1),) * value.ndim]
+    return value[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in value.strides)]
+
+
+def equal(one, other) -> bool:
+    return type(one) is type(other) and one == other
+
+
+def converted(text: str, own: str, kind: str) -> str:
+    return text if own == kind else f"({kind})({text})"
+
+
+def base_of(target: Value) -> str:
+    if isinstance(target, View):
+        return target.base
+    return target.ravel()[0].partition("[")[0] if target.size else ""
+
+
+def same(target: Value, value: Value) -> bool:
+    if isinstance(target, View) or isinstance(value, View):
+        return isinstance(target, View) and isinstance(value, View) and target == value
+    return target.shape == value.shape and target.ravel().tolist() == value.ravel().tolist()
+
+
+def _is(entry, number: int) -> bool:
+    return not isinstance(entry, str | bool) and entry == number
+
+
+def simpler(name: str, parts: list):
+    """What follows from the parts that are known, if anything does. Zero times something counts as zero: what is not a number
+    shows elsewhere.
+    """
+    if name == "select_n":
+        which, first, second = parts
+        if not isinstance(which, str):
+            return second if which else first
+        return first if equal(first, second) else None
+    if name in ("add", "add_any", "mul", "and", "or"):
+        for own, other in (parts, parts[::-1]):
+            if name in ("add", "add_any") and _is(own, 0):
+                return other
+            if name == "mul" and _is(own, 0):
+                return own
+            if name == "mul" and _is(own, 1):
+                return other
+            if isinstance(own, bool):
+                return other if own == (name == "and") else own
+    if (name == "sub" and _is(parts[1], 0)) or (name == "div" and _is(parts[1], 1)):
+        return parts[0]
+    if name in ("div", "neg") and _is(parts[0], 0):
+        return parts[0]
+    return None
+
+
+def of_known(equation, operands: list[Value]) -> list[Value]:
+    values = [
+        np.array(part.tolist(), atom.aval.dtype).reshape(part.shape)
+        for part, atom in zip(operands, equation.invars, strict=True)
+    ]
+    name = equation.primitive.name
+    if name in OF_NUMBERS:
+        found = OF_NUMBERS[name](*values, equation.params)
+    else:
+        found = equation.primitive.bind(*map(jnp.asarray, values), **equation.params)
+    return list(map(of_numbers, found if equation.primitive.multiple_results else [found]))

@@ -1,0 +1,289 @@
+"""Primitives whose places in arrays may be unknown until the code runs, and others that move or reduce arrays, as C++."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers, reshaped
+from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
+from .cpp_writer import FEW, Writer
+
+# Reductions, by the primitive that they repeat, and running totals.
+FOLDED = {
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+}
+RUNNING = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+
+
+def _dynamic_slice(writer: Writer, equation, operands, kind: str) -> Value:
+    value, *starts = operands
+    view, sizes = writer.view(value, kind), equation.params["slice_sizes"]
+    return writer.small(_from(writer, view, starts, sizes))
+
+
+def _from(writer: Writer, view: View, starts, sizes) -> View:
+    known, unknown = view.offset[0], list(view.offset[1:])
+    for start, size, own, stride in zip(starts, sizes, view.shape, view.strides, strict=True):
+        at = writer.place(writer.entries(start).item(), own - size)
+        if isinstance(at, str):
+            unknown += [f"{at} * {stride}" if stride != 1 else at] * (stride != 0)
+        else:
+            known += at * stride
+    return View(view.base, (known, *unknown), tuple(sizes), view.strides, view.kind)
+
+
+def _dynamic_update_slice(writer: Writer, equation, operands, kind: str) -> Value:
+    value, update, *starts = operands
+    kind = WIDE if writer.is_wide(value) or writer.is_wide(update) else kind
+    into = writer.new(value.shape, kind)
+    writer.copy(value, into.base, kind)
+    part = _from(writer, into, starts, update.shape)
+    for place, entry in np.ndenumerate(writer.entries(update)):
+        writer.put(f"{part.at(place)} = {writer.as_type(entry, kind)};")
+    return writer.small(into)
+
+
+def _gather(writer: Writer, equation, operands, kind: str) -> Value:
+    value, places = operands
+    if is_known(places):
+        return _moved_to(equation, [writer.entries(value)], places)
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    view, places = writer.view(value, kind), writer.entries(places)
+    one_of_each = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [axis for axis in range(view.ndim) if axis not in one_of_each]
+    found = np.empty(equation.outvars[0].aval.shape, object)
+    parts = {}
+    for batch in np.ndindex(places.shape[:-1]):
+        starts = [of_numbers(0)] * view.ndim
+        for axis, of_batch in zip(
+            numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True
+        ):
+            starts[axis] = of_numbers(batch[of_batch])
+        for position, axis in enumerate(numbers.start_index_map):
+            starts[axis] = np.asarray(places[(*batch, position)], object)
+        part = _from(writer, view, starts, sizes)
+        parts[batch] = part.selected(part.offset, kept)
+    for place in np.ndindex(found.shape):
+        batch = tuple(at for axis, at in enumerate(place) if axis not in numbers.offset_dims)
+        found[place] = parts[batch].at([place[axis] for axis in numbers.offset_dims])
+    return found
+
+
+def _scatter(writer: Writer, equation, operands, kind: str) -> Value:
+    value, places, update = operands
+    if is_known(places):
+        return _moved_to(equation, [writer.entries(value), writer.entries(update)], places)
+    return _put_at(writer, equation, operands, kind, "=")
+
+
+def _scatter_add(writer: Writer, equation, operands, kind: str) -> Value:
+    value, places, update = operands
+    if not is_known(places):
+        return _put_at(writer, equation, operands, kind, "+=")
+    value, update = writer.entries(value), writer.entries(update)
+    numbers = np.arange(1, update.size + 1).reshape(update.shape)
+    places = np.array(places.tolist(), np.int32).reshape(places.shape)
+    put = np.asarray(
+        jax.lax.scatter(np.zeros(value.shape, numbers.dtype), places, numbers, equation.params["dimension_numbers"])
+    )
+    found = value.copy()
+    for place in zip(*np.nonzero(put), strict=True):
+        more = update.ravel()[put[place] - 1]
+        found[place] = writer.one("add", BY_NUMBER["add"], [value[place], more], kind)
+    return found
+
+
+def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
+    value, places, update = operands
+    numbers = equation.params["dimension_numbers"]
+    if places.size != len(numbers.scatter_dims_to_operand_dims):
+        raise NotImplementedError("Numbers put at several unknown places have no C++ here; put them one by one.")
+    kind = WIDE if writer.is_wide(value) or writer.is_wide(update) else kind
+    into = writer.new(value.shape, kind)
+    writer.copy(value, into.base, kind)
+    starts = [of_numbers(0)] * len(value.shape)
+    sizes = [1 if axis in numbers.inserted_window_dims else size for axis, size in enumerate(value.shape)]
+    for at, axis in zip(writer.entries(places).ravel(), numbers.scatter_dims_to_operand_dims, strict=True):
+        starts[axis] = np.asarray(at, object)
+    kept = [axis for axis in range(len(value.shape)) if axis not in numbers.inserted_window_dims]
+    part = _from(writer, into, starts, sizes)
+    part = part.selected(part.offset, kept)
+    for place, entry in np.ndenumerate(writer.entries(update)):
+        writer.put(f"{part.at(place)} {how} {writer.as_type(entry, kind)};")
+    return writer.small(into)
+
+
+def _moved_to(equation, moving: list[np.ndarray], places: np.ndarray) -> np.ndarray:
+    """Where the entries of operands go: the numbers of entries are moved in their stead."""
+    entries, numbers = [], []
+    for part in moving:
+        numbers.append(np.arange(len(entries), len(entries) + part.size).reshape(part.shape))
+        entries += list(part.ravel())
+    places = np.array(places.tolist(), np.int32).reshape(places.shape)
+    params = dict(equation.params)
+    if "fill_value" in params:
+        params["fill_value"] = None
+    found = equation.primitive.bind(*map(jnp.asarray, [numbers[0], places, *numbers[1:]]), **params)
+    return np.asarray(np.array([*entries, None], object)[np.asarray(found)], object)
+
+
+def _concatenate(writer: Writer, equation, operands, kind: str) -> Value:
+    axis = equation.params["dimension"]
+    kind = WIDE if any(map(writer.is_wide, operands)) else kind
+    into, start = writer.new(equation.outvars[0].aval.shape, kind), 0
+    for part in operands:
+        if part.size:
+            writer.copy(part, into.base, kind, f"{start * into.strides[axis]}", into.strides)
+        start += part.shape[axis]
+    return into
+
+
+def _reshape(writer: Writer, equation, operands, kind: str) -> Value:
+    (value,) = operands
+    shape = equation.params["new_sizes"]
+    found = reshaped(value, shape)
+    if found is None:
+        into = writer.new(value.shape, value.kind)
+        writer.copy(value, into.base, value.kind)
+        found = into._replace(shape=tuple(shape), strides=natural(shape))
+    return writer.small(found)
+
+
+def _best_place(sign: str) -> Callable:
+    def of(writer: Writer, equation, operands, kind: str) -> Value:
+        (axis,) = equation.params["axes"]
+        parts = np.moveaxis(writer.entries(operands[0]), axis, 0)
+        found = np.empty(parts.shape[1:], object)
+        for place in np.ndindex(found.shape):
+            best, at = parts[(0, *place)], 0
+            for i in range(1, len(parts)):
+                own = parts[(i, *place)]
+                better = writer.line(f"{text_of(own)} {sign} {text_of(best)}", "bool")
+                at = writer.line(f"({better} ? {i} : {text_of(at)})", kind)
+                best = writer.line(f"({better} ? {text_of(own)} : {text_of(best)})", writer.type_of(own))
+            found[place] = at
+        return found
+
+    return of
+
+
+def _sort(writer: Writer, equation, operands) -> list[Value]:
+    """By insertion, which is stable; what belongs to the keys is moved with them."""
+    if operands[0].ndim != 1 or equation.params["num_keys"] != 1:
+        raise NotImplementedError("Only rows of numbers are sorted in C++ here, by one key.")
+    kinds = [
+        WIDE if writer.is_wide(part) else kind_of(variable.aval)
+        for part, variable in zip(operands, equation.outvars, strict=True)
+    ]
+    rows = [writer.new(part.shape, kind) for part, kind in zip(operands, kinds, strict=True)]
+    for row, part in zip(rows, operands, strict=True):
+        writer.copy(part, row.base, row.kind)
+    own, at = writer.name("int", "i"), writer.name("int", "i")
+    kept = [writer.name(kind, "x") for kind in kinds]
+    writer.open(f"for (int {own} = 1; {own} < {rows[0].size}; ++{own})")
+    for row, name in zip(rows, kept, strict=True):
+        writer.put(f"const {row.kind} {name} = {row.base}[{own}];")
+    moves = " ".join(f"{row.base}[{at} + 1] = {row.base}[{at}];" for row in rows)
+    writer.put(f"int {at} = {own} - 1;")
+    writer.put(f"for (; {at} >= 0 && {rows[0].base}[{at}] > {kept[0]}; --{at}) {{ {moves} }}")
+    for row, name in zip(rows, kept, strict=True):
+        writer.put(f"{row.base}[{at} + 1] = {name};")
+    writer.close()
+    return list(map(writer.small, rows))
+
+
+def _running(name: str) -> Callable:
+    def of(writer: Writer, equation, operands, kind: str) -> Value:
+        axis, backwards = equation.params["axis"], equation.params["reverse"]
+        parts = list(np.moveaxis(writer.entries(operands[0]), axis, 0))[:: -1 if backwards else 1]
+        found = [np.asarray(parts[0], object)]
+        for part in parts[1:]:
+            found.append(
+                writer.entries(writer.each(name, BY_NUMBER[name], [found[-1], np.asarray(part, object)], kind))
+            )
+        return np.moveaxis(np.stack(found[:: -1 if backwards else 1]), 0, axis)
+
+    return of
+
+
+def _same_bits(writer: Writer, equation, operands, kind: str) -> Value:
+    own, value = kind_of(equation.invars[0].aval), writer.entries(operands[0])
+    found = np.empty(value.shape, object)
+    for place, entry in np.ndenumerate(value):
+        found[place] = writer.line(f"__builtin_bit_cast({kind}, {writer.line(text_of(entry), own)})", kind)
+    return found
+
+
+def _product(writer: Writer, left: Value, right: Value, numbers, kind: str) -> Value:
+    """A product of matrices, vectors or batches of them."""
+    along, batch = numbers
+    kept = [
+        [axis for axis in range(part.ndim) if axis not in (*own, *shared)]
+        for part, own, shared in zip((left, right), along, batch, strict=True)
+    ]
+    shape = [left.shape[axis] for axis in (*batch[0], *kept[0])] + [right.shape[axis] for axis in kept[1]]
+    lengths = [left.shape[axis] for axis in along[0]]
+
+    def at(result, step):
+        """The places of both factors, for that of a result and the summand's."""
+        shared, own = result[: len(batch[0])], result[len(batch[0]) :]
+        ends = own[: len(kept[0])], own[len(kept[0]) :]
+        for part, axes, free, common, end in zip((left, right), along, kept, batch, ends, strict=True):
+            place = dict(zip(axes, step, strict=True)) | dict(zip(free, end, strict=True))
+            place |= dict(zip(common, shared, strict=True))
+            yield tuple(place[axis] for axis in range(part.ndim))
+
+    if count_of(shape) * count_of(lengths) > FEW:
+        factors = writer.view(left, kind), writer.view(right, kind)
+        into = writer.new(shape, WIDE if WIDE in (factors[0].kind, factors[1].kind) else kind)
+        every = writer.name("int", "i")
+        writer.put(
+            f"for (int {every} = 0; {every} < {into.size}; ++{every}) {into.base}[{every}] = ({into.kind})(0.0);"
+        )
+        # The sum outside: then the loop over the results is one of vectors.
+        step, names = writer.loops(lengths), writer.loops(shape)
+        texts = [factor.at(place) for factor, place in zip(factors, at(names, step), strict=True)]
+        writer.put(f"{into.at(names)} += {' * '.join(texts)};")
+        writer.close(len(step) + len(names))
+        return writer.small(into)
+    left, right = writer.entries(left), writer.entries(right)
+    found = np.empty(shape, object)
+    for place in np.ndindex(*shape):
+        total = 0.0
+        for step in np.ndindex(*lengths):
+            a, b = at(place, step)
+            term = writer.one("mul", BY_NUMBER["mul"], [left[a], right[b]], kind)
+            total = writer.one("add", BY_NUMBER["add"], [total, term], kind)
+        found[place] = total
+    return found
+
+
+RULES: dict[str, Callable] = {
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter": _scatter,
+    "scatter-add": _scatter_add,
+    "concatenate": _concatenate,
+    "reshape": _reshape,
+    "expand_dims": _reshape,
+    "argmax": _best_place(">"),
+    "argmin": _best_place("<"),
+    "sort": _sort,
+    "bitcast_convert_type": _same_bits,
+    "dot_general": lambda writer, equation, operands, kind: _product(
+        writer, *operands, equation.params["dimension_numbers"], kind
+    ),
+}
+RULES |= {name: _running(of) for name, of in RUNNING.items()}
+RULES |= {
+    name: lambda writer, equation, operands, kind, of=of: writer.folded(of, operands[0], equation.params["axes"], kind)
+    for name, of in FOLDED.items()
+}

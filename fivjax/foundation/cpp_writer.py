@@ -1,0 +1,369 @@
+"""A JAX function as C++, so that a kernel for one trajectory computes what the function says.
+
+The function is traced, and its equations are written out one by one: arithmetic of a few numbers with a variable for each, of
+many as loops over arrays; `while_loop`, `scan` and `cond` as loops and branches, of which one trajectory goes through one way,
+where a batch under `vmap` computes all. What only moves numbers is carried out on their names.
+
+A function may be traced through `jax.jvp`. Then some of what it is given are tangents, which are `wide`: several numbers side
+by side, one for each direction. What depends on one is wide, too, and the rest is computed once for all directions.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
+
+import numpy as np
+from jax.extend.core import Jaxpr, Literal
+
+from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, is_known, natural, of_numbers, of_text
+from .cpp_numbers import (
+    BY_NUMBER,
+    COMPARISONS,
+    SAME,
+    WIDE,
+    base_of,
+    converted,
+    kind_of,
+    of_known,
+    same,
+    simpler,
+    text_of,
+    without_repeats,
+)
+from .taylor import within
+
+# Arrays with more numbers are gone through by loops.
+FEW = 40
+
+
+class Writer:
+    """Code that is being written, equation by equation."""
+
+    def __init__(self, rules: Mapping[str, Callable], types: dict[str, str] | None = None):
+        """`rules` are functions that write primitives, by name; `types` are those of the variables that the code is given."""
+        self.rules = rules
+        self.lines: list[str] = []
+        self.types = dict(types or {})
+        self._count = count()
+        # Blocks that are open, each with what has been computed in it: the same text is the same number.
+        self._blocks: list[dict] = [{}]
+
+    # Lines.
+
+    def put(self, line: str) -> None:
+        self.lines.append("  " * len(self._blocks) + line)
+
+    def open(self, head: str) -> None:
+        self.put(f"{head} {{")
+        self._blocks.append({})
+
+    def close(self, blocks: int = 1) -> None:
+        for _ in range(blocks):
+            self._blocks.pop()
+            self.put("}")
+
+    def name(self, kind: str, prefix: str = "v") -> str:
+        """A new variable's, or a C array's."""
+        found = f"{prefix}{next(self._count)}"
+        self.types[found] = kind
+        return found
+
+    def line(self, text: str, kind: str) -> str:
+        """The name of a variable that has the value of this text."""
+        if self.types.get(text) == kind:
+            return text
+        found = self._computed((kind, text))
+        if found is None:
+            found = self.name(kind)
+            self.put(f"const {kind} {found} = {text};")
+            self._blocks[-1][kind, text] = found
+        return found
+
+    def _computed(self, key) -> str | None:
+        return next((block[key] for block in reversed(self._blocks) if key in block), None)
+
+    def array(self, size: int, kind: str) -> str:
+        """The name of a new C array."""
+        found = self.name(kind, "a")
+        self.put(f"{kind} {found}[{max(size, 1)}];")
+        return found
+
+    def loops(self, shape) -> list[str]:
+        """The variables of nested loops over all places of an array."""
+        names = [self.name("int", "i") for _ in shape]
+        for name, size in zip(names, shape, strict=True):
+            self.open(f"for (int {name} = 0; {name} < {size}; ++{name})")
+        return names
+
+    # Numbers.
+
+    def type_of(self, entry) -> str:
+        if isinstance(entry, str):
+            return self.types[entry.partition("[")[0]]
+        return "bool" if isinstance(entry, bool) else "int" if isinstance(entry, int) else "double"
+
+    def as_type(self, entry, kind: str) -> str:
+        own = self.type_of(entry)
+        return text_of(entry) if own == kind else f"({kind})({text_of(entry)})"
+
+    def is_wide(self, value: Value) -> bool:
+        if isinstance(value, View):
+            return value.kind == WIDE
+        return any(isinstance(entry, str) and self.type_of(entry) == WIDE for entry in value.ravel())
+
+    # Arrays.
+
+    def entries(self, value: Value) -> np.ndarray:
+        return value.entries() if isinstance(value, View) else value
+
+    def small(self, value: Value) -> Value:
+        """A view only where there are many numbers."""
+        return value.entries() if isinstance(value, View) and value.size <= FEW else value
+
+    def view(self, value: Value, kind: str) -> View:
+        """The value in a C array, of this type or wide."""
+        if isinstance(value, View):
+            return value
+        kind = WIDE if self.is_wide(value) else kind
+        entries = value.ravel().tolist()
+        first = re.fullmatch(r"(\w+)\[(\d+)\]", str(entries[0])) if entries else None
+        if first is not None and self.types[first[1]] == kind:
+            start = int(first[2])
+            if entries == [f"{first[1]}[{start + i}]" for i in range(len(entries))]:
+                return View(first[1], (start,), value.shape, natural(value.shape), kind)
+        key = kind, tuple(map(text_of, entries))
+        base = self._computed(key)
+        if base is None:
+            base = self.array(value.size, kind)
+            self.copy(value, base, kind)
+            self._blocks[-1][key] = base
+        return View(base, (0,), value.shape, natural(value.shape), kind)
+
+    def copy(self, value: Value, base: str, kind: str, start: str = "0", strides=None) -> None:
+        """All numbers into a C array."""
+        strides = natural(value.shape) if strides is None else strides
+        into = View(base, (0,) if start == "0" else (0, start), value.shape, strides, kind)
+        if isinstance(value, View) and value.size > FEW:
+            names = self.loops(value.shape)
+            self.put(f"{into.at(names)} = {converted(value.at(names), value.kind, kind)};")
+            self.close(len(names))
+            return
+        entries = self.entries(value)
+        for place in np.ndindex(value.shape):
+            self.put(f"{into.at(place)} = {self.as_type(entries[place], kind)};")
+
+    def new(self, shape, kind: str) -> View:
+        """A view of a new C array."""
+        return View(self.array(count_of(shape), kind), (0,), tuple(shape), natural(shape), kind)
+
+    # Equations.
+
+    def run(self, jaxpr: Jaxpr, consts, given: Sequence[Value]) -> list[Value]:
+        """The results of a traced function."""
+        known = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
+        known.update(zip(jaxpr.invars, given, strict=True))
+
+        def read(atom) -> Value:
+            return of_numbers(atom.val) if isinstance(atom, Literal) else known[atom]
+
+        for equation in jaxpr.eqns:
+            results = self.applied(equation, list(map(read, equation.invars)))
+            known.update(zip(equation.outvars, results, strict=True))
+        return list(map(read, jaxpr.outvars))
+
+    def applied(self, equation, operands: list[Value]) -> list[Value]:
+        primitive, params = equation.primitive, equation.params
+        name = primitive.name
+        if name in self.rules and primitive.multiple_results:
+            return self.rules[name](self, equation, operands)
+        called = within(params)
+        if called is not None:
+            return self.run(called.jaxpr, called.consts, operands)
+        if name in SAME:
+            return operands
+        if name in MOVING:
+            found = MOVING[name](*operands, params)
+            return list(map(self.small, found)) if primitive.multiple_results else [self.small(found)]
+        if all(map(is_known, operands)) and sum(part.size for part in operands) < 4096:
+            return of_known(equation, operands)
+        kinds = [kind_of(variable.aval) for variable in equation.outvars]
+        if name in MOVING_ENTRIES and not (name == "concatenate" and any(isinstance(x, View) for x in operands)):
+            return [MOVING_ENTRIES[name](*map(self.entries, operands), params)]
+        if name in self.rules:
+            return [self.rules[name](self, equation, operands, kinds[0])]
+        return [self.by_number(name, params, operands, kinds[0])]
+
+    def by_number(self, name: str, params, operands: list[Value], kind: str) -> Value:
+        if name == "select_n":
+            which, *cases = operands
+            if is_known(which) and which.size == 1:
+                return cases[int(self.entries(which).item())]
+            if len(cases) != 2:
+                raise NotImplementedError("A choice among more than two values has no C++ here; write `jnp.where`.")
+            form = "({0} ? {2} : {1})"
+        elif name == "convert_element_type":
+            value = operands[0]
+            if self.is_wide(value) or (isinstance(value, View) and value.kind == kind):
+                return value
+            form = "({} != 0)" if kind == "bool" else f"({kind})({{}})"
+        elif name == "integer_pow":
+            power = params["y"]
+            if power == 0:
+                return of_numbers(np.ones(operands[0].shape))
+            form = " * ".join(["{0}"] * abs(power))
+            form = form if power > 0 else f"1.0 / ({form})"
+        elif name == "rem":
+            form = "__builtin_fmod({}, {})" if kind == "double" else "({} % {})"
+        elif name == "round":
+            form = (
+                "wp::round({})"
+                if params["rounding_method"] == jax.lax.RoundingMethod.AWAY_FROM_ZERO
+                else "wp::rint({})"
+            )
+        elif name in BY_NUMBER:
+            form = BY_NUMBER[name]
+        else:
+            raise NotImplementedError(f"The primitive `{name}` has no C++ here; write the function without it.")
+        return self.each(name, form, operands, kind)
+
+    def each(self, name: str, form: str, operands: Sequence[Value], kind: str) -> Value:
+        """The same for each number."""
+        if name in ("max", "min") and kind == "double":
+            form = form.replace(" ?", " || {0} != {0} ?")  # not a number stays that, as in JAX
+        shape = np.broadcast_shapes(*(part.shape for part in operands))
+        if count_of(shape) > FEW and not all(map(is_known, operands)):
+            return self._each_in_loops(name, form, operands, kind, shape)
+        spread = np.broadcast_arrays(*map(self.entries, operands))
+        found = np.empty(shape, object)
+        for place in np.ndindex(shape):
+            found[place] = self.one(name, form, [part[place] for part in spread], kind)
+        return found
+
+    def _each_in_loops(self, name: str, form: str, operands: Sequence[Value], kind: str, shape) -> View:
+        own = [kind] * len(operands) if name not in ("select_n", *COMPARISONS) else None
+        views = []
+        for position, part in enumerate(map(without_repeats, operands)):
+            if part.size == 1:
+                views.append(self.entries(part).ravel()[0])
+            else:
+                otherwise = own[position] if own else ("bool" if name == "select_n" and position == 0 else "double")
+                views.append(self.view(part, self._plain_type(part, otherwise)).broadcast(shape))
+        if kind == "double" and any(map(self.is_wide, operands)):
+            kind = WIDE
+        into = self.new(shape, kind)
+        names = self.loops(shape)
+        texts = [part.at(names) if isinstance(part, View) else text_of(part) for part in views]
+        if kind == WIDE and name == "select_n":
+            texts[1:] = [f"(wide)({text})" for text in texts[1:]]
+        text = form.format(*texts)
+        self.put(f"{into.at(names)} = {f'(wide)({text})' if kind == WIDE else text};")
+        self.close(len(names))
+        return into
+
+    def _plain_type(self, value: Value, otherwise: str) -> str:
+        """That of the numbers of an array."""
+        if isinstance(value, View):
+            return value.kind
+        kinds = {self.type_of(entry) for entry in value.ravel()}
+        return kinds.pop() if len(kinds) == 1 else otherwise
+
+    def one(self, name: str, form: str, parts: list, kind: str):
+        """One number: its variable, or what it is known to be."""
+        known = simpler(name, parts)
+        if known is not None:
+            return known
+        texts = list(map(text_of, parts))
+        if kind == "double" and any(isinstance(part, str) and self.type_of(part) == WIDE for part in parts):
+            kind = WIDE
+            if name == "select_n":
+                texts[1:] = [self.as_type(part, WIDE) for part in parts[1:]]
+        return self.line(form.format(*texts), kind)
+
+    def folded(self, name: str, value: Value, axes, kind: str) -> Value:
+        """A reduction over some axes."""
+        if value.size > FEW and not is_known(value):
+            return self._folded_in_loops(name, self.view(value, kind), axes)
+        value = self.entries(value)
+        for axis in sorted(axes, reverse=True):
+            parts = np.moveaxis(value, axis, 0)
+            value = np.asarray(parts[0], object)
+            for part in parts[1:]:
+                value = self.each(name, BY_NUMBER[name], [value, np.asarray(part, object)], kind)
+        return value
+
+    def _folded_in_loops(self, name: str, value: View, axes) -> Value:
+        kept = [axis for axis in range(value.ndim) if axis not in axes]
+        into, form = self.new([value.shape[axis] for axis in kept], value.kind), BY_NUMBER[name]
+        if name in ("max", "min") and value.kind == "double":
+            form = form.replace(" ?", " || {0} != {0} ?")
+        outer = self.loops(into.shape)
+        total = self.name(value.kind, "s")
+        neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)
+        first = dict.fromkeys(axes, "0") | dict(zip(kept, outer, strict=True))
+        start = value.at([first[axis] for axis in range(value.ndim)]) if neutral is None else neutral
+        self.put(f"{value.kind} {total} = ({value.kind})({start});")
+        inner = self.loops([value.shape[axis] for axis in axes])
+        place = dict(zip(axes, inner, strict=True)) | dict(zip(kept, outer, strict=True))
+        self.put(f"{total} = {form.format(total, value.at([place[axis] for axis in range(value.ndim)]))};")
+        self.close(len(inner))
+        self.put(f"{into.at(outer)} = {total};")
+        self.close(len(outer))
+        return self.small(into)
+
+    def place(self, entry, most: int):
+        """An index, kept between zero and the most, as JAX keeps it."""
+        if not isinstance(entry, str):
+            return min(max(int(entry), 0), most)
+        return self.line(f"({entry} < 0 ? 0 : ({entry} > {most} ? {most} : (int)({entry})))", "int")
+
+    # What loops and branches change.
+
+    def changed(self, value: Value, kind: str) -> Value:
+        """A variable, or a C array, that begins with this value."""
+        if value.shape == ():
+            found = self.name(kind, "w")
+            self.put(f"{kind} {found} = {self.as_type(self.entries(value).item(), kind)};")
+            return of_text(found)
+        into = self.new(value.shape, kind)
+        self.copy(value, into.base, kind)
+        return self.small(into)
+
+    def unset(self, shape, kind: str) -> Value:
+        """The same, without a value yet."""
+        if shape == ():
+            found = self.name(kind, "w")
+            self.put(f"{kind} {found};")
+            return of_text(found)
+        return self.small(self.new(shape, kind))
+
+    def assign(self, targets: Sequence[Value], values: Sequence[Value]) -> None:
+        """Give these variables and arrays their new values, all at once."""
+        bases = {base_of(target) for target in targets}
+        moves = []
+        for target, value in zip(targets, values, strict=True):
+            if target.size == 0 or same(target, value):
+                continue
+            # What is itself changed by this is copied before.
+            if isinstance(value, View):
+                if value.base in bases:
+                    copied = self.new(value.shape, value.kind)
+                    self.copy(value, copied.base, value.kind)
+                    value = copied
+            else:
+                value = np.array([self._kept(entry, bases) for entry in value.ravel()], object).reshape(value.shape)
+            moves.append((target, value))
+        for target, value in moves:
+            if target.shape == ():
+                variable = target.item()
+                kind = self.type_of(variable)
+                self.put(f"{variable} = {self.as_type(self.entries(value).item(), kind)};")
+            else:
+                self.copy(value, base_of(target), self.types[base_of(target)])
+
+    def _kept(self, entry, bases: set[str]):
+        if not isinstance(entry, str) or entry.partition("[")[0] not in bases:
+            return entry
+        kind = self.type_of(entry)
+        found = self.name(kind)
+        self.put(f"const {kind} {found} = {entry};")
+        return found

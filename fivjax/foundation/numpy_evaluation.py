@@ -1,0 +1,202 @@
+"""A traced function computed by NumPy, equation by equation: for small functions of known values.
+
+XLA takes longer to compile such a function than NumPy takes for a hundred calls.
+"""
+
+import functools
+from collections import Counter
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Jaxpr, Literal
+
+from .compiling import compiled, transformed
+from .kernel_text import Form
+from .taylor import within
+
+# Calls after which it is compiled.
+REPAID = 100
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# What NumPy has for primitives, by name; the rest is left to JAX, which compiles a program for each.
+KNOWN: dict[str, Callable] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "sqrt": np.sqrt,
+    "square": np.square,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+    "max": np.maximum,
+    "min": np.minimum,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "not": np.invert,
+    "is_finite": np.isfinite,
+    "stop_gradient": np.asarray,
+    "copy": np.asarray,
+    "copy_p": np.asarray,
+}
+WITH_PARAMETERS: dict[str, Callable] = {
+    "div": lambda a, b, p: a / b if np.issubdtype(np.result_type(a), np.inexact) else None,
+    "integer_pow": lambda a, p: a ** p["y"] if p["y"] >= 0 else 1.0 / a ** -p["y"],
+    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
+    "convert_element_type": lambda a, p: np.asarray(a).astype(p["new_dtype"]),
+    "reshape": lambda a, p: np.reshape(a, p["new_sizes"]),
+    "squeeze": lambda a, p: np.squeeze(a, tuple(p["dimensions"])),
+    "transpose": lambda a, p: np.transpose(a, p["permutation"]),
+    "slice": lambda a, p: a[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * a.ndim))],
+    "concatenate": lambda *a: np.concatenate(a[:-1], a[-1]["dimension"]),
+    "stack": lambda *a: np.stack(a[:-1], a[-1]["axis"]),
+    "broadcast_in_dim": lambda a, p: _broadcast(a, p["shape"], p["broadcast_dimensions"]),
+    "reduce_sum": lambda a, p: np.sum(a, axis=tuple(p["axes"])),
+    "reduce_max": lambda a, p: np.max(a, axis=tuple(p["axes"])),
+    "reduce_min": lambda a, p: np.min(a, axis=tuple(p["axes"])),
+    "reduce_and": lambda a, p: np.all(a, axis=tuple(p["axes"])),
+    "reduce_or": lambda a, p: np.any(a, axis=tuple(p["axes"])),
+    "select_n": lambda which, *cases: _selected(which, cases[:-1]),
+    "dot_general": lambda a, b, p: _product(a, b, p["dimension_numbers"]),
+}
+
+
+def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
+    """`compiled`, but the first calls with known values are computed by NumPy; results are then arrays of NumPy."""
+    otherwise = compiled(function)
+    traced: dict = {}
+    calls: Counter = Counter()
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if transformed((args, kwargs)):
+            return otherwise(*args, **kwargs)
+        form, arrays = Form.of((args, kwargs))
+        calls[form] += 1
+        if calls[form] > REPAID:
+            return otherwise(*args, **kwargs)
+        if form not in traced:
+            with jax.enable_x64(True):
+                like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
+                structures = []
+
+                def flat(arrays):
+                    own, named = form.args(arrays)
+                    leaves, structure = jax.tree.flatten(function(*own, **named))
+                    structures.append(structure)
+                    return leaves
+
+                traced[form] = jax.make_jaxpr(flat)(like), structures[-1]
+        closed, structure = traced[form]
+        given = [np.asarray(leaf, array.dtype) for leaf, array in zip(arrays, form.arrays, strict=True)]
+        # As in JAX, what is no number comes without a warning.
+        with np.errstate(all="ignore"):
+            return jax.tree.unflatten(structure, _run(closed.jaxpr, closed.consts, given))
+
+    return call
+
+
+def _run(jaxpr: Jaxpr, consts, given) -> list:
+    known = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+    known |= dict(zip(jaxpr.invars, given, strict=True))
+
+    def read(atom):
+        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else known[atom]
+
+    for equation in jaxpr.eqns:
+        results = _applied(equation, list(map(read, equation.invars)))
+        for variable, result in zip(equation.outvars, results, strict=True):
+            known[variable] = np.asarray(result, variable.aval.dtype)
+    return list(map(read, jaxpr.outvars))
+
+
+def _applied(equation, operands: list) -> list:
+    primitive, params = equation.primitive, equation.params
+    name = primitive.name
+    if name in LOOPS:
+        return LOOPS[name](params, operands)
+    called = within(params)
+    if called is not None:
+        return _run(called.jaxpr, called.consts, operands)
+    if name in KNOWN:
+        return [KNOWN[name](*operands)]
+    if name in WITH_PARAMETERS:
+        found = WITH_PARAMETERS[name](*operands, params)
+        if found is not None:
+            return [found]
+    with jax.enable_x64(True):
+        found = primitive.bind(*map(jnp.asarray, operands), **params)
+    return list(found) if primitive.multiple_results else [found]
+
+
+def _broadcast(array, shape, along):
+    own = [1] * len(shape)
+    for axis, size in zip(along, np.shape(array), strict=True):
+        own[axis] = size
+    return np.broadcast_to(np.reshape(array, own), shape)
+
+
+def _selected(which, cases):
+    if np.ndim(which) == 0:
+        return cases[int(which)]
+    return np.choose(np.asarray(which, int), cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
+
+
+def _product(left, right, numbers):
+    (along_left, along_right), batch = numbers
+    return None if any(batch) else np.tensordot(left, right, (along_left, along_right))
+
+
+def _while(params, operands: list) -> list:
+    condition, body = params["cond_jaxpr"], params["body_jaxpr"]
+    asked = operands[: params["cond_nconsts"]]
+    fixed = operands[len(asked) :][: params["body_nconsts"]]
+    carry = operands[len(asked) + len(fixed) :]
+    while _run(condition.jaxpr, condition.consts, [*asked, *carry])[0]:
+        carry = _run(body.jaxpr, body.consts, [*fixed, *carry])
+    return carry
+
+
+def _scan(params, operands: list) -> list:
+    body, length = params["jaxpr"], params["length"]
+    fixed, carry = operands[: params["num_consts"]], operands[params["num_consts"] :][: params["num_carry"]]
+    along, rows = operands[len(fixed) + len(carry) :], []
+    for k in range(length)[:: -1 if params["reverse"] else 1]:
+        found = _run(body.jaxpr, body.consts, [*fixed, *carry, *(array[k] for array in along)])
+        rows.append(found[len(carry) :])
+        carry = found[: len(carry)]
+    rows = rows[:: -1 if params["reverse"] else 1]
+    shapes = [np.zeros((0, *variable.aval.shape)) for variable in body.jaxpr.outvars[len(carry) :]]
+    return [*carry, *(map(np.stack, zip(*rows, strict=True)) if rows else shapes)]
+
+
+def _cond(params, operands: list) -> list:
+    index, *rest = operands
+    branch = params["branches"][int(np.clip(int(index), 0, len(params["branches"]) - 1))]
+    return _run(branch.jaxpr, branch.consts, rest)
+
+
+def _solved(params, operands: list) -> list:
+    lengths, solve = params["const_lengths"], params["jaxprs"].solve
+    ends = np.cumsum(lengths).tolist()
+    end = ends[list(lengths._fields).index("solve")]
+    return _run(solve.jaxpr, solve.consts, [*operands[end - lengths.solve : end], *operands[ends[-1] :]])
+
+
+LOOPS: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _solved}
