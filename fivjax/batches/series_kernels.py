@@ -15,7 +15,7 @@ from ..contact import Contact
 from ..cycles.around import higher_peak
 from ..cycles.section_map import MOST_TO_CROSSING
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
+from ..foundation.kernel_functions import WIDTHS, KernelFunction
 from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -26,8 +26,6 @@ from .sharing import Batch, Shared, with_values
 
 # Rows of numbers for a kernel are put together for so many bytes at a time.
 AT_A_TIME = 2**26
-# Directions side by side in the derivative of a return map: as few of these as serve, or several calls with the most.
-WIDTHS = (1, 2, 4, 8, 16)
 
 
 class Following(eqx.Module):
@@ -139,9 +137,8 @@ class SeriesKernels:
         """Trajectories so many steps further, in place."""
         columns, now = trajectories.tree
         now = eqx.tree_at(lambda now: now.steps, now, None, is_leaf=lambda leaf: leaf is None)
-        steps = np.asarray(steps, np.int32)
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.of_group, columns, now))
-        form, _ = Form.of((self.of_all, *first, steps))
+        form, _ = Form.of((self.of_all, *first, np.asarray(steps, np.int32)))
         of_all = _row((self.of_all,))
         own = trajectories.numbers
         size, begin = own.shape[1], columns.shape[-1]
@@ -175,14 +172,15 @@ class SeriesKernels:
         wide = tuple(
             array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays)
         )
-        found, slopes = None, []
+        slopes = []
         width = next((width for width in WIDTHS if width >= size), WIDTHS[-1])
         for start in range(0, size, width):
             directions = np.eye(size, size + width)[:, start : start + width]
-            found, dots = _return.derived_of_many(form, given, np.zeros(1), wide, directions, self.pool)
+            _, dots = _return.derived_of_many(form, given, np.zeros(1), wide, directions, self.pool)
             slopes.append(dots[0])
-        (y, status, direction, _, time, _), _ = found
-        return (y, status.astype(np.int32), direction, time), np.concatenate(slopes, axis=-1)[..., :size]
+        slopes = np.concatenate(slopes, axis=-1)[..., :size]
+        (y, status, direction, _, time, _), _ = _return.of_many(form, given, np.zeros(1), self.pool)
+        return (y, status.astype(np.int32), direction, time), slopes
 
     def _section_rows(self, group, y, status, direction, crossings, peaks: bool):
         crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))

@@ -62,9 +62,7 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     parts = {}
     for batch in np.ndindex(places.shape[:-1]):
         starts = [of_numbers(0)] * view.ndim
-        for axis, of_batch in zip(
-            numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True
-        ):
+        for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
             starts[axis] = of_numbers(batch[of_batch])
         for position, axis in enumerate(numbers.start_index_map):
             starts[axis] = np.asarray(places[(*batch, position)], object)
@@ -221,9 +219,9 @@ def _same_bits(writer: Writer, equation, operands, kind: str) -> Value:
     return found
 
 
-def _product(writer: Writer, left: Value, right: Value, numbers, kind: str) -> Value:
+def _product(writer: Writer, equation, operands, kind: str) -> Value:
     """A product of matrices, vectors or batches of them."""
-    along, batch = numbers
+    (left, right), (along, batch) = operands, equation.params["dimension_numbers"]
     kept = [
         [axis for axis in range(part.ndim) if axis not in (*own, *shared)]
         for part, own, shared in zip((left, right), along, batch, strict=True)
@@ -278,9 +276,7 @@ RULES: dict[str, Callable] = {
     "argmin": _best_place("<"),
     "sort": _sort,
     "bitcast_convert_type": _same_bits,
-    "dot_general": lambda writer, equation, operands, kind: _product(
-        writer, *operands, equation.params["dimension_numbers"], kind
-    ),
+    "dot_general": _product,
 }
 RULES |= {name: _running(of) for name, of in RUNNING.items()}
 RULES |= {

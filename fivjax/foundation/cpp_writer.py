@@ -160,7 +160,7 @@ class Writer:
 
     def run(self, jaxpr: Jaxpr, consts, given: Sequence[Value]) -> list[Value]:
         """The results of a traced function."""
-        known = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
+        known: dict = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
         known.update(zip(jaxpr.invars, given, strict=True))
 
         def read(atom) -> Value:

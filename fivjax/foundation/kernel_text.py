@@ -92,10 +92,11 @@ class Text(NamedTuple):
 
     def widths(self) -> tuple[int, int, int, int]:
         """How many numbers each of these rows has, at least one."""
-        return tuple(
+        ends, rows, end_dots, row_dots = (
             max(sum(place.size for place in places), 1)
             for places in (self.ends, self.rows, self.end_dots, self.row_dots)
         )
+        return ends, rows, end_dots, row_dots
 
 
 def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
@@ -181,7 +182,7 @@ class _WriterOfKernel:
             raise NotImplementedError(
                 "A kernel's function must go along its instants by one `scan`, and use them nowhere else."
             )
-        known = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
+        known: dict = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
         known |= dict(zip(numbers[: self.given], _given(writer, "given", numbers[: self.given]), strict=True))
         known |= dict(zip(numbers[self.given :], _given(writer, "dots", numbers[self.given :]), strict=True))
         known[instants] = View("instants", (0,), (2,), (1,), "double")

@@ -98,7 +98,7 @@ def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
 
                 def flat(arrays):
                     own, named = form.args(arrays)
-                    leaves, structure = jax.tree.flatten(function(*own, **named))
+                    leaves, structure = jax.tree.flatten(function(*own, **named))  # pyright: ignore[reportCallIssue]
                     structures.append(structure)
                     return leaves
 

@@ -1,6 +1,6 @@
 """NVIDIA Warp, where it is installed: kernels of one thread for each trajectory, on a CPU or on GPUs.
 
-It is an extra (`pip install "fivjax[gpu]"`), so it is imported only where it is used.
+It comes with fivjax where it has wheels. It is imported only where it is used, because that takes a third of a second.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ def _initialised():
     except ImportError:
         raise ImportError(
             "This run's trajectories are followed by kernels of Warp, which is not installed here. Install it with "
-            '`pip install "fivjax[gpu]"` on all machines of the run, or on none.'
+            "`pip install warp-lang` on all machines of the run, or on none."
         ) from None
     with _quietly(wp), _without_stderr():
         if not _has_place(wp):

@@ -83,7 +83,7 @@ class EventExact(AbstractStepper):
         # Steps end at jumps of the load, so the load at mid-step is that of the whole step.
         load = args.load(0.5 * (t0 + t1))
         after = follow(self, mechanics, contact, load, y0, t1 - t0)
-        dense_info = dict(y0=y0, contact=contact, mechanics=mechanics, load=load, stepper=self)
+        dense_info = {"y0": y0, "contact": contact, "mechanics": mechanics, "load": load, "stepper": self}
         result = diffrax.RESULTS.where(after.enough, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
         return after.y, None, dense_info, StepperState(mechanics, after.contact), result
 
