@@ -1,6 +1,11 @@
 """Files of others, damaged or hostile: what is wrong with them is said in a sentence, and no other file is read."""
 
+import os
+import shutil
 import struct
+import subprocess
+import sys
+from importlib.util import find_spec
 
 import h5py
 import numpy as np
@@ -9,6 +14,7 @@ import xarray as xr
 from scipy import io, sparse
 
 import fivjax as fj
+from fivjax.io import reading_process, separate_reading
 
 
 def test_sparse_matrices_of_every_kind_are_what_scipy_saved(tmp_path):
@@ -120,3 +126,41 @@ def test_hostile_attributes(scene):
     for kind in (fj.Scene, fj.Trajectory):
         with pytest.raises(ValueError, match=r"argument `dataset` is damaged|Argument `dataset` must carry a scene"):
             kind.from_dataset(xr.Dataset(attrs={"scene": scene}))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the process that does not start is a shell script")
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("exit 3", "was not read: the process that reads it, `.*python`, did not start"),
+        # What takes too long after its start is ended.
+        ("echo started; exec sleep 60", "its library fell over it, or did not come to an end"),
+    ],
+)
+def test_a_process_that_does_not_start_or_end(tmp_path, monkeypatch, script, said):
+    path, command = tmp_path / "run.nc", tmp_path / "python"
+    with h5py.File(path, "w") as file:
+        file["x"] = np.arange(4)
+    command.write_text(f"#!{shutil.which('sh')}\n{script}\n")
+    command.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(command))
+    monkeypatch.setattr(separate_reading, "PATIENCE", -3.9)  # s, to which come 4 s for a file as short as this
+    with pytest.raises(ValueError, match=said):
+        fj.open(path)
+
+
+@pytest.mark.skipif(find_spec("pyyeti") is None, reason="OUTPUT4 needs pyyeti")
+def test_output4_is_read_without_the_other_modules_of_its_library(tmp_path):
+    """They take longer to import than a damaged file may take to be refused."""
+    code = (
+        "import importlib.util, sys; "
+        "found = importlib.util.spec_from_file_location('reading_process', sys.argv[1]); "
+        "module = importlib.util.module_from_spec(found); found.loader.exec_module(module); "
+        "module.import_libraries('output4'); print(*sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, reading_process.__file__], capture_output=True, text=True, check=True
+    )
+    imported = set(done.stdout.split())
+    assert "pyyeti.nastran.op4" in imported
+    assert not imported & {"pyyeti.nastran.bulk", "matplotlib", "pandas", "numba"}

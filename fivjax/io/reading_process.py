@@ -9,12 +9,21 @@ Nothing is pickled.
 import json
 import math
 import sys
+import types
+from importlib.util import find_spec
 
 # Filters of the HDF5 library itself (deflate, shuffle, Fletcher's checksum, SZIP, N-bit, scale and offset) and of h5py (LZF).
 # For any other one, the library would look for code to load.
 FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 # Groups and datasets of a file; attributes of each; characters of their text.
 OBJECTS, ATTRIBUTES, TEXT = 20_000, 5_000, 2**28
+# What each function here needs, and the line that says that it has been imported: the time of a reading counts from there.
+LIBRARIES = {
+    "netcdf": ("h5netcdf",),
+    "matlab": ("h5py",),
+    "output4": ("numpy", "scipy.sparse", "pyyeti.nastran.op4"),
+}
+STARTED = b"started\n"
 
 
 class Refused(Exception):
@@ -100,7 +109,7 @@ def matlab(path: str, send) -> None:
 
 def output4(path: str, send) -> None:
     """Send the matrices of an OUTPUT4 file: sizes, and rows, columns and values of the entries under `name/part`."""
-    from pyyeti.nastran import op4
+    import pyyeti.nastran.op4 as op4
     from scipy import sparse
 
     for name, matrix in op4.read(path, sparse=True, justmatrix=True).items():
@@ -218,12 +227,22 @@ def limit(memory: int, seconds: int) -> None:
         pass
 
 
+def import_libraries(kind: str) -> None:
+    """Import what a function here needs."""
+    found = find_spec("pyyeti") if kind == "output4" else None
+    if found is not None and "pyyeti.nastran" not in sys.modules:
+        # By itself the package would import all of its modules, with Matplotlib, pandas and Numba: two seconds for nothing.
+        package = types.ModuleType("pyyeti.nastran")
+        package.__path__ = [f"{folder}/nastran" for folder in found.submodule_search_locations or ()]
+        sys.modules["pyyeti.nastran"] = package
+    for library in LIBRARIES[kind]:
+        __import__(library)
+
+
 if __name__ == "__main__":
     # Before the limits, so that it does not count.
-    if sys.argv[1] == "output4":
-        import pyyeti.nastran.op4  # noqa: F401
-    else:
-        import h5netcdf  # noqa: F401
-
+    import_libraries(sys.argv[1])
     limit(int(sys.argv[3]), int(sys.argv[4]))
+    sys.stdout.buffer.write(STARTED)
+    sys.stdout.buffer.flush()
     run(sys.argv[1], sys.argv[2], sys.stdout.buffer)

@@ -17,9 +17,10 @@ import numpy as np
 from . import reading_process
 from .reading_limits import COPIES, PACKED, SMALL, check_declared, free_memory, unreadable
 
-# Memory that the process may take beside the data, bytes; time of a processor that it may take, s, and how many bytes it must
-# read in one; how much longer it may take by the clock, s, where others use the machine.
-BESIDE, SECONDS, PATIENCE = 2**28, 3, 20
+# Memory that the process may take beside the data, bytes; time of a processor, s, that it may take beside what it needs to read
+# so many bytes in one; how long it may take by the clock, s, beside four times as long, because others use the machine. A small
+# file is then done with within eight seconds of the start of the process, which a slow disk delays, but no file.
+BESIDE, SECONDS, PATIENCE, START = 2**28, 3, 4, 60
 RATES = {"netcdf": 10_000_000, "matlab": 10_000_000, "output4": 500_000}
 
 
@@ -71,21 +72,42 @@ def _reading(path: Path, what: str, length: int) -> Iterator[IO[bytes]]:
     free = free_memory()
     memory = COPIES * max(SMALL, PACKED * length)
     memory = BESIDE + (memory if free is None else min(memory, free))
-    seconds = SECONDS + math.ceil(length / RATES[what])
-    command = [sys.executable, "-P", reading_process.__file__, what, str(path.absolute()), str(memory), str(seconds)]
+    needed = math.ceil(length / RATES[what])
+    command = [
+        sys.executable,
+        "-P",
+        reading_process.__file__,
+        what,
+        str(path.absolute()),
+        str(memory),
+        str(SECONDS + needed),
+    ]
     # It finds what this process finds, and starts no threads.
     own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         command, env={**os.environ, **own}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )
-    late = threading.Timer(PATIENCE + 4 * seconds, process.kill)
-    late.daemon = True
-    late.start()
     assert process.stdout is not None
+    late = _killed_after(START, process)
     try:
+        started = process.stdout.readline()
+        late.cancel()
+        if started != reading_process.STARTED:
+            raise ValueError(
+                f"File `{path}` was not read: the process that reads it, `{sys.executable}`, did not start. Free some memory, "
+                f"and see whether Python imports {', '.join(reading_process.LIBRARIES[what])}."
+            )
+        late = _killed_after(PATIENCE + 4 * needed, process)
         yield process.stdout
     finally:
         late.cancel()
         process.kill()
         process.stdout.close()
         process.wait()
+
+
+def _killed_after(seconds: float, process: subprocess.Popen) -> threading.Timer:
+    late = threading.Timer(seconds, process.kill)
+    late.daemon = True
+    late.start()
+    return late
