@@ -1,15 +1,17 @@
 """Damage to what is kept of compiled code, and kills while it, or a result, is written.
 
-    python tests/measure_caches.py [damages] [maps] [kills]
+    python tests/measure_caches.py [damages] [maps] [kills] [calibrations]
 
 Each word picks one study; without any, all run. `CACHES_MAPS` sets how many runs of `fivjax map` with damaged files there are (20
-unless given). Right is: what is read is what was written, or nothing; a map of damaged files has the bits of one without any;
+unless given), `FIVJAX_TIMES` how many kills of `fivjax calibrate` (50). Right is: what is read is what was written, or nothing; a map of damaged files has the bits of one without any;
 a killed writer leaves the old file or the new one, and the next writer leaves nothing else.
 """
 
+import contextlib
 import itertools
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,12 +21,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import recordings
 import xarray as xr
 
 import fivjax as fj
 from fivjax.foundation import kept_folder, kept_kernels
 
 FLIPS, KILLS, MAPS = 200, 50, int(os.environ.get("CACHES_MAPS", "20"))
+CALIBRATIONS = int(os.environ.get("FIVJAX_TIMES", "50"))
 
 
 def a_map(folder: Path, name: str) -> tuple[int, str, xr.Dataset | None]:
@@ -155,11 +159,52 @@ def kills(folder: Path) -> None:
         )
 
 
+def calibrations(folder: Path) -> None:
+    """`fivjax calibrate` killed at random instants, often while it keeps what it compiled: the next one comes to the same."""
+    table, cache, rng = folder / "decay.csv", folder / "of_fits", random.Random(3)
+    table.write_text(recordings.sample(), encoding="utf-8")
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    fit = [sys.executable, "-m", "fivjax.cli", "calibrate", str(table), "--free", "mu", "c1", "k1", "--starts", "1"]
+
+    def begun(name: str) -> subprocess.Popen:
+        command = [*fit, "--overwrite", "--out", str(folder / name)]
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def found(name: str) -> dict[str, bytes]:
+        return {str(key): part.values.tobytes() for key, part in fj.open(folder / f"{name}.nc").data_vars.items()}
+
+    began = time.monotonic()
+    assert begun("fit").wait() == 0
+    took = time.monotonic() - began
+    expected, whole, same = found("fit"), 0, 0
+    for k in range(CALIBRATIONS):
+        if k % 10 == 0:
+            shutil.rmtree(cache)
+        killed = begun("fit")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            killed.wait(rng.uniform(0.02, 1.0) * took)
+        killed.kill()
+        killed.wait()
+        # What was there before, or the same anew.
+        whole += found("fit") == expected
+        if k % 10 == 9 or k == CALIBRATIONS - 1:
+            began = time.monotonic()
+            same += begun("after").wait() == 0 and found("after") == expected
+            took = max(0.5 * took, time.monotonic() - began)
+    after = -(-CALIBRATIONS // 10)
+    print(
+        f"calibrations: {CALIBRATIONS} kills, {whole} left the result whole; of {after} after ten kills each, {same} the same bits"
+    )
+
+
 def main(names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if not names or "kills" in names:
             kills(folder)
+        if not names or "calibrations" in names:
+            calibrations(folder)
         if not names or {"damages", "maps"} & set(names):
             code, error, expected = a_map(folder, "whole")
             assert code == 0 and expected is not None, error
