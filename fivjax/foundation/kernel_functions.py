@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Float
 
 from .forking import refuse_if_forked
@@ -307,6 +307,16 @@ def _batched(operands, axes, *, kernel: _Hashed):
 
 
 batching.primitive_batchers[kernel_p] = _batched
+
+
+def _no_second_derivative(primals, tangents, **_):
+    raise NotImplementedError(
+        "A kernel has first derivatives only. Take second ones without `jax.jit` inside of them: then the motion is followed "
+        "by XLA's programs, which have them."
+    )
+
+
+ad.primitive_jvps[kernel_p] = _no_second_derivative
 
 
 def _lowered(given, dots, instants, *, kernel: _Hashed):
