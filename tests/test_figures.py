@@ -31,7 +31,7 @@ def measured(start: str) -> str:
     return found
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/methods.md", "docs/howto/gpu.md"])
+@pytest.mark.parametrize("page", ["docs/methods.md", "docs/howto/gpu.md"])
 def test_what_kernels_gain_is_as_measured(page):
     """ "A tenth of the time" is the ratio of two measured times, rounded to a tenth."""
     with_kernels, without = map(

@@ -131,5 +131,5 @@ def test_numpy_computes_what_jax_does():
         expected = with_loops(*args)
     found = by_numpy(with_loops)(*args)
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert isinstance(own, np.ndarray)
+        assert isinstance(own, np.ndarray | np.generic)
         np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-13)

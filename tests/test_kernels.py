@@ -176,7 +176,7 @@ def test_a_map_over_masses_by_kernels_is_that_of_each_structure(paper_scene):
 def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "warp", None)
     warp_library._initialised.cache_clear()
-    with pytest.raises(ImportError, match=r'pip install "fivjax\[gpu\]"'):
+    with pytest.raises(ImportError, match="pip install warp-lang"):
         warp()
     monkeypatch.undo()
     assert warp() is not None

@@ -15,7 +15,7 @@ from ..contact import Contact
 from ..cycles.around import higher_peak
 from ..cycles.section_map import MOST_TO_CROSSING
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import WIDTHS, KernelFunction
+from ..foundation.kernel_functions import KernelFunction, width_for
 from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -173,7 +173,7 @@ class SeriesKernels:
             array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays)
         )
         slopes = []
-        width = next((width for width in WIDTHS if width >= size), WIDTHS[-1])
+        width = width_for(size, given.shape[1])
         for start in range(0, size, width):
             directions = np.eye(size, size + width)[:, start : start + width]
             _, dots = _return.derived_of_many(form, given, np.zeros(1), wide, directions, self.pool)

@@ -76,7 +76,8 @@ def kept_value(make: Callable[..., R], *args, folder: Path | None = None) -> R:
     """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs, or in a
     folder that has been checked.
     """
-    path = _place(make, _folder() or "", None, args) if folder is None else _named(make, folder, None, args)
+    named = None if folder is None else _named(make, None, args)
+    path = _place(make, _folder() or "", None, args) if folder is None or named is None else folder / named
     if path is None:
         return make(*args)
     found = _found(path, from_text)
@@ -134,13 +135,14 @@ def _program(
 
 def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
     """The file for what a function makes of such arguments; none where these cannot be named, or nothing can be kept."""
-    place = folder_to_keep_in(folder) if folder else None
-    return None if place is None else _named(function, place, structure, rest)
+    named = _named(function, structure, rest) if folder else None
+    place = None if named is None else folder_to_keep_in(folder)
+    return None if place is None or named is None else place / named
 
 
-def _named(function: Callable, folder: Path, structure, rest: tuple) -> Path | None:
+def _named(function: Callable, structure, rest: tuple) -> str | None:
     try:
-        return folder / f"{function.__name__}-{_digest(function, structure, rest)}"
+        return f"{function.__name__}-{_digest(function, structure, rest)}"
     except (_Foreign, pickle.PicklingError, AttributeError, TypeError):
         return None
 

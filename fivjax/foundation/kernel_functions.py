@@ -30,11 +30,19 @@ from .warp_library import ONE_AT_A_TIME, folder_of_texts, load, warp
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
 WIDTHS = (1, 2, 4, 8, 16)
+# And no more than so many numbers, because a thread's stack holds them.
+MOST_SIDE_BY_SIDE = 2**14
 # Parts of a call's work for each thread, because some trajectories take longer.
 AT_A_TIME = 4
 # The arrays of every kernel, with their axes: over trajectories, then as said.
 GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
+
+
+def width_for(directions: int, numbers: int) -> int:
+    """How many directions a kernel has side by side, for so many to come and so many numbers that it is given."""
+    most = max((width for width in WIDTHS if width * numbers <= MOST_SIDE_BY_SIDE), default=1)
+    return min(next((width for width in WIDTHS if width >= directions), WIDTHS[-1]), most)
 
 
 class KernelFunction:
@@ -160,8 +168,7 @@ def _compiled(source: str, widths: tuple[int, ...], directions: int, width: int)
     wide = f"double wide __attribute__((ext_vector_type({width}), aligned(8)))" if width > 1 else "double wide"
     body = f"""
 typedef {wide};
-const long lane_ = lane;
-const int count = instants_.shape[1];
+const long long lane_ = lane, count = instants_.shape[1];
 const double* given = given_.data + lane_ * given_.shape[1];
 const wide* dots = (const wide*)dots_.data;
 const double* instants = instants_.data + (instants_.shape[0] == 1 ? 0 : lane_) * count;
@@ -215,7 +222,7 @@ def _values_jvp(function: KernelFunction, form: Form, primals, tangents):
     total, start, ends, rows, of_ends, of_rows = len(moving), 0, None, None, 0.0, 0.0
     while start < total:
         left = total - start
-        width = next((width for width in WIDTHS if width >= left), WIDTHS[-1])
+        width = width_for(left, sum(array.size for array in form.arrays))
         # One direction for each number that is perturbed.
         directions = np.eye(total)[:, start : start + width]
         directions = np.pad(directions, ((0, 0), (0, width - directions.shape[1])))

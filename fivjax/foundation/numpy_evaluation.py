@@ -107,7 +107,9 @@ def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
         given = [np.asarray(leaf, array.dtype) for leaf, array in zip(arrays, form.arrays, strict=True)]
         # As in JAX, what is no number comes without a warning.
         with np.errstate(all="ignore"):
-            return jax.tree.unflatten(structure, _run(closed.jaxpr, closed.consts, given))
+            found = _run(closed.jaxpr, closed.consts, given)
+        # Numbers are NumPy's own, which Python's functions take.
+        return jax.tree.unflatten(structure, [leaf[()] for leaf in found])
 
     return call
 

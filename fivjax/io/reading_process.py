@@ -17,12 +17,13 @@ from importlib.util import find_spec
 FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 # Groups and datasets of a file; attributes of each; characters of their text.
 OBJECTS, ATTRIBUTES, TEXT = 20_000, 5_000, 2**28
-# What each function here needs, and the line that says that it has been imported: the time of a reading counts from there.
+# The libraries of each function here.
 LIBRARIES = {
     "netcdf": ("h5netcdf",),
     "matlab": ("h5py",),
     "output4": ("numpy", "scipy.sparse", "pyyeti.nastran.op4"),
 }
+# The line that says that what a function here needs has been imported: the time of a reading counts from there.
 STARTED = b"started\n"
 
 
@@ -235,8 +236,14 @@ def import_libraries(kind: str) -> None:
         package = types.ModuleType("pyyeti.nastran")
         package.__path__ = [f"{folder}/nastran" for folder in found.submodule_search_locations or ()]
         sys.modules["pyyeti.nastran"] = package
-    for library in LIBRARIES[kind]:
-        __import__(library)
+    if kind == "netcdf":
+        import h5netcdf  # noqa: F401
+    elif kind == "matlab":
+        import h5py  # noqa: F401
+    else:
+        import numpy  # noqa: F401
+        import pyyeti.nastran.op4  # noqa: F401
+        import scipy.sparse  # noqa: F401
 
 
 if __name__ == "__main__":

@@ -1,0 +1,111 @@
+"""What a first call costs in a fresh process, and what later calls cost: trajectories, their derivatives, cycles, kicks, branches.
+
+    python tests/measure_engine.py first    # CPU seconds of fresh processes, in those of a first solve of diffrax in the same run
+    python tests/measure_engine.py warm     # milliseconds of calls after the first
+
+`first` runs every call twice in a cache of kernels of its own: with nothing built, and with the kernels that the first run
+kept. A process' CPU seconds include its imports and all threads. Ratios are what counts: the machine may be busy, and a solve of
+diffrax in the same minutes is as slow as the rest.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+
+SCENE = """
+import fivjax as fj
+scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
+"""
+DERIVATIVE = (
+    SCENE
+    + """
+import jax
+def loss(mu, k1):
+    one = fj.Scene(fj.belt_oscillator(k1=k1), fj.Coulomb(mu), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
+    return (fj.simulate(one, 1.0, 1e-2).velocity ** 2).sum()
+with jax.enable_x64(True):
+    jax.block_until_ready(jax.grad(loss, (0, 1))(0.227, 100e3))
+"""
+)
+DIFFRAX = """
+import diffrax, jax.numpy as jnp
+diffrax.diffeqsolve(diffrax.ODETerm(lambda t, y, args: -y), diffrax.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(6)).ys.block_until_ready()
+"""
+CALLS = {
+    "simulate": SCENE + "fj.simulate(scene, 1.0)",
+    "grad of a loss on simulate": DERIVATIVE,
+    "limit_cycle": SCENE + "fj.limit_cycle(scene)",
+    "saddle_cycle": SCENE + "fj.saddle_cycle(scene)",
+    "critical_perturbation, derivatives": SCENE + "fj.critical_perturbation(scene, derivatives=True)",
+    "continue_cycle": SCENE + "fj.continue_cycle(scene, 'mu', (0.2, 0.25))",
+}
+
+
+def cpu_seconds(code: str, cache: str) -> float:
+    """Of a fresh process that runs this."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    env = {**os.environ, "WARP_CACHE_PATH": cache}
+    subprocess.run([sys.executable, "-c", code], check=True, env=env, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def first(names) -> None:
+    print("| first call in a fresh process | CPU, s | in first solves of diffrax | with nothing built, s | the same |")
+    print("|---|---|---|---|---|")
+    for name in names:
+        with tempfile.TemporaryDirectory() as cache:
+            own = [(cpu_seconds(CALLS[name], cache), cpu_seconds(DIFFRAX, cache)) for _ in range(2)]
+        (built, solve), (kept, again) = own
+        print(f"| {name} | {kept:.2f} | {kept / again:.2f} | {built:.2f} | {built / solve:.2f} |", flush=True)
+
+
+def finished(function, *args) -> None:
+    import jax
+
+    jax.block_until_ready(function(*args))
+
+
+def warm() -> None:
+    import jax
+    import numpy as np
+
+    import fivjax as fj
+
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
+    names = ("m1", "m2", "c1", "c2", "k1", "k2", "theta", "mu", "belt_speed", "force", "p", "duration")
+
+    def milliseconds(call, repeats: int = 30) -> float:
+        for _ in range(3):
+            call()
+        times = []
+        for _ in range(repeats):
+            begin = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - begin)
+        return 1e3 * float(np.median(times))
+
+    for _ in range(120):
+        fj.simulate(scene, 0.01)
+    print(f"simulate, 1 s, 10,001 rows: {milliseconds(lambda: fj.simulate(scene, 1.0)):.2f} ms")
+    print(f"simulate, 1 s, 101 rows: {milliseconds(lambda: fj.simulate(scene, 1.0, 1e-2)):.2f} ms")
+    with jax.enable_x64(True):
+        for count in (2, len(names)):
+            some = names[7 : 7 + count] if count == 2 else names
+            values = np.array([float(scene.parameters[name]) for name in some])
+
+            def of(values, some=some):
+                one = scene.replace(**dict(zip(some, values, strict=True)))
+                return (fj.simulate(one, 1.0, 1e-2).velocity ** 2).sum()
+
+            both = jax.jit(jax.value_and_grad(of))
+            taken = milliseconds(functools.partial(finished, both, values))
+            print(f"value and gradient by {count}, jitted: {taken:.2f} ms")
+
+
+if __name__ == "__main__":
+    kind, *names = sys.argv[1:]
+    first(names or CALLS) if kind == "first" else warm()
