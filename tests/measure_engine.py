@@ -8,6 +8,7 @@ kept. A process' CPU seconds include its imports and all threads. Ratios are wha
 diffrax in the same minutes is as slow as the rest.
 """
 
+import functools
 import os
 import resource
 import subprocess
