@@ -6,12 +6,14 @@ certain to fade, or for ten thousand periods.
     python tests/measure_verdicts.py folds [--kicks K]
     python tests/measure_verdicts.py maps [--side N]
     python tests/measure_verdicts.py tori [--structures N] [--kicks K] [--seed S]
+    python tests/measure_verdicts.py falling [--structures N] [--kicks K] [--seed S]
     python tests/measure_verdicts.py contacts [--structures N] [--kicks K] [--seed S]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value; a
 disagreement counts unless the reference itself says otherwise of a kick that differs by 1e-14 to 1e-11;
 `folds` tries friction just below that at which the paper's limit cycle ends; `maps` the paper's map at belt speeds 1 and
-0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `contacts` structures with two to
+0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `falling` such oscillators under friction
+that falls with slip speed; `contacts` structures with two to
 four contacts in as many scenes at once, each contact against `oracle` (`--kicks`: states tried in each scene); `cases` scenes
 that once had wrong verdicts. `--threads` is for the reference only.
 """
@@ -311,6 +313,21 @@ def tori(structures, kicks, seed, threads):
     print(f"trajectories by attractor: {dict(kinds)}")
 
 
+def falling(structures, kicks, seed, threads):
+    """Oscillators about the paper's under friction that falls with slip speed: small maps over static friction and kick."""
+    rng = np.random.default_rng(seed)
+    tally = Tally()
+    usual = fj.belt_oscillator().parameters
+    for i in range(structures):
+        parts = {name: float(usual[name]) * float(np.exp(rng.uniform(-0.2, 0.2))) for name in usual if name != "theta"}
+        mu, fall, decay, v = (float(rng.uniform(*ends)) for ends in ((0.05, 0.25), (0.01, 0.1), (0.2, 3.0), (0.5, 4.0)))
+        law = fj.ExponentialDecay(mu + fall, mu, decay)
+        scene = fj.Scene(fj.belt_oscillator(**parts), law, v, load=fj.Pulse(100.0, 1.2))
+        axes = {"mu_static": mu + fall * np.linspace(1.0, 1.5, 3), "p": np.sort(rng.uniform(1.0, 4.0, kicks))}
+        compare(tally, scene, False, f"[{i}] v={v!r} law={law} {parts}", threads, **axes)
+    tally.show()
+
+
 # ------------------------------------------------------------------------------------------------------------- contacts
 
 
@@ -531,7 +548,7 @@ def cases(names):
 def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori", "contacts"])
+    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori", "falling", "contacts"])
     parser.add_argument("names", nargs="*", choices=[[], *CASES], help="which cases")
     parser.add_argument("--structures", type=int, default=500)
     parser.add_argument("--kicks", type=int, default=40)
@@ -541,6 +558,8 @@ def main():
     chosen = parser.parse_args()
     if chosen.study == "random":
         random(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
+    elif chosen.study == "falling":
+        falling(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
     elif chosen.study == "tori":
         tori(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
     elif chosen.study == "contacts":
