@@ -9,6 +9,7 @@ import pytest
 
 from fivjax.foundation.kernel_functions import KernelFunction
 from fivjax.foundation.kernel_text import Form
+from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
 
 
@@ -116,6 +117,25 @@ def test_a_batch_is_what_single_calls_are():
     rows = np.array([np.concatenate([one.ravel(), matrix.ravel(), [count]]) for one in x.reshape(-1, 4)])
     ends, _ = KERNEL.of_many(form, rows, instants)
     np.testing.assert_array_equal(ends["y"].reshape(3, 2, 4), found[0])
+
+
+@pytest.mark.parametrize("size", [3, 7])
+def test_solutions_of_systems_have_tangents(size):
+    """Small systems are eliminated in a row, larger ones in a loop."""
+    random = np.random.default_rng(size)
+    matrix, right = random.normal(size=(size, size)) + 3 * np.eye(size), random.normal(size=(size, 2))
+    kernel = KernelFunction(lambda args, instants: (solve(*args), ()))
+
+    def of_kernel(matrix, right):
+        return jnp.sum(kernel((matrix, right), np.zeros(1))[0] ** 2)
+
+    def of_jax(matrix, right):
+        return jnp.sum(jnp.linalg.solve(matrix, right) ** 2)
+
+    with jax.enable_x64(True):
+        expected, found = (jax.grad(of, (0, 1))(matrix, right) for of in (of_jax, of_kernel))
+    for own, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-11, atol=1e-12)
 
 
 def test_what_a_kernel_cannot_do_is_said():

@@ -55,12 +55,16 @@ def _eliminated(matrix, right):
     n = matrix.shape[0]
     index = np.arange(n)
 
-    def further(k, table):
-        pivot, swapped, _ = _pivoted(table, k)
-        pivot = pivot / pivot[k]
-        return jnp.where((index == k)[:, None], pivot, swapped - swapped[:, k, None] * pivot)
+    # Apart from each other, because in a kernel the right side may be tangents, and the matrix none.
+    def further(k, sides):
+        matrix, right = sides
+        pivot, swapped, place = _pivoted(matrix, k)
+        own, right = _with_row_at(right, k, place)
+        at_k, factors, divisor = (index == k)[:, None], swapped[:, k, None], pivot[k]
+        pivot, own = pivot / divisor, own / divisor
+        return jnp.where(at_k, pivot, swapped - factors * pivot), jnp.where(at_k, own, right - factors * own)
 
-    return _repeated(n, further, jnp.concatenate([matrix, right.reshape(n, -1)], axis=1))[:, n:].reshape(right.shape)
+    return _repeated(n, further, (matrix, right.reshape(n, -1)))[1].reshape(right.shape)
 
 
 def _pivoted(table, k):
@@ -71,9 +75,13 @@ def _pivoted(table, k):
     size = jnp.where(index >= k, jnp.abs(table[:, k]), -1.0)
     # By sums and comparisons, because indices that differ within a batch would be gathered system by system.
     place = jnp.min(jnp.where(size == jnp.max(size), index, table.shape[0]))
-    chosen = (index == place)[:, None]
-    pivot = jnp.sum(jnp.where(chosen, table, 0.0), axis=0)
-    return pivot, jnp.where(chosen, table[k], table), place
+    return *_with_row_at(table, k, place), place
+
+
+def _with_row_at(table, k, place):
+    """The row at a place, and the table with row k there."""
+    chosen = (np.arange(table.shape[0]) == place)[:, None]
+    return jnp.sum(jnp.where(chosen, table, 0.0), axis=0), jnp.where(chosen, table[k], table)
 
 
 def _repeated(count: int, further, value):
