@@ -125,7 +125,7 @@ class SeriesKernels:
 
     def __init__(self, batch: Batch, shared: Flattened):
         tree = shared.tree
-        self.batch, self.pool, self.tree = batch, batch.pool, tree
+        self.pool = batch.pool
         self.for_conclusions = for_conclusions(shared)
         self.of_all = Following(batch.scene, batch.names, batch.history, batch.method)
         self.of_group = (tree.values, tree.mechanics, tree.weights, tree.longest_return)
@@ -169,9 +169,9 @@ class SeriesKernels:
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
         form, given = self._section_rows(group, y, status, direction, crossings, False)
         size = y.shape[1]
-        wide = tuple(
-            array.shape == (size,) and place == self._place_of_state for place, array in enumerate(form.arrays)
-        )
+        # The state comes after what is the group's.
+        state = len(jax.tree.leaves(self.on_section))
+        wide = tuple(place == state for place in range(len(form.arrays)))
         slopes = []
         width = width_for(size, given.shape[1])
         for start in range(0, size, width):
@@ -187,7 +187,6 @@ class SeriesKernels:
         rows = (np.asarray(y), np.asarray(status, np.int32), np.asarray(direction, float), crossings)
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.on_section, *rows))
         form, _ = Form.of((Asked(peaks), *first))
-        self._place_of_state = len(jax.tree.leaves(self.on_section))
         own = [part.reshape(len(y), -1).astype(float) for part in rows]
         return form, np.concatenate([self.section_table[group], *own], axis=1)
 

@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .cpp_arrays import Value, View
 from .cpp_numbers import WIDE, kind_of, text_of
 from .cpp_writer import Writer
-from .taylor import within
+from .taylor import solution, within
 
 
 def _while(writer: Writer, equation, operands) -> list[Value]:
@@ -89,11 +88,8 @@ def _cond(writer: Writer, equation, operands) -> list[Value]:
 
 def _solved(writer: Writer, equation, operands) -> list[Value]:
     """`custom_linear_solve`, by the solution that it was given."""
-    lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-    ends = np.cumsum(lengths).tolist()
-    place = list(lengths._fields).index("solve")
-    own = operands[ends[place] - lengths.solve : ends[place]]
-    return writer.run(solve.jaxpr, solve.consts, [*own, *operands[ends[-1] :]])
+    solve, given = solution(equation.params, operands)
+    return writer.run(solve.jaxpr, solve.consts, given)
 
 
 RULES: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _solved}

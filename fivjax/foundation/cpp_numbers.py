@@ -115,6 +115,11 @@ def text_of(entry) -> str:
     return f"({entry!r})"
 
 
+def keeping_nan(name: str, form: str, kind: str) -> str:
+    """The form of a primitive; of two numbers, the larger or smaller is no number where the first is none, as in JAX."""
+    return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form
+
+
 def without_repeats(value: Value) -> Value:
     """The value with one entry along axes along which it has been broadcast."""
     if isinstance(value, View) or value.ndim == 0 or value.size == 0:

@@ -23,6 +23,7 @@ from .cpp_numbers import (
     WIDE,
     base_of,
     converted,
+    keeping_nan,
     kind_of,
     of_known,
     same,
@@ -228,8 +229,7 @@ class Writer:
 
     def each(self, name: str, form: str, operands: Sequence[Value], kind: str) -> Value:
         """The same for each number."""
-        if name in ("max", "min") and kind == "double":
-            form = form.replace(" ?", " || {0} != {0} ?")  # not a number stays that, as in JAX
+        form = keeping_nan(name, form, kind)
         shape = np.broadcast_shapes(*(part.shape for part in operands))
         if count_of(shape) > FEW and not all(map(is_known, operands)):
             return self._each_in_loops(name, form, operands, kind, shape)
@@ -293,9 +293,8 @@ class Writer:
 
     def _folded_in_loops(self, name: str, value: View, axes) -> Value:
         kept = [axis for axis in range(value.ndim) if axis not in axes]
-        into, form = self.new([value.shape[axis] for axis in kept], value.kind), BY_NUMBER[name]
-        if name in ("max", "min") and value.kind == "double":
-            form = form.replace(" ?", " || {0} != {0} ?")
+        into = self.new([value.shape[axis] for axis in kept], value.kind)
+        form = keeping_nan(name, BY_NUMBER[name], value.kind)
         outer = self.loops(into.shape)
         total = self.name(value.kind, "s")
         neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)

@@ -76,8 +76,11 @@ def kept_value(make: Callable[..., R], *args, folder: Path | None = None) -> R:
     """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs, or in a
     folder that has been checked.
     """
-    named = None if folder is None else _named(make, None, args)
-    path = _place(make, _folder() or "", None, args) if folder is None or named is None else folder / named
+    if folder is None:
+        path = _place(make, _folder() or "", None, args)
+    else:
+        named = _named(make, None, args)
+        path = None if named is None else folder / named
     if path is None:
         return make(*args)
     found = _found(path, from_text)

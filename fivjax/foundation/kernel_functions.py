@@ -98,10 +98,9 @@ class Kernel:
 
     def __init__(self, function: KernelFunction, form: Form, wide: tuple[bool, ...], width: int):
         own = function.differentiated if width else function.function
-        self.form, self.width = form, width
+        self.width = width
         self.text = text(kept_value(written, own, form, wide, folder=folder_of_texts()))
         self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
-        self.numbers = sum(array.size for array in form.arrays)
         with ONE_AT_A_TIME:
             self.kernel = _compiled(self.text.source, self.text.widths(), self.directions, width)
 

@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr, Literal
 
 from .compiling import compiled, transformed
 from .kernel_text import Form
-from .taylor import within
+from .taylor import solution, within
 
 # Calls after which it is compiled.
 REPAID = 100
@@ -195,10 +195,8 @@ def _cond(params, operands: list) -> list:
 
 
 def _solved(params, operands: list) -> list:
-    lengths, solve = params["const_lengths"], params["jaxprs"].solve
-    ends = np.cumsum(lengths).tolist()
-    end = ends[list(lengths._fields).index("solve")]
-    return _run(solve.jaxpr, solve.consts, [*operands[end - lengths.solve : end], *operands[ends[-1] :]])
+    solve, given = solution(params, operands)
+    return _run(solve.jaxpr, solve.consts, given)
 
 
 LOOPS: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _solved}

@@ -59,6 +59,14 @@ def within(params) -> ClosedJaxpr | None:
     return None
 
 
+def solution(params, operands: Sequence) -> tuple[ClosedJaxpr, list]:
+    """The traced function by which an equation `custom_linear_solve` is solved, and its operands."""
+    lengths, solve = params["const_lengths"], params["jaxprs"].solve
+    ends = np.cumsum(lengths).tolist()
+    end = ends[list(lengths._fields).index("solve")]
+    return solve, [*operands[end - lengths.solve : end], *operands[ends[-1] :]]
+
+
 def _through(function: Callable, *parts: Series) -> list:
     # Not the function itself, which may be a module: JAX would look for a name in it.
     closed = jax.make_jaxpr(lambda *values: function(*values))(*(part.terms[0] for part in parts))

@@ -89,7 +89,7 @@ def _followed(args, instants, method: EventExact):
         return _next_step(scene, mechanics, method, accounts_of, now)
 
     def to_row(carry, instant):
-        now, lost, unbounded, ending = carry
+        now, lost, ending = carry
 
         def going(now: Step) -> Bool[Array, ""]:
             return (now.end < instant) & (now.count < most)
@@ -113,7 +113,7 @@ def _followed(args, instants, method: EventExact):
         )
         failing = ~lost & (beyond | ~finite | short)
         ending = jnp.where(failing, failure, ending).astype(jnp.int32)
-        lost, unbounded = lost | failing, unbounded | beyond
+        lost = lost | failing
         y, ledger = jax.tree.map(
             lambda leaf: jnp.where(lost, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, (y, ledger)
         )
@@ -122,11 +122,11 @@ def _followed(args, instants, method: EventExact):
         contact = settled(mechanics, now.contact, load, y, on_jump)
         row = _row(mechanics, accounts_of, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
-        return (now, lost, unbounded, ending), row
+        return (now, lost, ending), row
 
     instants_begin = begin.t
-    start = begin, none, none, jnp.asarray(Ending.FINISHED, jnp.int32)
-    (_, _, _, ending), rows = jax.lax.scan(to_row, start, instants)
+    start = begin, none, jnp.asarray(Ending.FINISHED, jnp.int32)
+    (_, _, ending), rows = jax.lax.scan(to_row, start, instants)
     return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
 
 
