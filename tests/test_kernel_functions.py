@@ -153,3 +153,27 @@ def test_numpy_computes_what_jax_does():
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert isinstance(own, np.ndarray | np.generic)
         np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-13)
+
+
+def test_numpy_reads_and_writes_the_places_of_arrays_that_jax_does():
+    """Against JAX's own `gather` and `scatter`, by the forms of indexing that it writes them for."""
+    from fivjax.foundation.numpy_evaluation import by_numpy
+
+    a, where = np.arange(24.0).reshape(4, 6), np.array([2, 0, 3])
+    forms = [
+        lambda a, at: a[at],
+        lambda a, at: a[:, at],
+        lambda a, at: a[at, at],
+        lambda a, at: a[jnp.ix_(at, at)],
+        lambda a, at: jax.vmap(lambda row, i: row[i])(a[:3], at),
+        lambda a, at: jax.vmap(lambda row, i: jax.lax.dynamic_slice(row, (i,), (2,)))(a[:3], at),
+        lambda a, at: a.at[at].set(-1.0),
+        lambda a, at: a.at[:, at].set(jnp.arange(3.0)),
+        lambda a, at: a.at[at, 1].add(jnp.arange(3.0)),
+        lambda a, at: a.at[jnp.array([1, 1]), 1].add(2.0),
+        lambda a, at: a.at[at + 2, 0].set(-1.0),  # one of them outside
+        lambda a, at: jnp.argmax(a, axis=1) + jnp.max(a[:, ::-1], axis=1),
+        lambda a, at: jnp.take(a, at, axis=1, mode="clip"),
+    ]
+    for form in forms:
+        np.testing.assert_array_equal(by_numpy(form)(a, where), form(jnp.asarray(a), jnp.asarray(where)))

@@ -212,12 +212,12 @@ def test_a_grazing_dip_inside_one_advance_is_found():
     with jax.enable_x64(True):
         for depth in (1e-1, 1e-4, 1e-8, 1e-12):
             # (x - 0.6)² - depth: positive at both ends, two roots in between.
-            c = [jnp.array([0.36 - depth]), jnp.array([-1.2]), jnp.array([1.0])]
+            c = jnp.array([[0.36 - depth], [-1.2], [1.0]])
             x, fires = march(c)
             assert bool(fires[0])
             assert float(x[0]) == pytest.approx(0.6 - np.sqrt(depth), abs=1e-7)
             # And raised by as much, it stays clear: no event.
-            c = [jnp.array([0.36 + depth]), jnp.array([-1.2]), jnp.array([1.0])]
+            c = jnp.array([[0.36 + depth], [-1.2], [1.0]])
             assert not bool(march(c)[1][0])
 
 
@@ -229,7 +229,7 @@ def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
     coefficients = rng.normal(size=(400, 8)) / np.arange(1, 9)
     coefficients[:, 0] = np.abs(coefficients[:, 0]) + 1e-3
     with jax.enable_x64(True):
-        x, fires = map(np.asarray, jax.jit(_march_to_roots)([jnp.asarray(column) for column in coefficients.T]))
+        x, fires = map(np.asarray, jax.jit(_march_to_roots)(jnp.asarray(coefficients.T)))
     for row, position, fired in zip(coefficients, x, fires, strict=True):
         roots = np.roots(row[::-1])
         real = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0) & (roots.real < 1)].real)
@@ -255,7 +255,7 @@ def test_a_guard_about_to_run_out_is_not_taken_for_one_that_has_just_begun():
     with jax.enable_x64(True):
 
         def march(*c):
-            x, fires = jax.jit(_march_to_roots)([jnp.array([ck]) for ck in c])
+            x, fires = jax.jit(_march_to_roots)(jnp.array(c)[:, None])
             return float(x[0]), bool(fires[0])
 
         assert march(1e-14, -1.0, 0.5) == (0.0, True)

@@ -85,7 +85,7 @@ def _to_crossings(args, instants, method: EventExact):
         after, states, unit = method.with_series(mechanics, way.contact, zero, way.y, way.left, True)
         peak = way.peak
         if asked.peaks:
-            peak = higher_peak(mechanics, jnp.stack(states), after.h, after.h / unit, peak)
+            peak = higher_peak(mechanics, states, after.h, after.h / unit, peak)
         return Way(
             after.y,
             after.contact,

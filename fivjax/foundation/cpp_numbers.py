@@ -1,12 +1,10 @@
 """Numbers in C++ code that is being written: their types, the text of arithmetic, and what is known of it beforehand."""
 
-from collections.abc import Callable
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .cpp_arrays import Value, View, of_numbers
+from .numpy_primitives import applied
 
 # Types in C++. What is wide is declared by the kernel: so many numbers in double precision.
 WIDE = "wide"
@@ -72,29 +70,6 @@ BY_NUMBER = {
 }
 # What leaves each number as it is.
 SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
-# The commonest arithmetic of numbers that are known; the rest is left to JAX, which compiles a program for each.
-OF_NUMBERS: dict[str, Callable] = {
-    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
-    "convert_element_type": lambda a, p: a.astype(p["new_dtype"]),
-    "add": lambda a, b, _: a + b,
-    "sub": lambda a, b, _: a - b,
-    "mul": lambda a, b, _: a * b,
-    "neg": lambda a, _: -a,
-    "abs": lambda a, _: np.abs(a),
-    "square": lambda a, _: a * a,
-    "max": lambda a, b, _: np.maximum(a, b),
-    "min": lambda a, b, _: np.minimum(a, b),
-    "eq": lambda a, b, _: a == b,
-    "ne": lambda a, b, _: a != b,
-    "lt": lambda a, b, _: a < b,
-    "le": lambda a, b, _: a <= b,
-    "gt": lambda a, b, _: a > b,
-    "ge": lambda a, b, _: a >= b,
-    "and": lambda a, b, _: a & b,
-    "or": lambda a, b, _: a | b,
-}
-
-
 COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne", "is_finite")
 
 
@@ -184,9 +159,4 @@ def of_known(equation, operands: list[Value]) -> list[Value]:
         np.array(part.tolist(), atom.aval.dtype).reshape(part.shape)
         for part, atom in zip(operands, equation.invars, strict=True)
     ]
-    name = equation.primitive.name
-    if name in OF_NUMBERS:
-        found = OF_NUMBERS[name](*values, equation.params)
-    else:
-        found = equation.primitive.bind(*map(jnp.asarray, values), **equation.params)
-    return list(map(of_numbers, found if equation.primitive.multiple_results else [found]))
+    return list(map(of_numbers, applied(equation, values)))

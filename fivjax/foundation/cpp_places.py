@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers, reshaped
 from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
 from .cpp_writer import FEW, Writer
+from .numpy_primitives import gathered_places, scattered_places
 
 # Reductions, by the primitive that they repeat, and running totals.
 FOLDED = {
@@ -53,7 +52,10 @@ def _dynamic_update_slice(writer: Writer, equation, operands, kind: str) -> Valu
 def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     value, places = operands
     if is_known(places):
-        return _moved_to(equation, [writer.entries(value)], places)
+        found = gathered_places(value.shape, places, equation.params)
+        if found is None:
+            raise NotImplementedError("Places outside of an array have no C++ here; keep the indices within it.")
+        return np.asarray(writer.entries(value).ravel()[found], object)
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     view, places = writer.view(value, kind), writer.entries(places)
     one_of_each = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -75,27 +77,25 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
 
 
 def _scatter(writer: Writer, equation, operands, kind: str) -> Value:
-    value, places, update = operands
-    if is_known(places):
-        return _moved_to(equation, [writer.entries(value), writer.entries(update)], places)
+    if is_known(operands[1]):
+        return _at_known(writer, equation, operands, lambda before, own: own)
     return _put_at(writer, equation, operands, kind, "=")
 
 
 def _scatter_add(writer: Writer, equation, operands, kind: str) -> Value:
-    value, places, update = operands
-    if not is_known(places):
+    if not is_known(operands[1]):
         return _put_at(writer, equation, operands, kind, "+=")
-    value, update = writer.entries(value), writer.entries(update)
-    numbers = np.arange(1, update.size + 1).reshape(update.shape)
-    places = np.array(places.tolist(), np.int32).reshape(places.shape)
-    put = np.asarray(
-        jax.lax.scatter(np.zeros(value.shape, numbers.dtype), places, numbers, equation.params["dimension_numbers"])
+    return _at_known(
+        writer, equation, operands, lambda before, own: writer.one("add", BY_NUMBER["add"], [before, own], kind)
     )
-    found = value.copy()
-    for place in zip(*np.nonzero(put), strict=True):
-        more = update.ravel()[put[place] - 1]
-        found[place] = writer.one("add", BY_NUMBER["add"], [value[place], more], kind)
-    return found
+
+
+def _at_known(writer: Writer, equation, operands, put: Callable) -> np.ndarray:
+    value, places, update = operands
+    found, update_entries = writer.entries(value).ravel().copy(), writer.entries(update).ravel()
+    for place, own in scattered_places(value.shape, places, update.shape, equation.params):
+        found[place] = put(found[place], update_entries[own])
+    return found.reshape(value.shape)
 
 
 def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
@@ -116,20 +116,6 @@ def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
     for place, entry in np.ndenumerate(writer.entries(update)):
         writer.put(f"{part.at(place)} {how} {writer.as_type(entry, kind)};")
     return writer.small(into)
-
-
-def _moved_to(equation, moving: list[np.ndarray], places: np.ndarray) -> np.ndarray:
-    """Where the entries of operands go: the numbers of entries are moved in their stead."""
-    entries, numbers = [], []
-    for part in moving:
-        numbers.append(np.arange(len(entries), len(entries) + part.size).reshape(part.shape))
-        entries += list(part.ravel())
-    places = np.array(places.tolist(), np.int32).reshape(places.shape)
-    params = dict(equation.params)
-    if "fill_value" in params:
-        params["fill_value"] = None
-    found = equation.primitive.bind(*map(jnp.asarray, [numbers[0], places, *numbers[1:]]), **params)
-    return np.asarray(np.array([*entries, None], object)[np.asarray(found)], object)
 
 
 def _concatenate(writer: Writer, equation, operands, kind: str) -> Value:

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
 from .compiling import compiled, transformed
 from .kernel_text import Form
+from .numpy_primitives import applied
 from .taylor import solution, within
 
 # Calls after which it is compiled.
@@ -22,60 +22,6 @@ REPAID = 100
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-# What NumPy has for primitives, by name; the rest is left to JAX, which compiles a program for each.
-KNOWN: dict[str, Callable] = {
-    "add": np.add,
-    "add_any": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "neg": np.negative,
-    "abs": np.abs,
-    "sign": np.sign,
-    "sqrt": np.sqrt,
-    "square": np.square,
-    "exp": np.exp,
-    "log": np.log,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tanh": np.tanh,
-    "max": np.maximum,
-    "min": np.minimum,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "not": np.invert,
-    "is_finite": np.isfinite,
-    "stop_gradient": np.asarray,
-    "copy": np.asarray,
-    "copy_p": np.asarray,
-}
-WITH_PARAMETERS: dict[str, Callable] = {
-    "div": lambda a, b, p: a / b if np.issubdtype(np.result_type(a), np.inexact) else None,
-    "integer_pow": lambda a, p: a ** p["y"] if p["y"] >= 0 else 1.0 / a ** -p["y"],
-    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
-    "convert_element_type": lambda a, p: np.asarray(a).astype(p["new_dtype"]),
-    "reshape": lambda a, p: np.reshape(a, p["new_sizes"]),
-    "squeeze": lambda a, p: np.squeeze(a, tuple(p["dimensions"])),
-    "transpose": lambda a, p: np.transpose(a, p["permutation"]),
-    "slice": lambda a, p: a[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * a.ndim))],
-    "concatenate": lambda *a: np.concatenate(a[:-1], a[-1]["dimension"]),
-    "stack": lambda *a: np.stack(a[:-1], a[-1]["axis"]),
-    "broadcast_in_dim": lambda a, p: _broadcast(a, p["shape"], p["broadcast_dimensions"]),
-    "reduce_sum": lambda a, p: np.sum(a, axis=tuple(p["axes"])),
-    "reduce_max": lambda a, p: np.max(a, axis=tuple(p["axes"])),
-    "reduce_min": lambda a, p: np.min(a, axis=tuple(p["axes"])),
-    "reduce_and": lambda a, p: np.all(a, axis=tuple(p["axes"])),
-    "reduce_or": lambda a, p: np.any(a, axis=tuple(p["axes"])),
-    "select_n": lambda which, *cases: _selected(which, cases[:-1]),
-    "dot_general": lambda a, b, p: _product(a, b, p["dimension_numbers"]),
-}
-
 
 def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
     """`compiled`, but the first calls with known values are computed by NumPy; results are then arrays of NumPy."""
@@ -136,33 +82,7 @@ def _applied(equation, operands: list) -> list:
     called = within(params)
     if called is not None:
         return _run(called.jaxpr, called.consts, operands)
-    if name in KNOWN:
-        return [KNOWN[name](*operands)]
-    if name in WITH_PARAMETERS:
-        found = WITH_PARAMETERS[name](*operands, params)
-        if found is not None:
-            return [found]
-    with jax.enable_x64(True):
-        found = primitive.bind(*map(jnp.asarray, operands), **params)
-    return list(found) if primitive.multiple_results else [found]
-
-
-def _broadcast(array, shape, along):
-    own = [1] * len(shape)
-    for axis, size in zip(along, np.shape(array), strict=True):
-        own[axis] = size
-    return np.broadcast_to(np.reshape(array, own), shape)
-
-
-def _selected(which, cases):
-    if np.ndim(which) == 0:
-        return cases[int(which)]
-    return np.choose(np.asarray(which, int), cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
-
-
-def _product(left, right, numbers):
-    (along_left, along_right), batch = numbers
-    return None if any(batch) else np.tensordot(left, right, (along_left, along_right))
+    return applied(equation, operands)
 
 
 def _while(params, operands: list) -> list:

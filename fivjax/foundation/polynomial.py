@@ -20,6 +20,15 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
     return value, slope, bend
 
 
+def in_shares(c: Array, unit: Array) -> Array:
+    """The coefficients of the same polynomial where its argument is measured in another unit."""
+
+    def one(power, own):
+        return power * unit, own * power
+
+    return jax.lax.scan(one, jnp.ones_like(unit), c, unroll=True)[1]
+
+
 def ratio(above: Array, below: Array, otherwise: float) -> Array:
     """A ratio, or something else where the divisor is not positive."""
     return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), otherwise)
@@ -37,9 +46,16 @@ def extremum(c: Sequence[Array] | Array, x: Array, low: Array | float, high: Arr
 
 
 def _with_derivatives(c: Sequence[Array] | Array, x: Array, count: int) -> list[Array]:
-    found = [c[-1]] + [jnp.zeros_like(c[-1])] * count  # Taylor coefficients at x
-    for k in reversed(range(len(c) - 1)):
-        for j in reversed(range(1, count + 1)):
-            found[j] = found[j] * x + found[j - 1]
-        found[0] = found[0] * x + c[k]
+    c = c if hasattr(c, "shape") else jnp.stack(c)
+    zeros = [jnp.zeros_like(c[-1] * x)] * count
+    # A loop that XLA unrolls, and that kernels keep.
+    found, _ = jax.lax.scan(
+        lambda found, own: (_one_further(found, x, own), None), [c[-1] + zeros[0], *zeros], c[:-1], reverse=True, unroll=True
+    )
     return found[:2] + [math.factorial(j) * found[j] for j in range(2, count + 1)]
+
+
+def _one_further(found: list[Array], x: Array, coefficient: Array) -> list[Array]:
+    """Taylor coefficients at x, with one coefficient of the polynomial more."""
+    further = [found[j] * x + found[j - 1] for j in range(1, len(found))]
+    return [found[0] * x + coefficient, *further]

@@ -184,7 +184,7 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
         y=y,
         contact=contact,
         load=load,
-        series=jnp.stack(states),
+        series=states,
         unit=unit,
         ledger=now.ledger_end,
         end=jnp.where(arrived, until, t + after.h),

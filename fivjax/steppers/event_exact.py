@@ -20,7 +20,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import RESTING, largest_rounding, zero_at_start
 from ..foundation import arguments
-from ..foundation.polynomial import ratio, value_and_slope, value_slope_and_bend
+from ..foundation.polynomial import in_shares, ratio, value_and_slope, value_slope_and_bend
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
@@ -106,32 +106,28 @@ class EventExact(AbstractStepper):
         y: State,
         h: Float[Array, ""],
         at_section: bool = False,
-    ) -> tuple[Advance, list[State], Float[Array, ""]]:
+    ) -> tuple[Advance, Float[Array, "coefficient state"], Float[Array, ""]]:
         """The same, with the Taylor coefficients of the motion on the way, and the unit of their time, in s."""
         unit = time_unit(mechanics)
         series = _series(mechanics, contact, load, y, self.order_, unit)
-        states, guards = series.states, series.guards
+        states = series.states
         rounding = _rounding(mechanics, contact, load, y, unit, series.mode)
         # With several contacts, the two guards of the first, then those of the second, …
-        guards, rounding = [guard.ravel() for guard in guards], [row.ravel() for row in rounding]
+        guards, rounding = (rows.reshape(len(rows), -1) for rows in (series.guards, rounding))
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
         if at_section:
             # One more row for the rise through zero of the tangential velocity, no event of the contact.
-            rows = [-section_speed(mechanics, state) for state in states]
-            guards = [jnp.append(guard, row) for guard, row in zip(guards, rows, strict=True)]
+            rising = -jax.vmap(lambda state: section_speed(mechanics, state))(states)
+            guards = jnp.concatenate([guards, rising[:, None]], axis=1)
             # With several contacts, a small distance from the section is no rounding error.
-            rounding, exact = [jnp.append(row, 0.0) for row in rounding], jnp.append(exact, mechanics.several)
+            rounding = jnp.pad(rounding, ((0, 0), (0, 1)))
+            exact = jnp.append(exact, mechanics.several)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
-        power, scaled = jnp.ones_like(reach), []
-        for guard in guards:
-            scaled.append(guard * power)
-            power = power * reach
-        safe, fires = _march_to_roots(
-            [jax.lax.stop_gradient(c) for c in scaled], [r * reach**k for k, r in enumerate(rounding)], exact
-        )
+        scaled = in_shares(guards, reach)
+        safe, fires = _march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact)
         if at_section:
             watching = jnp.arange(count + 1) < count + before_section(mechanics, y)
             safe, fires = jnp.where(watching, safe, 1.0), fires & watching
@@ -165,7 +161,7 @@ class EventExact(AbstractStepper):
         states = _series(mechanics, contact, load, y, self.order_, unit).states
         points, weights = np.polynomial.legendre.leggauss(self.order_ // 2 + 2)
         times = 0.5 * (points + 1.0) * h
-        inside, _ = value_and_slope([state[None] for state in states], times[:, None] / unit)
+        inside, _ = value_and_slope(states[:, None], times[:, None] / unit)
         end, _ = value_and_slope(states, h / unit)
         return Within(inside, 0.5 * h * weights, times, end)
 
@@ -174,7 +170,7 @@ class EventExact(AbstractStepper):
     ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
         """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
         unit = time_unit(mechanics)
-        return jnp.stack(_series(mechanics, contact, load, y, self.order_, unit).states), unit
+        return _series(mechanics, contact, load, y, self.order_, unit).states, unit
 
     def in_one_mode(
         self,
@@ -229,10 +225,10 @@ def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
 class _Series(NamedTuple):
     """Taylor coefficients, in time measured in a unit; and the forces of the mode at the start."""
 
-    states: list[State]
-    guards: list[Float[Array, "*contacts 2"]]
-    slip: list[Float[Array, "*contacts"]]
-    friction: list[Float[Array, "*contacts"]]  # of μ; only its value, if it is constant
+    states: Float[Array, "k state"]
+    guards: Float[Array, "k *contacts 2"]
+    slip: Float[Array, "k *contacts"]
+    friction: Float[Array, "j *contacts"]  # of μ; only its value, if it is constant
     mode: ModeForces
 
 
@@ -247,25 +243,43 @@ def _series(
     n = y.shape[0] // 2
     slip = physics.slip_speed(mechanics, contact, y)
     friction = [mechanics.friction(slip)]
-    next_term = None if mechanics.friction.constant else mechanics.friction.in_time(slip, order)
     mode = ModeForces(mechanics, contact, friction[0])
-    states, guards, slips, normal_forces = [y], [], [], []
-    for k in range(order + 1):
-        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
-        free = physics.free_acceleration(own, force, states[k])
-        slips.append(physics.slip_speed(own, contact, states[k]))
-        otherwise = None
-        if k > 0 and next_term is not None:
-            friction.append(next_term(slips, friction))
-            otherwise = contact.direction * sum(
-                (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
-            )
+
+    def following(own: Mechanics, force, state: State, slip, otherwise, divisor):
+        """What follows from one coefficient of the state: the next, and those of the guards and of N."""
+        free = physics.free_acceleration(own, force, state)
         forces = mode.added(own, free, otherwise)
-        normal_forces.append(physics.total_forces(own, *forces)[1])
-        guards.append(physics.guards_under(own, contact, *forces, slips[k], physics.gap(own, states[k])))
-        rate = jnp.concatenate([states[k][n:], physics.acceleration_under(own, contact, free, *forces)])
-        states.append(rate * (unit / (k + 1)))
-    return _Series(states[: order + 1], guards, slips, friction, mode)
+        guards = physics.guards_under(own, contact, *forces, slip, physics.gap(own, state))
+        rate = jnp.concatenate([state[n:], physics.acceleration_under(own, contact, free, *forces)])
+        return rate * (unit / divisor), guards, physics.total_forces(own, *forces)[1]
+
+    changes, none = mechanics.homogeneous, jnp.zeros_like(load)
+    state, guards, normal_force = following(mechanics, load, y, slip, None, 1)
+    if mechanics.friction.constant:
+
+        def next_one(state: State, divisor):
+            slip = physics.slip_speed(changes, contact, state)
+            further, guards, _ = following(changes, none, state, slip, None, divisor)
+            return further, (state, guards, slip)
+
+        # A loop that XLA unrolls, and that kernels keep.
+        _, rows = jax.lax.scan(next_one, state, np.arange(2.0, order + 2.0, dtype=y.dtype), unroll=True)
+        first = y, guards, slip
+        states, guards, slips = (jnp.concatenate([one[None], more]) for one, more in zip(first, rows, strict=True))
+        return _Series(states, guards, slips, friction[0][None], mode)
+    next_term = mechanics.friction.in_time(slip, order)
+    states, all_guards, slips, normal_forces = [y], [guards], [slip], [normal_force]
+    for k in range(1, order + 1):
+        states.append(state)
+        slips.append(physics.slip_speed(changes, contact, state))
+        friction.append(next_term(slips, friction))
+        otherwise = contact.direction * sum(
+            (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
+        )
+        state, guards, normal_force = following(changes, none, state, slips[k], otherwise, k + 1)
+        all_guards.append(guards)
+        normal_forces.append(normal_force)
+    return _Series(*map(jnp.stack, (states, all_guards, slips, friction)), mode)
 
 
 def _rounding(
@@ -275,20 +289,24 @@ def _rounding(
     y: State,
     unit: Float[Array, ""],
     mode: ModeForces,
-) -> list[Float[Array, "*contacts 2"]]:
+) -> Float[Array, "3 *contacts 2"]:
     """Bounds on the rounding of the first three coefficients of the guards."""
     mechanics, contact, load, y, mode = jax.lax.stop_gradient((mechanics, contact, load, y, mode))
-    sizes, found = jnp.abs(y), []
-    for k in range(3):
-        own, force = (mechanics, load) if k == 0 else (mechanics.homogeneous, jnp.zeros_like(load))
+
+    def following(own: Mechanics, force, sizes: State, divisor):
         guards, rates = physics.magnitudes(own, contact, force, sizes, mode)
-        found.append(largest_rounding(guards))
-        sizes = rates * (unit / (k + 1))
-    return found
+        return rates * (unit / divisor), largest_rounding(guards)
+
+    sizes, first = following(mechanics, load, jnp.abs(y), 1)
+    changes, none = mechanics.homogeneous, jnp.zeros_like(load)
+    _, rest = jax.lax.scan(
+        lambda sizes, divisor: following(changes, none, sizes, divisor), sizes, np.array([2.0, 3.0], y.dtype), unroll=True
+    )
+    return jnp.concatenate([first[None], rest])
 
 
 def _together(
-    mechanics: Mechanics, scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], first: Float[Array, ""]
+    mechanics: Mechanics, scaled: Float[Array, "k g"], fires: Bool[Array, " g"], first: Float[Array, ""]
 ) -> Bool[Array, " g"]:
     """Which of the guards of several contacts that run out at the end of the advance are one event.
 
@@ -300,8 +318,9 @@ def _together(
     chosen = jax.lax.argmax(fires, 0, jnp.int32)
     among = physics.coupled_with(mechanics, jnp.minimum(chosen, count - 1) // 2)
     own = jnp.arange(count) // 2 == chosen // 2
-    values, slopes = value_and_slope([jax.lax.stop_gradient(c[:count]) for c in scaled], first)
-    size = sum(jnp.abs(c[:count]) for c in scaled)
+    own_guards = jax.lax.stop_gradient(scaled[:, :count])
+    values, slopes = value_and_slope(own_guards, first)
+    size = jnp.sum(jnp.abs(own_guards), axis=0)
     nearly = (values <= 64 * jnp.finfo(size.dtype).eps * size) & (slopes < 0)
     coupled = jnp.repeat(among, 2) & jnp.any(fires[:count])
     of_contacts = coupled & (fires[:count] | (nearly & ~own))
@@ -310,8 +329,8 @@ def _together(
 
 
 def _march_to_roots(
-    c: list[Float[Array, " g"]],
-    rounding: list[Float[Array, " g"]] | None = None,
+    c: Float[Array, "k g"],
+    rounding: Float[Array, "3 g"] | None = None,
     exact: Bool[Array, " g"] | None = None,
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
@@ -324,16 +343,28 @@ def _march_to_roots(
     start, a small value there is no rounding error. A march that uses up its steps has still shown that there is no root up to
     where it came.
     """
-    eps = jnp.finfo(c[0].dtype).eps
-    size = sum(jnp.abs(ck) for ck in c)
-    none = jnp.zeros_like(size)
-    rounding = [none] * 3 if rounding is None else rounding
+    eps = jnp.finfo(c.dtype).eps
+    none = jnp.zeros_like(c[0])
+    size, _ = jax.lax.scan(lambda size, own: (size + jnp.abs(own), None), none, c, unroll=True)
+    rounding = jnp.zeros((3, *none.shape), none.dtype) if rounding is None else rounding
     exact = jnp.zeros_like(size, bool) if exact is None else exact
-    for starts_at_zero in reversed(zero_at_start(c, size, rounding, exact)):
-        c = [jnp.where(starts_at_zero, following, own) for own, following in zip(c, [*c[1:], none], strict=True)]
-    falling = [jnp.maximum(-ck, 0.0) for ck in c]
-    bound_2 = sum(k * (k - 1) * fk for k, fk in enumerate(falling) if k > 1)
-    bound_3 = sum(k * (k - 1) * (k - 2) * fk for k, fk in enumerate(falling) if k > 2)
+    zeros = zero_at_start(c, size, rounding, exact)
+
+    def divided(carry, here):
+        """The coefficient that this one becomes, and what it adds to the bounds."""
+        (next_, next_but_one, third), bound_2, bound_3 = carry
+        own, k = here
+        after = next_, next_but_one, third
+        found = own
+        for place in range(3):
+            found = jnp.where(zeros[place], after[place], found)
+        falling = jnp.maximum(-found, 0.0)
+        bound_2 = bound_2 + k * (k - 1) * falling
+        bound_3 = bound_3 + k * (k - 1) * (k - 2) * falling
+        return ((own, next_, next_but_one), bound_2, bound_3), found
+
+    places = np.arange(len(c), dtype=c.dtype)
+    (_, bound_2, bound_3), c = jax.lax.scan(divided, ((none,) * 3, none, none), (c, places), reverse=True, unroll=True)
     huge = 1.0 / eps
 
     # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
@@ -364,7 +395,7 @@ def _march_to_roots(
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
 
 
-def _implicit(scaled: list[Float[Array, " g"]], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
+def _implicit(scaled: Float[Array, "k g"], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
     """The root with the derivatives of an implicit function.
 
     A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first

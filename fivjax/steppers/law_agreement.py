@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact, Status
-from ..foundation.polynomial import extremum, value_and_slope
+from ..foundation.polynomial import extremum, in_shares, value_and_slope
 from ..model.friction import AbstractFriction
 from .step_length import attainable
 
@@ -26,8 +26,8 @@ MOST_HALVINGS = 80
 def agreeing(
     law: AbstractFriction,
     contact: Contact,
-    friction: list[Float[Array, "*contacts"]],
-    slip: list[Float[Array, "*contacts"]],
+    friction: Float[Array, "k *contacts"],
+    slip: Float[Array, "k *contacts"],
     reach: Float[Array, ""],
     tolerance: float,
 ) -> Float[Array, ""]:
@@ -37,12 +37,7 @@ def agreeing(
     ends just beyond it, so that the next one begins on the other side of a kink.
     """
     law, friction, slip, reach = jax.lax.stop_gradient((law, friction, slip, reach))
-    power, mu, u = jnp.ones_like(reach), [], []
-    for own, speed in zip(friction, slip, strict=True):
-        mu.append(own * power)
-        u.append(speed * power)
-        power = power * reach
-    mu, u = jnp.stack(mu), jnp.stack(u)
+    mu, u = in_shares(friction, reach), in_shares(slip, reach)
     sliding = contact.status == Status.SLIDE
     eps = float(jnp.finfo(mu.dtype).eps)
     allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..contact import Mechanics, State
+from ..contact import Mechanics
 
 # The longest advance, in units of time. A block that is carried by the belt moves in a straight line, whose series ends at
 # once; powers of a longer time would overflow.
@@ -36,17 +36,17 @@ def attainable(tolerance: float, dtype) -> float:
     return max(tolerance, 0.25 * float(jnp.finfo(dtype).eps))
 
 
-def trusted(states: list[State], tolerance: float) -> Float[Array, ""]:
+def trusted(states: Float[Array, "k state"], tolerance: float) -> Float[Array, ""]:
     """How far the series is accurate, in its units of time: up to where its last two terms are `tolerance` of its first
     ones.
     """
-    order, n = len(states) - 1, states[0].shape[0] // 2
-    tolerance = attainable(tolerance, states[0].dtype)
+    order, n = len(states) - 1, states.shape[1] // 2
+    tolerance = attainable(tolerance, states.dtype)
 
     def size(k):
         return jax.lax.stop_gradient(jnp.max(jnp.abs(states[k][:n])))
 
-    tiny = float(jnp.finfo(states[0].dtype).tiny)
+    tiny = float(jnp.finfo(states.dtype).tiny)
     moves = (size(0) > 0) | (size(1) > 0)
     # At rest, but accelerated: a load has just jumped.
     starts = size(2) > 0
