@@ -1,0 +1,175 @@
+"""JAX's primitives by NumPy, for values that are known; and which places of arrays the indexing ones read and write."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+# By name, of operands alone.
+PLAIN: dict[str, Callable] = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "sqrt": np.sqrt,
+    "square": np.square,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tanh": np.tanh,
+    "max": np.maximum,
+    "min": np.minimum,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "not": np.invert,
+    "is_finite": np.isfinite,
+    "stop_gradient": np.asarray,
+    "copy": np.asarray,
+    "copy_p": np.asarray,
+}
+# By name, of operands and then the primitive's parameters; None where NumPy has no such case.
+WITH_PARAMETERS: dict[str, Callable] = {
+    "div": lambda a, b, p: a / b if np.issubdtype(np.result_type(a), np.inexact) else None,
+    "integer_pow": lambda a, p: a ** p["y"] if p["y"] >= 0 else 1.0 / a ** -p["y"],
+    "iota": lambda p: np.indices(p["shape"], p["dtype"])[p["dimension"]],
+    "convert_element_type": lambda a, p: np.asarray(a).astype(p["new_dtype"]),
+    "bitcast_convert_type": lambda a, p: (
+        np.asarray(a).view(p["new_dtype"]) if np.dtype(p["new_dtype"]).itemsize == a.dtype.itemsize else None
+    ),
+    "reshape": lambda a, p: np.reshape(a, p["new_sizes"]),
+    "squeeze": lambda a, p: np.squeeze(a, tuple(p["dimensions"])),
+    "transpose": lambda a, p: np.transpose(a, p["permutation"]),
+    "rev": lambda a, p: np.flip(a, p["dimensions"]),
+    "slice": lambda a, p: a[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * a.ndim))],
+    "dynamic_slice": lambda a, *rest: _sliced(a, rest[:-1], rest[-1]["slice_sizes"]),
+    "concatenate": lambda *a: np.concatenate(a[:-1], a[-1]["dimension"]),
+    "stack": lambda *a: np.stack(a[:-1], a[-1]["axis"]),
+    "broadcast_in_dim": lambda a, p: _broadcast(a, p["shape"], p["broadcast_dimensions"]),
+    "reduce_sum": lambda a, p: np.sum(a, axis=tuple(p["axes"])),
+    "reduce_max": lambda a, p: np.max(a, axis=tuple(p["axes"])) if a.size else None,
+    "reduce_min": lambda a, p: np.min(a, axis=tuple(p["axes"])) if a.size else None,
+    "reduce_and": lambda a, p: np.all(a, axis=tuple(p["axes"])),
+    "reduce_or": lambda a, p: np.any(a, axis=tuple(p["axes"])),
+    "argmax": lambda a, p: np.argmax(a, axis=p["axes"][0]),
+    "argmin": lambda a, p: np.argmin(a, axis=p["axes"][0]),
+    "select_n": lambda which, *cases: _selected(which, cases[:-1]),
+    "dot_general": lambda a, b, p: _product(a, b, p["dimension_numbers"]),
+    "gather": lambda a, places, p: _gathered(a, places, p),
+    "scatter": lambda a, places, update, p: _scattered(a, places, update, p, False),
+    "scatter-add": lambda a, places, update, p: _scattered(a, places, update, p, True),
+}
+
+
+def applied(equation, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """A primitive's results; what NumPy does not have is left to JAX, which compiles a program for it."""
+    primitive, params = equation.primitive, equation.params
+    name = primitive.name
+    if name in PLAIN:
+        return [PLAIN[name](*operands)]
+    if name in WITH_PARAMETERS:
+        found = WITH_PARAMETERS[name](*operands, params)
+        if found is not None:
+            return [found]
+    with jax.enable_x64(True):
+        found = primitive.bind(*map(jnp.asarray, operands), **params)
+    return list(found) if primitive.multiple_results else [found]
+
+
+def gathered_places(shape: tuple[int, ...], places, params) -> Int[np.ndarray, "..."] | None:
+    """The places in an array of this shape, flattened, that `gather` reads; None if some are outside of it."""
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    one_of_each = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [size for axis, size in enumerate(sizes) if axis not in one_of_each]
+    batch = places.shape[:-1]
+    flat = np.arange(np.prod(shape, dtype=int)).reshape(shape)
+    found = np.empty((*batch, *kept), int)
+    for at in np.ndindex(*batch):
+        start = [0] * len(shape)
+        for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
+            start[axis] = at[of_batch]
+        for axis, own in zip(numbers.start_index_map, places[at], strict=True):
+            start[axis] = int(own)
+        window = _window(shape, start, sizes, params["mode"])
+        if window is None:
+            return None
+        found[at] = flat[window].reshape(kept)
+    return np.moveaxis(found, range(len(batch), found.ndim), numbers.offset_dims)
+
+
+def scattered_places(shape: tuple[int, ...], places, update_shape: tuple[int, ...], params):
+    """Pairs of a place in an array of this shape and one in the update that `scatter` puts there, both flattened."""
+    numbers = params["dimension_numbers"]
+    one_of_each = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    kept = [axis for axis in range(len(shape)) if axis not in one_of_each]
+    within = numbers.update_window_dims
+    sizes = [1] * len(shape)
+    for axis, own in zip(kept, within, strict=True):
+        sizes[axis] = update_shape[own]
+    flat, update = (np.arange(np.prod(s, dtype=int)).reshape(s) for s in (shape, update_shape))
+    update = np.moveaxis(update, within, range(update.ndim - len(within), update.ndim))
+    for at in np.ndindex(*places.shape[:-1]):
+        start = [0] * len(shape)
+        for axis, of_batch in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
+            start[axis] = at[of_batch]
+        for axis, own in zip(numbers.scatter_dims_to_operand_dims, places[at], strict=True):
+            start[axis] = int(own)
+        window = _window(shape, start, sizes, params["mode"])
+        if window is not None:
+            yield from zip(flat[window].ravel().tolist(), update[at].ravel().tolist(), strict=True)
+
+
+def _window(shape, start, sizes, mode) -> tuple[slice, ...] | None:
+    """A part of an array; None outside of it, where `mode` does not move it inside."""
+    last = [own - size for own, size in zip(shape, sizes, strict=True)]
+    if mode == jax.lax.GatherScatterMode.CLIP:
+        start = [min(max(own, 0), most) for own, most in zip(start, last, strict=True)]
+    if not all(0 <= own <= most for own, most in zip(start, last, strict=True)):
+        return None
+    return tuple(slice(own, own + size) for own, size in zip(start, sizes, strict=True))
+
+
+def _gathered(array, places, params):
+    found = gathered_places(array.shape, places, params)
+    return None if found is None else array.ravel()[found]
+
+
+def _scattered(array, places, update, params, added: bool):
+    found, numbers = array.ravel().copy(), update.ravel()
+    for place, own in scattered_places(array.shape, places, update.shape, params):
+        found[place] = found[place] + numbers[own] if added else numbers[own]
+    return found.reshape(array.shape)
+
+
+def _sliced(array, starts, sizes):
+    places = [min(max(int(at), 0), own - size) for at, own, size in zip(starts, array.shape, sizes, strict=True)]
+    return array[tuple(slice(at, at + size) for at, size in zip(places, sizes, strict=True))]
+
+
+def _broadcast(array, shape, along):
+    own = [1] * len(shape)
+    for axis, size in zip(along, np.shape(array), strict=True):
+        own[axis] = size
+    return np.broadcast_to(np.reshape(array, own), shape)
+
+
+def _selected(which, cases):
+    if np.ndim(which) == 0:
+        return cases[int(which)]
+    return np.choose(np.asarray(which, int), cases) if len(cases) > 2 else np.where(which, cases[1], cases[0])
+
+
+def _product(left, right, numbers):
+    (along_left, along_right), batch = numbers
+    return None if any(batch) else np.tensordot(left, right, (along_left, along_right))
