@@ -244,7 +244,7 @@ def roofline() -> None:
     import jax.numpy as jnp
 
     from fivjax.contact import Contact
-    from fivjax.cycles.section_map import mechanics_about_sliding, sliding_state
+    from fivjax.cycles.about_sliding import mechanics_about_sliding, sliding_state
     from fivjax.foundation.compiling import less_thought
     from fivjax.steppers.windowed import Windowed
 

@@ -292,8 +292,10 @@ def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, 
     ended = np.zeros((4, *shape, 2), bool)
     ended[:2, ..., 0] = True
     ended[2] = ends
-    times = np.array([1.0, 2.0, 3.0, 0.0])
-    segments = Round(np.cumsum(times) - times, times, np.zeros((4, 4)), Contact(status, direction), ended, np.array(3))  # type: ignore[arg-type]
+    times = np.array([1.0, 2.0, 3.0])
+    contact = Contact(status[:3], direction[:3])  # type: ignore[arg-type]
+    states, series = np.zeros((3, 4)), np.zeros((3, 17, 4))
+    segments = Round(np.cumsum(times) - times, times, states, contact, ended[:3], series, np.ones(3))
     found = word(segments)
     assert [phase.duration for phase in found] == ([1.0, 2.0, 3.0] if ends else [4.0, 2.0])
     sticking = (fj.Status.SLIDE,) * (contacts - 1) + (fj.Status.STICK,)

@@ -14,7 +14,7 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
-from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.foundation.compiling import compiled
 from fivjax.maps.engine import run_to_verdict
 from fivjax.plot import energy as plot_energy

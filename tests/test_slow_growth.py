@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Contact
-from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.model.sliding import sliding_states
 from fivjax.verdicts.sliding_proof import sliding_modes

@@ -10,7 +10,7 @@ from catalogue import LOW_ORDER
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
-from fivjax.cycles.section_map import mechanics_about_sliding
+from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.foundation.compiling import compiled
 from fivjax.steppers.core import follow
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..cycles.section_map import MOST_TO_CROSSING
+from ..cycles.section_motion import MOST_TO_CROSSING
 from ..foundation.warp_library import warp
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form

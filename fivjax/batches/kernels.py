@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from ..cycles.section_map import mechanics_about_sliding
+from ..cycles.about_sliding import mechanics_about_sliding
 from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form

@@ -14,11 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..contact import Contact, Status
-from ..cycles.around import peak_speed_along
-from ..cycles.section_map import MOST_SEGMENTS, MOST_TO_CROSSING, Point, moved, to_crossing
+from ..cycles.section_motion import How, Point, to_crossing
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
-from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import section_weights
 from ..steppers.windowed import Windowed
@@ -28,7 +26,7 @@ from .flattened import Flattened, flatten
 from .kernels import Kernels
 from .series_kernels import SeriesKernels
 from .sharing import Batch
-from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, in_rows_of_several, moved_in_windows, no_path, with_newest
+from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, in_rows_of_several, moved_in_windows
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -233,32 +231,6 @@ def _images(found) -> Images:
     return Images(Section(y, status, direction), *rest)
 
 
-def _arrived(shared, y, status, direction, crossings):
-    mechanics, longest = shared
-    point = Point(y, Contact(status.astype(jnp.int32), direction))
-    found = moved(for_derivatives(EventExact(), mechanics), mechanics, point, crossings, longest * crossings)
-    y = jnp.where(found.arrived, found.point.y, jnp.nan)
-    return y, found.point.contact.status, found.point.contact.direction, found.time
-
-
-def _with_path(shared, y, status, direction, crossings):
-    mechanics, longest = shared
-    point = Point(y, Contact(status.astype(jnp.int32), direction))
-
-    def observe(total, segment: Segment):
-        events, path = total
-        after = segment.after
-        return events + jnp.any(after.ended), with_newest(path, after.y, after.rise.happened)
-
-    nothing = jnp.zeros((), jnp.int32), no_path(y)
-    longest = longest * crossings
-    crossed, after, (events, path) = to_crossing(
-        EventExact(), mechanics, point, crossings, longest, nothing, observe, MOST_TO_CROSSING
-    )
-    y = jnp.where(crossed & jnp.all(jnp.isfinite(after.y)), after.y, jnp.nan)
-    return y, after.contact.status, after.contact.direction, events, longest - after.left, path
-
-
 def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
     """A function of what a group shares and of one row's own, for all rows of a block."""
     own = rows.tree
@@ -266,9 +238,24 @@ def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
     return flatten(jax.vmap(of_group)(shared.tree, *own), row_axes=2)
 
 
+def _to_crossing(shared, y, status, direction, crossings, rows: int, how: How, careful: bool = False):
+    mechanics, longest = shared
+    start, method = Point(y, Contact(status, direction)), how.method
+    method = for_derivatives(method, mechanics) if careful else method
+    numbers = crossings - jnp.arange(rows, dtype=y.dtype)[::-1]
+    end, path = to_crossing(how, method, mechanics, start, crossings, longest * crossings, numbers)
+    found = end.at.point
+    y = jnp.where(end.arrived, found.y, jnp.nan)
+    return (y, found.contact.status, found.contact.direction), end, path.point.y
+
+
 @compiled
 def _returned(shared: Flattened, rows: Flattened) -> Flattened:
-    return of_block(_with_path, shared, rows)
+    def one(shared, *row):
+        section, end, path = _to_crossing(shared, *row, KEPT, How(EventExact()))
+        return *section, end.at.events, end.at.time, path
+
+    return of_block(one, shared, rows)
 
 
 @compiled
@@ -276,8 +263,8 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, y, *row):
         def along(direction):
             def state(y):
-                found = _arrived(shared, y, *row)
-                return found[0], found
+                section, end, _ = _to_crossing(shared, y, *row, 1, How(EventExact()), careful=True)
+                return section[0], (*section, end.at.time)
 
             _, tangent, found = jax.jvp(state, (y,), (direction,), has_aux=True)
             return found, tangent
@@ -289,9 +276,8 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
 
 @compiled
 def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
-    def one(shared, y, status, direction, crossings):
-        mechanics, longest = shared
-        point = Point(y, Contact(status.astype(jnp.int32), direction))
-        return peak_speed_along(EventExact(), mechanics, point, crossings, longest * crossings, MOST_SEGMENTS)[0]
+    def one(shared, *row):
+        _, end, _ = _to_crossing(shared, *row, 1, How(EventExact(), peaks=True))
+        return jnp.where(end.arrived, end.peak, jnp.nan)
 
     return of_block(one, shared, rows)

@@ -1,24 +1,20 @@
 """Trajectories followed, and return maps evaluated, by kernels that step by Taylor series: any friction, several contacts.
 
-A kernel does for one trajectory what `progress.step` says, and what `to_crossing` does on the section.
+A kernel does for one trajectory what `progress.step` says; those of the section are `cycles.section_motion`.
 """
-
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ..contact import Contact
-from ..cycles.around import higher_peak
-from ..cycles.section_map import MOST_TO_CROSSING
+from ..cycles.section_motion import Arrival, How, Point, motion_of_mechanics
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction, width_for
 from ..foundation.kernel_text import Form
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.event_exact import EventExact
 from .flattened import Flattened
 from .kernels import for_conclusions
 from .progress import Setting, step
@@ -37,24 +33,6 @@ class Following(eqx.Module):
     method: EventExact = eqx.field(static=True)
 
 
-class Way(NamedTuple):
-    """A motion from one crossing of the section to the next ones."""
-
-    y: Float[Array, " state"]
-    contact: Contact
-    left: Float[Array, ""]  # of the longest time, s
-    crossed: Int[Array, ""]
-    events: Int[Array, ""]
-    count: Int[Array, ""]
-    peak: Float[Array, ""]  # m/s
-
-
-class Asked(eqx.Module):
-    """What is asked of a motion on the section besides its state there."""
-
-    peaks: bool = eqx.field(static=True)
-
-
 def _followed(args, instants):
     """A trajectory so many steps further."""
     of_all, (values, mechanics, weights, longest), row, now, steps = args
@@ -66,58 +44,7 @@ def _followed(args, instants):
     return jax.tree.leaves(after), ()
 
 
-def _returned(args, instants):
-    return _to_crossings(args, instants, EventExact())
-
-
-def _returned_to_derive(args, instants):
-    return _to_crossings(args, instants, for_derivatives(EventExact(), args[1][0]))
-
-
-def _to_crossings(args, instants, method: EventExact):
-    """The motion from a state of the section to a later one, with a row for each of the last states there."""
-    asked, (mechanics, longest), y, status, direction, crossings = args
-    none, zero = jnp.zeros((), jnp.int32), jnp.zeros((), y.dtype)
-    begin = Way(y, Contact(status.astype(jnp.int32), direction), longest * crossings, none, none, none, zero)
-    begin = depending_on(mechanics, begin)
-
-    def further(way: Way) -> Way:
-        after, states, unit = method.with_series(mechanics, way.contact, zero, way.y, way.left, True)
-        peak = way.peak
-        if asked.peaks:
-            peak = higher_peak(mechanics, states, after.h, after.h / unit, peak)
-        return Way(
-            after.y,
-            after.contact,
-            jnp.where(after.h >= way.left, 0.0, way.left - after.h),
-            way.crossed + after.rise.happened,
-            way.events + jnp.any(after.ended),
-            way.count + 1,
-            peak,
-        )
-
-    def until(way: Way, crossed) -> Way:
-        def going(way: Way):
-            return (way.left > 0) & (way.crossed < crossed) & (way.count < MOST_TO_CROSSING)
-
-        return jax.lax.while_loop(going, further, way)
-
-    def row(way: Way, place):
-        # The last row is the last crossing; there are fewer crossings than rows, or more.
-        wanted = crossings - place.astype(jnp.int32)
-        way = until(way, wanted)
-        there = (wanted > 0) & (way.crossed >= wanted)
-        return way, jnp.where(there, way.y, jnp.nan)
-
-    way, path = jax.lax.scan(row, begin, instants)
-    arrived = (way.crossed >= crossings) & jnp.all(jnp.isfinite(way.y))
-    y = jnp.where(arrived, way.y, jnp.nan)
-    peak = jnp.where(arrived, way.peak, jnp.nan)
-    time = longest * crossings - way.left
-    return (y, way.contact.status, way.contact.direction, way.events, time, peak), path
-
-
-_follow, _return = KernelFunction(_followed), KernelFunction(_returned, _returned_to_derive)
+_follow = KernelFunction(_followed)
 
 
 class SeriesKernels:
@@ -157,13 +84,15 @@ class SeriesKernels:
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
         """The `crossings`-th crossing from each row, as `Kernels.returns` gives it."""
         form, given = self._section_rows(group, y, status, direction, crossings, peaks)
-        places = np.arange(kept, dtype=float)[::-1]
+        numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
         parts = [
-            _return.of_many(form, given[rows], places, self.pool)
+            motion_of_mechanics.of_many(form, given[rows], numbers[rows], self.pool)
             for rows in _parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
         ]
-        (y, status, direction, events, time, peak), path = jax.tree.map(lambda *part: np.concatenate(part), *parts)
-        return y, status.astype(np.int32), direction, events, time, path, peak
+        end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts)
+        (y, status, direction), (at, _, arrived, peak) = _on_section(end), end
+        peak = np.where(arrived, peak, np.nan)
+        return y, status, direction, at.events.astype(np.int32), at.time, path.point.y, peak
 
     def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
@@ -172,23 +101,32 @@ class SeriesKernels:
         # The state comes after what is the group's.
         state = len(jax.tree.leaves(self.on_section))
         wide = tuple(place == state for place in range(len(form.arrays)))
+        last = np.broadcast_to(np.asarray(crossings, float), len(y))[:, None]
         slopes = []
         width = width_for(size, given.shape[1])
         for start in range(0, size, width):
             directions = np.eye(size, size + width)[:, start : start + width]
-            _, dots = _return.derived_of_many(form, given, np.zeros(1), wide, directions, self.pool)
+            _, dots = motion_of_mechanics.derived_of_many(form, given, last, wide, directions, self.pool)
             slopes.append(dots[0])
         slopes = np.concatenate(slopes, axis=-1)[..., :size]
-        (y, status, direction, _, time, _), _ = _return.of_many(form, given, np.zeros(1), self.pool)
-        return (y, status.astype(np.int32), direction, time), slopes
+        end, _ = motion_of_mechanics.of_many(form, given, last, self.pool)
+        return (*_on_section(end), end.at.time), slopes
 
     def _section_rows(self, group, y, status, direction, crossings, peaks: bool):
         crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))
-        rows = (np.asarray(y), np.asarray(status, np.int32), np.asarray(direction, float), crossings)
-        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.on_section, *rows))
-        form, _ = Form.of((Asked(peaks), *first))
-        own = [part.reshape(len(y), -1).astype(float) for part in rows]
+        contact = Contact(np.asarray(status, np.int32), np.asarray(direction, float))
+        rows = Point(np.asarray(y), contact), crossings
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (*self.on_section, *rows))
+        form, _ = Form.of((How(EventExact(), peaks), *first))
+        own = [part.reshape(len(y), -1).astype(float) for part in jax.tree.leaves(rows)]
         return form, np.concatenate([self.section_table[group], *own], axis=1)
+
+
+def _on_section(end: Arrival):
+    """State, status and direction on the section; the state is NaN where the section was not reached."""
+    point = end.at.point
+    y = np.where(end.arrived[:, None], point.y, np.nan)
+    return y, point.contact.status.astype(np.int32), point.contact.direction
 
 
 def _table(tree) -> Float[np.ndarray, "g k"]:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..contact import Mechanics
-from ..cycles.section_map import longest_return, mechanics_about_sliding
+from ..cycles.about_sliding import longest_return, mechanics_about_sliding
 from ..foundation.kept_programs import kept
 from ..foundation.warp_library import is_installed
 from ..linear.linearisation import linear_sliding

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact
-from ..cycles.section_map import MOST_TO_CROSSING
+from ..cycles.section_motion import MOST_TO_CROSSING
 from ..foundation.kept_programs import kept
 from ..steppers.windowed import Windowed
 from .flattened import Flattened, flatten

@@ -1,6 +1,5 @@
 """One period of a cycle: its segments, its sequence of contact modes, its peak speed, harmonics and monodromy matrix."""
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -9,19 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..contact import Contact, Mechanics, State, Status
-from ..foundation.compiling import compiled, power_of_4
-from ..foundation.polynomial import extremum, value_and_slope
+from ..contact import Contact, State, Status
+from ..foundation.carried import depending_on
+from ..foundation.compiling import power_of_4
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
-from ..steppers.core import Followed, Segment, follow
 from ..steppers.event_exact import EventExact
-from .section_map import Point, flow_with_jacobian, mechanics_about_sliding, to_crossing
+from ..steppers.kernel_scope import has_kernel
+from .about_sliding import mechanics_about_sliding
+from .peak_speed import higher_peak
+from .section_map import flow_with_jacobian
+from .section_motion import MOST_SEGMENTS, How, Point
 
-# Samples of the tangential speed in a segment; Newton's method finds the peak from the largest.
-SAMPLES = 24
-PEAK_STEPS = 6
 HARMONICS = 16
 
 
@@ -33,160 +33,83 @@ class Phase(NamedTuple):
 
 
 class Round(NamedTuple):
-    """The segments of one period; rows beyond `count` are empty."""
+    """The segments of one period, in rows."""
 
-    t: Float[Array, " s"]  # when each begins, s
-    h: Float[Array, " s"]  # its duration, s; zero where empty
-    y: Float[Array, "s state"]  # the state where it begins
+    t: Float[np.ndarray, " s"]  # when each begins, s
+    h: Float[np.ndarray, " s"]  # its duration, s
+    y: Float[np.ndarray, "s state"]  # the state where it begins
     contact: Contact
-    ended: Bool[Array, "s *contacts 2"]  # which guard ended it
-    count: Int[Array, ""]
-
-
-def once_around(stepper: EventExact, mechanics: Mechanics, point: Point, period: Float[Array, ""], most: int) -> Round:
-    """The segments of a motion that starts at a point, over a time `period` (s); at most `most` of them are kept."""
-    n2 = point.y.shape[0]
-    none, shape = jnp.zeros(most, point.y.dtype), point.contact.status.shape
-    empty = Round(
-        none,
-        none,
-        jnp.zeros((most, n2), point.y.dtype),
-        Contact(jnp.zeros((most, *shape), jnp.int32), jnp.ones((most, *shape), point.y.dtype)),
-        jnp.zeros((most, *shape, 2), bool),
-        jnp.zeros((), jnp.int32),
-    )
-
-    def record(total: Round, segment: Segment) -> Round:
-        row = Round(segment.t, segment.after.h, segment.y, segment.contact, segment.after.ended, total.count + 1)
-        kept = jax.tree.map(lambda all_, one: all_.at[total.count].set(one), total[:-1], row[:-1])
-        return Round._make((*kept, row.count))
-
-    zero = jnp.zeros((), point.y.dtype)
-    return follow(
-        stepper, mechanics, point.contact, zero, point.y, period, total=empty, observe=record, most=most, kind="lax"
-    ).total
-
-
-def peak_speed(stepper: EventExact, mechanics: Mechanics, segments: Round) -> Float[Array, ""]:
-    """The largest tangential speed of any contact in all segments, in m/s, to rounding."""
-
-    def of_segment(y, contact, h):
-        return _peak_within(stepper, mechanics, y, contact, h)
-
-    return jnp.max(jax.vmap(of_segment)(segments.y, segments.contact, segments.h))
-
-
-def peak_speed_along(
-    stepper: EventExact,
-    mechanics: Mechanics,
-    point: Point,
-    crossings: Int[Array, ""],
-    longest: Float[Array, ""],
-    most: int,
-) -> tuple[Float[Array, ""], Followed]:
-    """The largest tangential speed in m/s, to rounding, of a motion from a point to its `crossings`-th crossing of the section;
-    and the end of that motion.
-
-    The speed is NaN if that takes longer than `longest` (s), or more than `most` segments. The segments are not kept.
-    """
-
-    def observe(peak, segment: Segment):
-        own = _peak_within(stepper, mechanics, segment.y, segment.contact, segment.after.h)
-        return jnp.maximum(peak, own)
-
-    zero = jnp.zeros((), point.y.dtype)
-    crossed, after, peak = to_crossing(stepper, mechanics, point, crossings, longest, zero, observe, most)
-    return jnp.where(crossed, peak, jnp.nan), after
-
-
-def _peak_within(stepper: EventExact, mechanics: Mechanics, y: State, contact: Contact, h) -> Float[Array, ""]:
-    coefficients, unit = stepper.series(mechanics, contact, jnp.zeros((), y.dtype), y)
-    of_contacts = [
-        _peak_of_series(coefficients[:, y.shape[0] // 2 + tangential], h, h / unit)
-        for tangential, _ in mechanics.places
-    ]
-    return functools.reduce(jnp.maximum, of_contacts)
-
-
-def higher_peak(
-    mechanics: Mechanics, coefficients: Float[Array, "k state"], h, end, before: Float[Array, ""]
-) -> Float[Array, ""]:
-    """The largest tangential speed in m/s within an advance, or the one from `before` if that was larger.
-
-    `coefficients` are those of the motion's Taylor series, `h` is the advance's duration in s and `end` the same in the unit
-    of the series.
-    """
-    n, powers = coefficients.shape[1] // 2, end ** np.arange(len(coefficients))
-    for tangential, _ in mechanics.places:
-        speeds = coefficients[:, n + tangential]
-        # Most advances have no higher peak than those before them.
-        most = jnp.sum(jnp.abs(speeds) * powers)
-        before = jax.lax.cond(
-            most <= before,
-            lambda speeds, before: before,
-            lambda speeds, before: jnp.maximum(before, _peak_of_series(speeds, h, end)),
-            speeds,
-            before,
-        )
-    return before
-
-
-def _peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
-    samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
-    values, _ = value_and_slope(speeds, samples)
-    # To first order the value at the peak does not depend on the instant of the peak.
-    sizes = jnp.abs(values)
-    # Not `argmax`, which JAX lowers in single precision when a caller's own `jit` is in it.
-    largest = jax.lax.stop_gradient(jnp.max(jnp.where(sizes == jnp.max(sizes), samples, 0.0)))
-    x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, end, PEAK_STEPS))
-    refined, _ = value_and_slope(speeds, x)
-    ends = jnp.stack([jnp.max(sizes), jnp.abs(refined)])
-    return jnp.where(h > 0, jnp.max(ends), 0.0)
-
-
-def harmonics(
-    stepper: EventExact, mechanics: Mechanics, segments: Round, period: Float[Array, ""]
-) -> Complex[Array, "count n"]:
-    r"""Fourier coefficients of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, over exactly one period; m/s."""
-    n = segments.y.shape[1] // 2
-    zero = jnp.zeros((), segments.y.dtype)
-
-    def of_segment(t, h, y, contact):
-        within = stepper.within(mechanics, contact, zero, y, h)
-        turns = 2 * math.pi * jnp.arange(1, HARMONICS + 1)[:, None] * ((t + within.times) / period)
-        weights = jnp.where(h > 0, within.weights, 0.0)
-        states = jnp.where(h > 0, within.states[:, n:], 0.0)
-        return (jnp.cos(turns) * weights) @ states, (jnp.sin(turns) * weights) @ states
-
-    real, imaginary = jax.vmap(of_segment)(segments.t, segments.h, segments.y, segments.contact)
-    return (2 / period) * (jnp.sum(real, axis=0) - 1j * jnp.sum(imaginary, axis=0))
+    ended: Bool[np.ndarray, "s *contacts 2"]  # which guard ended it
+    series: Float[np.ndarray, "s k state"]  # Taylor coefficients of the motion, in time measured in the unit
+    unit: Float[np.ndarray, " s"]  # s
 
 
 class Seen(NamedTuple):
     """Segments, peak speed and harmonics of one period."""
 
     segments: Round
-    amplitude: Float[Array, ""]  # m/s
-    lines: Complex[Array, "count n"]  # m/s
+    amplitude: float  # m/s
+    lines: Complex[np.ndarray, "count n"]  # m/s
 
 
-@compiled
-def read_period(scene: Scene, stepper: EventExact, point: Point, period: Float[Array, ""], most: int) -> Seen:
-    """Segments, peak tangential speed and harmonics of one period from a point on it."""
-    mechanics = mechanics_about_sliding(scene)
-    segments = once_around(stepper, mechanics, point, period, most)
-    return Seen(
-        segments,
-        peak_speed(stepper, mechanics, segments),
-        harmonics(stepper, mechanics, segments, period),
-    )
+class _Way(NamedTuple):
+    y: State
+    contact: Contact
+    left: Float[Array, ""]  # of the period, s
+    peak: Float[Array, ""]  # m/s
+    count: Int[Array, ""]
+
+
+def _around(args, numbers):
+    """The end of a motion from a point on a cycle over one period; and its segments with these numbers, from 0 onwards."""
+    how, scene, point, period = args
+    mechanics, zero = mechanics_about_sliding(scene), jnp.zeros((), point.y.dtype)
+    contact = Contact(point.contact.status.astype(jnp.int32), point.contact.direction)
+    begin = _Way(point.y, contact, period, zero, jnp.zeros((), jnp.int32))
+    begin = depending_on(mechanics, begin)
+
+    def segment(way: _Way, number):
+        after, series, unit = how.method.with_series(mechanics, way.contact, zero, way.y, way.left)
+        goes = (way.left > 0) & (way.count == number)
+        peak = higher_peak(mechanics, series, after.h, after.h / unit, way.peak)
+        moved = _Way(after.y, after.contact, jnp.where(after.h >= way.left, 0.0, way.left - after.h), peak, way.count + 1)
+        row = Round(period - way.left, after.h, way.y, way.contact, after.ended, series, unit)
+        return jax.tree.map(lambda new, old: jnp.where(goes, new, old), moved, way), row
+
+    way, rows = jax.lax.scan(segment, begin, numbers)
+    return way, rows
+
+
+_period = KernelFunction(_around)
 
 
 def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, segments: int) -> Seen:
-    """`read_period` as NumPy arrays; compiled for few different numbers of segments."""
+    """Segments, peak tangential speed and harmonics of one period from a point on it, of some number of `segments`."""
+    args = How(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
     most = power_of_4(max(segments + 4, 64))
-    seen = read_period(scene, stepper, point, jnp.asarray(period), most)
-    return jax.tree.map(known_to_numpy, seen)
+    while True:
+        end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, stepper))
+        if end.count < most or most > MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
+            break
+        most *= 4
+    found = Round(*jax.tree.map(lambda row: np.asarray(row)[: int(end.count)], rows))
+    return Seen(found, float(end.peak), harmonics(found, period))
+
+
+def harmonics(segments: Round, period: float) -> Complex[np.ndarray, "count n"]:
+    r"""Fourier coefficients of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, over exactly one period; m/s.
+
+    With this many Gauss points, a product of two series is integrated with an error far below that of the series itself.
+    """
+    order, n = segments.series.shape[1] - 1, segments.series.shape[2] // 2
+    points, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
+    times = 0.5 * (points + 1.0) * segments.h[:, None]
+    x, velocities = (times / segments.unit[:, None])[..., None], np.zeros((*times.shape, n))
+    for k in reversed(range(order + 1)):
+        velocities = velocities * x + segments.series[:, None, k, n:]
+    turns = 2j * math.pi * np.arange(1, HARMONICS + 1)[:, None, None] * ((segments.t[:, None] + times) / period)
+    weighted = (0.5 * segments.h[:, None] * weights)[..., None] * velocities
+    return (2 / period) * np.einsum("hsq,sqn->hn", np.exp(-turns), weighted)
 
 
 def word(segments: Round) -> tuple[Phase, ...]:
@@ -194,7 +117,7 @@ def word(segments: Round) -> tuple[Phase, ...]:
 
     Sliding that reverses its direction is two phases. With several contacts, a phase lasts until the mode of one of them ends.
     """
-    count = int(segments.count)
+    count = len(segments.h)
     letters: list[tuple[tuple[tuple, tuple], float]] = []
     for k in range(count):
         status, direction = (np.atleast_1d(part[k]) for part in (segments.contact.status, segments.contact.direction))
@@ -221,8 +144,7 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
     stuck = segments.contact.status == Status.STICK
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
-    contact = jax.tree.map(lambda leaf: jnp.asarray(leaf[longest]), segments.contact)
-    start = Point(jnp.asarray(segments.y[longest]), contact)
+    start = Point(segments.y[longest], jax.tree.map(lambda leaf: leaf[longest], segments.contact))
     middle, _ = flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
     _, matrix = flow_with_jacobian(scene, stepper, middle, period)
     free = free_coordinates(scene, segments.contact.status[longest])

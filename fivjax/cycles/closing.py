@@ -2,15 +2,14 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..contact import same_mode
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
-from .section_map import Point, Return, return_with_jacobian
+from .section_map import Return, return_with_jacobian
+from .section_motion import Point
 
 MOST_ITERATIONS = 30
 # A cycle is closed if the return map misses its start by less than this share of its size.
@@ -42,7 +41,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
     best: tuple[float, Point, Return, np.ndarray] | None = None
     point, step, since = guess, None, 0
     for _ in range(MOST_ITERATIONS):
-        found, jacobian = _returned(scene, stepper, point, crossings)
+        found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
         y, closure = np.asarray(point.y), missed_by(point, found, weights)
         gap = np.asarray(found.point.y) - y
         usable = np.isfinite(closure) and np.all(np.isfinite(jacobian))
@@ -58,7 +57,7 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
                 break
             # The step was too long: half of it.
             step, since = 0.5 * step, since + 1
-            point = Point(jnp.asarray(np.asarray(best[1].y) + step), best[1].contact)
+            point = Point(np.asarray(np.asarray(best[1].y) + step), best[1].contact)
             continue
         if not usable:
             return None
@@ -68,13 +67,13 @@ def close(scene: Scene, stepper: EventExact, guess: Point, crossings: int) -> Cl
         step = _newton_step(jacobian, gap, len(scene.structure.contacts))
         if step is None:
             break
-        point = Point(jnp.asarray(y + step), point.contact)
+        point = Point(np.asarray(y + step), point.contact)
     if best is None or not best[0] <= CLOSED:
         return None
     _, point, found, jacobian = best
     # The period may be a fraction of the time that was asked for.
     for fewer in (count for count in range(1, crossings) if crossings % count == 0):
-        sooner, derived = _returned(scene, stepper, point, fewer)
+        sooner, derived = return_with_jacobian(scene, stepper, point, fewer)
         missed = missed_by(point, sooner, weights)
         if missed <= CLOSED and _same_mode(sooner.point, point):
             found, jacobian, crossings = sooner, derived, fewer
@@ -93,11 +92,6 @@ def closed_as(point: Point, crossings: int, found: Return, jacobian, weights: Fl
     """The cycle with this return."""
     residual = missed_by(point, found, weights)
     return Closed(point, crossings, float(found.time), jacobian, residual, int(found.segments), int(found.events))
-
-
-def _returned(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> tuple[Return, np.ndarray]:
-    found, jacobian = return_with_jacobian(scene, stepper, point, crossings)
-    return jax.tree.map(jnp.asarray, found), jacobian
 
 
 def _same_mode(a: Point, b: Point) -> bool:

@@ -22,6 +22,7 @@ from ..model.contact_coordinates import to_contact_coordinates
 from ..model.scene import Scene, refuse_several_contacts, scene_in_contact_coordinates
 from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
+from .about_sliding import sliding_state
 from .around import seen_around
 from .branch_points import Point, seen
 from .closing import closed_as
@@ -33,8 +34,8 @@ from .own_coordinates import cycle_in_own_coordinates, in_own_coordinates
 from .pseudo_arclength import Curve, Family
 from .saddle import saddle_cycle
 from .search import NoLimitCycle, limit_cycle
-from .section_map import Point as SectionPoint
-from .section_map import return_with_jacobian, sliding_state
+from .section_map import return_with_jacobian
+from .section_motion import Point as SectionPoint
 from .special_derivatives import derivatives_of_special_points
 from .special_points import MEETS_SLIDING
 from .verification import crossings_of, on_section
@@ -177,8 +178,8 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     if scene is not given:
         state = np.asarray(snapped_to_belt(scene, jnp.asarray(to_contact_coordinates(given.structure, state))))
     y = state - np.asarray(sliding_state(scene, scene.load.final))
-    contact = Contact(jnp.asarray(int(row["status"]), jnp.int32), jnp.asarray(float(row["direction"])))
-    point = SectionPoint(jnp.asarray(y), contact)
+    contact = Contact(np.asarray(int(row["status"]), np.int32), np.asarray(float(row["direction"])))
+    point = SectionPoint(np.asarray(y), contact)
     weights = np.asarray(scene.structure.weights)
     crossings = crossings_of(scene, stepper, point, weights)
     if crossings is None:

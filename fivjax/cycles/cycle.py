@@ -1,7 +1,6 @@
 """A limit cycle, its properties, and the quantities computed from it."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -12,9 +11,11 @@ from ..model.load import ConstantLoad
 from ..model.scene import Scene
 from ..simulation.trajectory import Trajectory, simulate
 from ..steppers.event_exact import EventExact
+from .about_sliding import sliding_state
 from .around import Phase, floquet_multipliers, seen_around, word
 from .closing import Closed
-from .section_map import Point, return_with_jacobian, sliding_state
+from .section_map import return_with_jacobian
+from .section_motion import Point
 
 # A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
@@ -223,8 +224,8 @@ def under_final_load(scene: Scene) -> Scene:
 
 def point_of(cycle: LimitCycle) -> Point:
     """The cycle's point on the section, in the form that the return map takes."""
-    contact = Contact(jnp.asarray(cycle.contact.status, jnp.int32), jnp.asarray(cycle.contact.direction, jnp.float64))
-    return Point(jnp.asarray(cycle.points[0], jnp.float64), contact)
+    contact = Contact(np.asarray(cycle.contact.status, np.int32), np.asarray(cycle.contact.direction, np.float64))
+    return Point(np.asarray(cycle.points[0], np.float64), contact)
 
 
 @in_double_precision

@@ -23,7 +23,7 @@ from ..model.scene import Scene
 from .cycle import LimitCycle, point_of
 from .nearby import next_to
 from .own_coordinates import cycle_in_contact_coordinates
-from .section_map import Point
+from .section_motion import Point
 
 
 class CycleDerivatives(eqx.Module):

@@ -21,10 +21,11 @@ from jaxtyping import Array, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
 from ..foundation.compiling import compiled, power_of_4
+from ..foundation.numpy_evaluation import by_numpy
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
+from .about_sliding import mechanics_about_sliding
 from .around import Round
-from .section_map import mechanics_about_sliding
 
 # A phase ends at one of the two guards of its mode (0 or 1), or at the section.
 AT_SECTION = 2
@@ -70,7 +71,7 @@ class Images(NamedTuple):
 
 def phases_around(segments: Round) -> Phases | None:
     """The phases of one period of real motion from a point of the section; None where it is at rest."""
-    count = int(segments.count)
+    count = len(segments.h)
     modes, starts, lengths, whole = [], [], [], True
     for k in range(count):
         status = int(segments.contact.status[k])
@@ -205,7 +206,11 @@ def _inside(scene, stepper, y, h, status, pointing):
 
 def parameter_direction(scene: Scene, name: str) -> Scene:
     """The scene's derivative by one of its parameters: one for that parameter, zero for all others."""
-    value = jnp.asarray(scene.parameters[name], jnp.float64)
+    return _parameter_direction(scene, name, np.asarray(scene.parameters[name], float))
+
+
+@by_numpy
+def _parameter_direction(scene: Scene, name: str, value: Float[Array, ""]) -> Scene:
     return jax.jvp(lambda value: scene.replace(**{name: value}), (value,), (jnp.ones_like(value),))[1]
 
 

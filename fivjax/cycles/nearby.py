@@ -4,6 +4,7 @@ Newton's method on the section's return map $P$ starts from a cycle that is know
 $y = P(y, θ)$, the derivatives are those of the implicit function theorem, $dy/dθ = (I - ∂P/∂y)^{-1} ∂P/∂θ$.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,12 +21,13 @@ from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
 from ..model.scene import Scene
-from ..steppers.event_exact import EventExact, for_derivatives
-from .around import peak_speed_along
+from ..steppers.event_exact import EventExact
+from ..steppers.kernel_scope import has_kernel
+from .about_sliding import sliding_state
 from .closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
 from .cycle import LimitCycle, point_of, under_final_load
 from .own_coordinates import in_own_coordinates
-from .section_map import MOST_TO_CROSSING, Point, longest_return, mechanics_about_sliding, sliding_state
+from .section_motion import How, Point, motion_of_scene
 
 
 class NearbyCycle(eqx.Module):
@@ -204,14 +206,13 @@ def _image(scene: Scene, contact: Contact, crossings):
     """The return map with period and peak, as a function of the state on the section; its further result is the contact mode
     there, and whether the section was reached.
     """
-    mechanics = mechanics_about_sliding(scene)
-    stepper = for_derivatives(EventExact(), mechanics)
-    longest = longest_return(scene) * crossings
+    how, numbers = How(EventExact(), peaks=True), jnp.asarray(crossings, jnp.float64)[None]
 
     def image(y):
-        peak, after = peak_speed_along(stepper, mechanics, Point(y, contact), crossings, longest, MOST_TO_CROSSING)
-        arrived = jnp.isfinite(peak) & jnp.all(jnp.isfinite(after.y))
-        return _Image(after.y, longest - after.left, peak), (after.contact, arrived)
+        (at, _, arrived, peak), _ = motion_of_scene(
+            (how, scene, Point(y, contact), crossings, math.inf), numbers, by_kernel=has_kernel(scene, how.method)
+        )
+        return _Image(at.point.y, at.time, jnp.where(arrived, peak, jnp.nan)), (at.point.contact, arrived)
 
     return image
 

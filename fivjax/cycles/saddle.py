@@ -7,7 +7,6 @@ either side of the boundary pass near that cycle while they are close together, 
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..foundation import arguments
@@ -99,7 +98,7 @@ class _Fates:
 
     def of(self, states: np.ndarray) -> np.ndarray:
         """0 for states that return to sliding, 1 for those that come to the cycle or stay away from sliding."""
-        now = states_in_contact(self.scene, jnp.asarray(states))
+        now = states_in_contact(self.scene, np.asarray(states))
         fate = np.full(len(states), -1)
         for _ in range(MOST_LOOKS):
             returns = points_along(self.scene, self.stepper, now, POINTS)
@@ -131,7 +130,7 @@ class _Fates:
     def together(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The points of the section that two neighbours pass until they separate."""
         pair = np.stack([low, high])[np.arange(SIDE_BY_SIDE) % 2]
-        now = states_in_contact(self.scene, jnp.asarray(pair))
+        now = states_in_contact(self.scene, np.asarray(pair))
         paths = np.zeros((2, 0, pair.shape[1]))
         for _ in range(MOST_LOOKS):
             returns = points_along(self.scene, self.stepper, now, POINTS)
@@ -162,7 +161,7 @@ class _Fates:
         for back, crossings, place in tried:
             if back > max(2 * best, 1e-9) or back > 0.1:
                 continue
-            guess = states_in_contact(self.scene, jnp.asarray(paths[0][place][None]))
+            guess = states_in_contact(self.scene, np.asarray(paths[0][place][None]))
             guess = jax.tree.map(lambda leaf: leaf[0], guess)
             closed = close(self.scene, self.stepper, guess, crossings)
             if closed is None:

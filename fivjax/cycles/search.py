@@ -11,17 +11,19 @@ from jaxtyping import Float
 
 from ..contact import Contact, State, Status, status_from_forces
 from ..foundation import arguments
-from ..foundation.compiling import compiled
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
+from .about_sliding import mechanics_about_sliding, sliding_state
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, under_final_load
 from .own_coordinates import in_own_coordinates
-from .section_map import Point, mechanics_about_sliding, points_along, sliding_state
+from .section_map import points_along
+from .section_motion import Point
 from .torus import POINTS, SIDE_BY_SIDE, on_torus, torus_of
 
 # Motions are released from rest under these multiples of the final load, and with the tangential velocities of steady sliding
@@ -319,13 +321,13 @@ def _closed_near(
     return limit_cycle_of(scene, stepper, closed)
 
 
-@compiled
+@by_numpy
 def _released_states(scene: Scene, loads: Float[jax.Array, " e"]) -> State:
     rest = sliding_state(scene, scene.load.final)
     return jax.vmap(lambda load: sliding_state(scene, load * scene.load.final) - rest)(loads)
 
 
-@compiled
+@by_numpy
 def _in_contact_mode(scene: Scene, y: State) -> Contact:
     mechanics = mechanics_about_sliding(scene)
     return jax.vmap(lambda y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(y)
@@ -340,8 +342,8 @@ def _released(scene: Scene, loads: Sequence[float], speeds: Sequence[float], sta
     moved = np.zeros((len(speeds), len(rest)))
     moved[:, scene.structure.size + np.atleast_1d(tangential)] = np.outer(speeds, np.atleast_1d(scene.belt_speed))
     given = [_state_of(scene, start) - rest for start in starts]
-    states = np.concatenate([np.asarray(_released_states(scene, jnp.asarray(loads))), moved, *np.array(given)[:, None]])
-    return states_in_contact(scene, jnp.asarray(states))
+    states = np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved, *np.array(given)[:, None]])
+    return states_in_contact(scene, np.asarray(states))
 
 
 def states_in_contact(scene: Scene, y: Float[jax.Array, "e state"]) -> Point:
@@ -380,11 +382,11 @@ def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
     elif isinstance(start, tuple | list) and len(start) == 2:
         start, status = start
     rest = np.asarray(sliding_state(scene, scene.load.final))
-    y = jnp.asarray(_state_of(scene, start) - rest)
+    y = np.asarray(_state_of(scene, start) - rest)
     contact = jax.tree.map(lambda leaf: leaf[0], _in_contact_mode(scene, y[None]))
     if status is not None:
         known = [int(Status(int(one))) for one in np.atleast_1d(status)]
-        contact = Contact(jnp.asarray(known, jnp.int32).reshape(contact.status.shape), contact.direction)
+        contact = Contact(np.asarray(known, np.int32).reshape(contact.status.shape), contact.direction)
     returns = points_along(scene, stepper, Point(y[None], Contact(contact.status[None], contact.direction[None])), 24)
     path = np.asarray(returns.point.y)[0] * np.asarray(scene.structure.weights)
     if not np.all(np.isfinite(path)):

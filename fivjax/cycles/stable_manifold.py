@@ -15,7 +15,6 @@ event from the kick to the saddle, and $l^T x_{s,θ} = l^T P_θ / (1 - Λ)$.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -26,7 +25,7 @@ from ..steppers.event_exact import EventExact
 from .closing import Closed, close
 from .kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned, started
 from .search import states_in_contact
-from .section_map import Point
+from .section_motion import Point
 
 # The most trajectories of Newton's method, and the relative change of p at which it has converged.
 MOST_TRAJECTORIES = 12
@@ -85,8 +84,8 @@ def saddle_passed(scene: Scene, stepper: EventExact, path: Crossings) -> Saddle 
     for back, count, place in sorted(tried)[:TRIED]:
         if not back < 0.2:
             break
-        contact = Contact(jnp.asarray(path.status[place], jnp.int32), jnp.asarray(path.direction[place]))
-        closed = close(scene, stepper, Point(jnp.asarray(path.y[place]), contact), count)
+        contact = Contact(np.asarray(path.status[place], np.int32), np.asarray(path.direction[place]))
+        closed = close(scene, stepper, Point(np.asarray(path.y[place]), contact), count)
         found = None if closed is None else saddle_of(closed, weights)
         if found is not None:
             apart = np.linalg.norm(weights * np.asarray(found.closed.point.y) - y[place]) / sizes[place]
@@ -132,7 +131,7 @@ def critical_kick(
     # From the side that slides: there only the saddle makes a motion with events repeat.
     p, best, crossings = low, np.inf, MOST_CROSSINGS
     for taken in range(1, MOST_TRAJECTORIES + 1):
-        path = kicked(scene.replace(p=p), stepper, along_p, crossings, rough=True)
+        path = kicked(scene.replace(p=p), stepper, along_p, crossings)
         if saddle is None:
             saddle = saddle_passed(scene, stepper, path)
             if saddle is None:
@@ -165,9 +164,7 @@ def _derivatives(
     crossings: int,
 ) -> dict[str, float]:
     every = ("p", *names)
-    # Padded to a fixed number of directions, so that one program is compiled.
-    filled = every + ("p",) * (-len(every) % 16)
-    directions = directions_of(scene, filled)
+    directions = directions_of(scene, every)
     path = kicked(scene, stepper, directions, crossings)
     near = approach(path, saddle, weights)
     with np.errstate(all="ignore"):
@@ -193,9 +190,8 @@ def manifold_normal(
     **Arguments:** `scene`; `y`, a deviation from the sliding equilibrium under the final load; `saddle`, if it is known.
     """
     stepper, weights = EventExact(), np.asarray(scene.structure.weights)
-    start = jax.tree.map(lambda leaf: leaf[0], states_in_contact(scene, jnp.asarray(y)[None]))
-    directions = np.eye(len(y))[np.minimum(np.arange(len(y) + -len(y) % 16), len(y) - 1)]
-    path = started(scene, stepper, start, directions, MOST_CROSSINGS)
+    start = jax.tree.map(lambda leaf: leaf[0], states_in_contact(scene, np.asarray(y)[None]))
+    path = started(scene, stepper, start, np.eye(len(y)), MOST_CROSSINGS)
     saddle = saddle_passed(scene, stepper, path) if saddle is None else saddle
     if saddle is None:
         return None

@@ -24,16 +24,17 @@ A motion that fails one of these tests is no torus.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..contact import Contact, Status
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
+from .about_sliding import sliding_state
 from .around import seen_around, word
 from .cycle import LimitCycle, under_final_load
-from .section_map import Point, points_along, return_with_jacobian, sliding_state
+from .section_map import points_along, return_with_jacobian
+from .section_motion import Point
 
 # Trajectories in a batch, and points of the section followed at a time; the same as in searches, so that one program serves
 # both.
@@ -108,7 +109,7 @@ def torus_of(scene: Scene, stepper: EventExact, point: Point) -> LimitCycle | No
 
 
 def _orbit(scene: Scene, stepper: EventExact, point: Point):
-    starts = jax.tree.map(lambda leaf: jnp.stack([leaf] * SIDE_BY_SIDE), point)
+    starts = jax.tree.map(lambda leaf: np.stack([leaf] * SIDE_BY_SIDE), point)
     states, times, windows = [], [], []
     for _ in range(CHUNKS):
         windows.append(jax.tree.map(lambda leaf: leaf[0], starts))
@@ -240,8 +241,8 @@ def _attracts(scene: Scene, stepper: EventExact, curve: Curve) -> bool:
         starts = states + away / weights
         starts[:, gap] = np.maximum(starts[:, gap], 0.0)
         status = np.where(open_, Status.DETACH, Status.SLIDE)
-        contact = Contact(jnp.asarray(status, jnp.int32), jnp.full(len(states), np.sign(float(scene.belt_speed))))
-        now, home = Point(jnp.asarray(starts), contact), False
+        contact = Contact(np.asarray(status, np.int32), np.full(len(states), np.sign(float(scene.belt_speed))))
+        now, home = Point(np.asarray(starts), contact), False
         for _ in range(TUBE_LOOKS):
             found = points_along(scene, stepper, now, POINTS)
             ends = weights * np.asarray(found.point.y)[:, -HOME:]

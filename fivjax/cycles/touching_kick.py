@@ -26,8 +26,9 @@ from ..model.load import Pulse
 from ..model.scene import Scene
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact, for_derivatives
+from .about_sliding import longest_return, mechanics_about_sliding, slowest_period
 from .kick_response import directions_of
-from .section_map import MOST_SEGMENTS, longest_return, mechanics_about_sliding, slowest_period
+from .section_motion import MOST_SEGMENTS
 
 # The most events that are compared; and the longest time in which two motions separate, in slowest periods.
 MOST_EVENTS, MOST_TIME = 1024, 20.0

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -11,7 +10,8 @@ from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .around import Seen, seen_around
 from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around, same_modes
-from .section_map import Point, return_with_jacobian
+from .section_map import return_with_jacobian
+from .section_motion import Point
 
 # The most crossings of the section in one period.
 MOST_CROSSINGS = 24
@@ -40,11 +40,9 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | Non
     longest = int(np.argmax(np.where([mode.status == Status.STICK for mode in phases.modes], 0.0, phases.h)))
     status, direction, ending = phases.modes[longest]
     states = phases.y if ending == AT_SECTION else inside(scene, stepper, phases).states[:, LOOKS // 2]
-    contact = Contact(jnp.asarray(status, jnp.int32), jnp.asarray(direction if direction else 1.0, jnp.float64))
-    start = Point(jnp.asarray(states[longest]), contact)
+    contact = Contact(np.asarray(status, np.int32), np.asarray(direction if direction else 1.0, np.float64))
+    start = Point(np.asarray(states[longest]), contact)
     seen = seen_around(scene, stepper, start, phases.period, 60)
-    if int(seen.segments.count) >= len(seen.segments.h):
-        seen = seen_around(scene, stepper, start, phases.period, 250)
     return Real(start, seen, phases_around(seen.segments))
 
 

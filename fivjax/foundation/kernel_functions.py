@@ -22,10 +22,11 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Float
 
+from .compiling import compiled
 from .forking import refuse_if_forked
 from .kept_programs import kept_value
 from .kernel_text import Form, Place, text, written
-from .precision import is_known
+from .precision import is_known, known_to_numpy
 from .warp_library import ONE_AT_A_TIME, folder_of_texts, load, warp
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
@@ -57,19 +58,101 @@ class KernelFunction:
         self.function = function
         self.differentiated = function if differentiated is None else differentiated
 
-    def __call__(self, args, instants):
-        """The results: arrays of NumPy where all values are known, else traced ones.
+    def __call__(self, args, instants, *, by_kernel: bool = True):
+        """The results: arrays of NumPy where all values are known, else traced ones; by XLA unless `by_kernel`.
 
         **Raises:** `NotImplementedError` for a function that cannot be written as C++.
         """
         refuse_if_forked()
         form, arrays = Form.of(args)
-        if all(map(is_known, (*arrays, instants))):
-            given = np.concatenate([np.ravel(np.asarray(array)).astype(np.float64) for array in arrays])
+        known = all(map(is_known, (*arrays, instants)))
+        if not by_kernel:
+            found = self._by_xla(form, _typed(form, arrays), instants)
+            return jax.tree.map(known_to_numpy, found) if known else found
+        if known:
             kernel = kernel_of(self, form)
-            ends, rows, _, _ = kernel.launched(given[None], np.asarray(instants)[None])
+            ends, rows, _, _ = kernel.launched(_row(arrays)[None], np.asarray(instants)[None])
             return kernel.results(ends[0], rows[0])
         return kernel_of(self, form).results(*_values(self, form, tuple(arrays), instants))
+
+    def many(self, shared: tuple, own: tuple, instants, *, by_kernel: bool = True):
+        """The results for several trajectories with known values: `args` are those that they share, then their own, whose
+        arrays have a leading axis over them.
+        """
+        refuse_if_forked()
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
+        form, _ = Form.of((*shared, *first))
+        _, common = Form.of(shared)
+        _, each = Form.of(own)
+        if by_kernel:
+            count = len(each[0])
+            rows = [np.reshape(leaf, (count, -1)).astype(np.float64) for leaf in each]
+            given = np.concatenate([np.broadcast_to(_row(common), (count, len(_row(common)))), *rows], axis=1)
+            return self.of_many(form, given, np.asarray(instants))
+        types = form.arrays[len(common) :]
+        each = [np.asarray(leaf, one.dtype) for leaf, one in zip(each, types, strict=True)]
+        found = self._of_each_by_xla(form, _typed(form, common), each, np.asarray(instants))
+        return jax.tree.map(known_to_numpy, found)
+
+    def derived(self, args, instants, directions, *, by_kernel: bool = True):
+        """The results for known values; and the derivatives of real ones along directions.
+
+        `directions` is a tree like `args`, with one more, last axis over the directions; what is zero in all of them is not
+        perturbed. In the tree of derivatives, results that are not real are None.
+        """
+        refuse_if_forked()
+        form, arrays = Form.of(args)
+        _, dots = Form.of(directions)
+        dots, instants = [np.asarray(dot, float) for dot in dots], np.asarray(instants)
+        if not by_kernel:
+            found, slopes = self._derived_by_xla(form, _typed(form, arrays), dots, instants)
+            return jax.tree.map(known_to_numpy, found), jax.tree.map(known_to_numpy, slopes)
+        wide = tuple(_is_real(array) and bool(np.any(dot)) for array, dot in zip(form.arrays, dots, strict=True))
+        total = dots[0].shape[-1]
+        moving = [dot.reshape(-1, total) for dot, is_wide in zip(dots, wide, strict=True) if is_wide]
+        given = _row(arrays)[None]
+        width = width_for(total, given.shape[1])
+        along, parts = np.concatenate(moving), []
+        kernel = kernel_of(self, form, wide, width)
+        for start in range(0, total, width):
+            part = along[:, start : start + width]
+            part = np.pad(part, ((0, 0), (0, width - part.shape[1])))
+            parts.append(kernel.launched(given, instants[None], part[None]))
+        ends, rows = parts[0][:2]
+        end_dots, row_dots = (np.concatenate([part[k][0] for part in parts], axis=-1)[:, :total] for k in (2, 3))
+        return kernel.results(ends[0], rows[0]), kernel.slopes(end_dots, row_dots, len(instants))
+
+    @functools.cached_property
+    def _by_xla(self):
+        return compiled(lambda form, arrays, instants: self.function(form.args(arrays), instants))
+
+    @functools.cached_property
+    def _of_each_by_xla(self):
+        def run(form: Form, common, each, instants):
+            return jax.vmap(lambda own: self.function(form.args([*common, *own]), instants))(each)
+
+        return compiled(run)
+
+    @functools.cached_property
+    def _derived_by_xla(self):
+        def run(form: Form, arrays, dots, instants):
+            real = [_is_real(array) for array in arrays]
+            moving = [array for array, is_real in zip(arrays, real, strict=True) if is_real]
+
+            def of(moving):
+                left = iter(moving)
+                whole = [next(left) if is_real else array for array, is_real in zip(arrays, real, strict=True)]
+                found = self.differentiated(form.args(whole), instants)
+                return jax.tree.map(lambda leaf: leaf if _is_real(leaf) else None, found), found
+
+            def along(dots):
+                _, slopes, found = jax.jvp(of, (moving,), (dots,), has_aux=True)
+                return found, slopes
+
+            dots = [dot for dot, is_real in zip(dots, real, strict=True) if is_real]
+            return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(dots)
+
+        return compiled(run)
 
     def of_many(self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants, pool: Executor | None = None):
         """The results for many trajectories, of which each has a row: all arrays of its arguments, one after the other. The
@@ -136,6 +219,17 @@ class Kernel:
         for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
             pass
 
+    def slopes(self, end_dots, row_dots, count: int):
+        """The derivatives of real results from rows of directions: trees like those of the results, without the others."""
+        trees = []
+        of_dots = (end_dots, self.text.ends, self.text.end_dots, None), (row_dots, self.text.rows, self.text.row_dots, count)
+        for structure, (dots, places, own, rows) in zip(self.text.structures, of_dots, strict=True):
+            real, leaves = iter(own), []
+            for place in places:
+                leaves.append(next(real).slopes(dots, rows) if place.is_real else None)
+            trees.append(jax.tree.unflatten(structure, leaves))
+        return tuple(trees)
+
     def results(self, ends, rows):
         """The function's results from rows of numbers; these may have more axes before their own."""
         total = self.text.widths()[1]
@@ -197,6 +291,18 @@ wide* row_dots = (wide*)row_dots_.data + lane_ * {f"count * {row_dots}" if width
     return kernel
 
 
+def _row(arrays) -> Float[np.ndarray, " numbers"]:
+    return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(array)).astype(np.float64) for array in arrays)])
+
+
+def _typed(form: Form, arrays) -> list:
+    """The arrays with the types of the form, where they are known."""
+    return [
+        np.asarray(array, like.dtype) if is_known(array) else array
+        for array, like in zip(arrays, form.arrays, strict=False)
+    ]
+
+
 # Inside JAX's transformations.
 
 
@@ -241,7 +347,7 @@ def _spread(values, dots, places: Sequence[Place], dot_places: Sequence[Place], 
     """Tangents of all numbers, from those of the real ones; each array is there so many times."""
     real, parts = iter(dot_places), []
     for place in places:
-        if np.issubdtype(np.dtype(place.dtype), np.floating):
+        if place.is_real:
             own = next(real)
             parts.append(dots[own.start * repeated : (own.start + own.size) * repeated])
         else:

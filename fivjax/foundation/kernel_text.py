@@ -73,6 +73,15 @@ class Place(NamedTuple):
     def size(self) -> int:
         return count_of(self.shape)
 
+    @property
+    def is_real(self) -> bool:
+        return np.issubdtype(np.dtype(self.dtype), np.floating)
+
+    def slopes(self, dots, count: int | None = None):
+        """The derivatives of the array along directions (the last axis), in a row of directions; or of so many of it."""
+        repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))
+        return dots[self.start * repeated : (self.start + self.size) * repeated].reshape(*shape, dots.shape[-1])
+
     def of(self, numbers, count: int | None = None):
         """The array, in such rows of numbers; or so many of it, one after the other."""
         repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))

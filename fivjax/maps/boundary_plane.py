@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..cycles.about_sliding import sliding_state
 from ..cycles.kick_response import MOST_CROSSINGS, Crossings, directions_of, kicked
 from ..cycles.own_coordinates import in_own_coordinates
-from ..cycles.section_map import sliding_state
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..contact import Contact, Status
-from ..cycles.section_map import MOST_SEGMENTS, mechanics_about_sliding
+from ..cycles.about_sliding import mechanics_about_sliding
+from ..cycles.section_motion import MOST_SEGMENTS
 from ..foundation.compiling import compiled
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene

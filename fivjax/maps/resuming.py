@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .. import contact as physics
 from ..batches.sharing import bytes_per_trajectory, in_bulk, kernels_by
-from ..cycles.section_map import mechanics_about_sliding
+from ..cycles.about_sliding import mechanics_about_sliding
 from ..foundation import arguments
 from ..foundation.traced_code import digest, is_from_outside
 from ..model.description import code_of, describe

@@ -255,6 +255,12 @@ def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
 _steady_sliding = by_numpy(steady_sliding)
 
 
+@by_numpy
+def _largest_friction(scene: Scene) -> Float[Array, "*contacts"]:
+    """The largest friction at slip speeds up to that of steady sliding."""
+    return scene.friction.largest(steady_slip_speeds(scene))
+
+
 @returning_numpy
 def painleve_friction(structure: Structure) -> Float[Array, ""]:
     r"""The friction beyond which the contact problem has no unique solution, $G_{nn} / |G_{nt}|$, without unit.
@@ -301,7 +307,7 @@ def refuse_vector_contacts(structure: Structure, who: str) -> None:
 def refuse_painleve(scene: Scene) -> None:
     """Refuse friction at which the contact problem has no unique solution, where its value is known."""
     # Every motion that slides or comes to rest passes through these slip speeds.
-    largest = scene.friction.largest(steady_slip_speeds(scene))
+    largest = _largest_friction(scene)
     if is_known(largest) and len(scene.structure.contacts) > 1:
         g = delassus(scene.structure)
         coefficients = np.broadcast_to(np.asarray(largest), len(scene.structure.contacts))

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real
 from .contact_point import ContactPoint, checked_contacts, directions
 from .matrix_checks import check_matrix, check_shapes, checked_names
@@ -315,7 +316,7 @@ class Structure(eqx.Module):
         of stiffness and mass.
         """
         matrices = self.matrices
-        return jnp.sqrt(jnp.concatenate([jnp.diag(matrices.stiffness), jnp.diag(matrices.mass)]))
+        return _weights(matrices.stiffness, matrices.mass)
 
     def __repr__(self) -> str:
         if self.builder is not None:
@@ -354,3 +355,8 @@ class Structure(eqx.Module):
             coordinates=self.coordinates,
             dampers=source.dampers,
         )
+
+
+@by_numpy
+def _weights(stiffness: Float[Array, "n n"], mass: Float[Array, "n n"]) -> Float[Array, " state"]:
+    return jnp.sqrt(jnp.concatenate([jnp.diag(stiffness), jnp.diag(mass)]))
