@@ -177,3 +177,25 @@ def test_numpy_reads_and_writes_the_places_of_arrays_that_jax_does():
     ]
     for form in forms:
         np.testing.assert_array_equal(by_numpy(form)(a, where), form(jnp.asarray(a), jnp.asarray(where)))
+
+
+def test_second_derivatives_of_a_kernel_are_those_of_its_function():
+    """By XLA's programs: `hessian`, and the derivative of a derivative under `vmap` and `jit`."""
+    x, matrix, count = given(3)
+    instants = np.linspace(0.1, 1.0, 4)
+
+    def of(run):
+        def loss(x):
+            ends, rows = run((x, matrix, count), instants)
+            return jnp.sum(ends["batch"]) + jnp.sum(rows["square"]) + jnp.sum(ends["total"] ** 2)
+
+        return loss
+
+    with jax.enable_x64(True):
+        many = x + 0.1 * np.arange(3.0)[:, None]
+        twice = jax.jacfwd(jax.jacfwd(of(function)))
+        for transformed in (jax.hessian, lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))):
+            np.testing.assert_allclose(
+                jax.vmap(transformed(of(KERNEL)))(many), jax.vmap(twice)(many), rtol=1e-9, atol=1e-9
+            )
+            np.testing.assert_allclose(transformed(of(KERNEL))(x), twice(x), rtol=1e-9, atol=1e-9)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from ..contact import Contact
 from ..cycles.section_motion import Arrival, How, Point, motion_of_mechanics
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction, width_for
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
@@ -102,15 +102,9 @@ class SeriesKernels:
         state = len(jax.tree.leaves(self.on_section))
         wide = tuple(place == state for place in range(len(form.arrays)))
         last = np.broadcast_to(np.asarray(crossings, float), len(y))[:, None]
-        slopes = []
-        width = width_for(size, given.shape[1])
-        for start in range(0, size, width):
-            directions = np.eye(size, size + width)[:, start : start + width]
-            _, dots = motion_of_mechanics.derived_of_many(form, given, last, wide, directions, self.pool)
-            slopes.append(dots[0])
-        slopes = np.concatenate(slopes, axis=-1)[..., :size]
+        _, (slopes, _) = motion_of_mechanics.derived_of_many(form, given, last, wide, np.eye(size), self.pool)
         end, _ = motion_of_mechanics.of_many(form, given, last, self.pool)
-        return (*_on_section(end), end.at.time), slopes
+        return (*_on_section(end), end.at.time), slopes.at.point.y
 
     def _section_rows(self, group, y, status, direction, crossings, peaks: bool):
         crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))

@@ -72,7 +72,9 @@ def _around(args, numbers):
         after, series, unit = how.method.with_series(mechanics, way.contact, zero, way.y, way.left)
         goes = (way.left > 0) & (way.count == number)
         peak = higher_peak(mechanics, series, after.h, after.h / unit, way.peak)
-        moved = _Way(after.y, after.contact, jnp.where(after.h >= way.left, 0.0, way.left - after.h), peak, way.count + 1)
+        moved = _Way(
+            after.y, after.contact, jnp.where(after.h >= way.left, 0.0, way.left - after.h), peak, way.count + 1
+        )
         row = Round(period - way.left, after.h, way.y, way.contact, after.ended, series, unit)
         return jax.tree.map(lambda new, old: jnp.where(goes, new, old), moved, way), row
 

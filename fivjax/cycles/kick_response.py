@@ -62,7 +62,9 @@ def started(
     return _followed(quiet, stepper, fixed, start, directions, crossings)
 
 
-def _followed(scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings: int) -> Crossings:
+def _followed(
+    scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings: int
+) -> Crossings:
     by_kernel, wanted = has_kernel(scene, stepper), crossings
     if not by_kernel:
         # XLA compiles a program for each number of rows.
@@ -73,9 +75,7 @@ def _followed(scene: Scene, stepper: EventExact, directions: Scene, start: Point
     moving = still[0], along, still[2], still[3]
     if of_start is not None:
         moving = eqx.tree_at(lambda args: args[2].y, moving, of_start.T)
-    (end, rows), (_, slopes) = _motion_after_kick.derived(
-        args, np.arange(1.0, wanted + 1), moving, by_kernel=by_kernel
-    )
+    (end, rows), (_, slopes) = _motion_after_kick.derived(args, np.arange(1.0, wanted + 1), moving, by_kernel=by_kernel)
     at, contact = rows.point, rows.point.contact
     return Crossings(
         at.y, np.moveaxis(slopes.point.y, -1, 0), contact.status, contact.direction, rows.events, int(end.crossed)

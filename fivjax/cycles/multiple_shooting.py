@@ -16,16 +16,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State, Status
-from ..foundation.compiling import compiled, power_of_4
+from ..contact import Contact, Status
+from ..foundation.carried import depending_on
+from ..foundation.compiling import power_of_4
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.numpy_evaluation import by_numpy
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.kernel_scope import has_kernel
 from .about_sliding import mechanics_about_sliding
 from .around import Round
+from .section_motion import How
 
 # A phase ends at one of the two guards of its mode (0 or 1), or at the section.
 AT_SECTION = 2
@@ -111,61 +115,67 @@ def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) 
 
 def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> Images:
     """`images` of single phases, each with the mode that follows it."""
-    count = len(modes)
-    most = power_of_4(max(count, LEAST))
-    fill = np.minimum(np.arange(most), count - 1)
-    own = np.array(modes, float)[fill]
-    next_ = np.array(following, float)[fill]
-    found = _images(
-        scene,
-        direction,
-        stepper,
-        np.asarray(y, float)[fill],
-        np.asarray(h, float)[fill],
-        own[:, 0].astype(np.int32),
-        own[:, 1],
-        own[:, 2].astype(np.int32),
-        next_[:, 0].astype(np.int32),
-        next_[:, 1],
-    )
-    return Images(*(np.asarray(part)[:count] for part in found))
-
-
-@compiled
-def _images(scene, direction, stepper, y, h, status, pointing, ending, next_status, next_pointing):
-    mechanics, mechanics_direction = jax.jvp(mechanics_about_sliding, (scene,), (direction,))
-    n2, stepper = y.shape[1], for_derivatives(stepper, mechanics)
+    by_kernel, count = has_kernel(scene, stepper), len(modes)
+    ends = Ends(*_typed(modes), *_typed(following)[:2])
+    own = _filled((np.asarray(y, float), np.asarray(h, float), ends), by_kernel)
+    size = own[0].shape[1]
     # Directions of the derivatives: those of the state, the duration, the parameter.
-    eye = jnp.eye(n2 + 2, dtype=y.dtype)
-
-    def of_phase(y, h, *modes):
-        def along(unit):
-            tangent = jax.tree.map(lambda leaf: unit[-1] * leaf, mechanics_direction)
-            return jax.jvp(
-                lambda y, h, mechanics: _image(stepper, mechanics, y, h, *modes),
-                (y, h, mechanics),
-                (unit[:n2], unit[n2], tangent),
-            )
-
-        (reached, guard), (to, of_guard) = jax.vmap(along, out_axes=(None, 0))(eye)
-        return reached, guard, to[:n2].T, to[n2], to[n2 + 1], of_guard[:n2], of_guard[n2], of_guard[n2 + 1]
-
-    return jax.vmap(of_phase)(y, h, status, pointing, ending, next_status, next_pointing)
+    args = How(stepper), scene
+    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), size + 2)), (*args, *_first(own)))
+    of_parameter = jax.tree.map(lambda leaf: np.asarray(leaf, float)[..., None] * np.eye(size + 2)[-1], direction)
+    units = np.eye(size + 2)
+    directions = still[0], of_parameter, units[:size], units[size], still[4]
+    found = _image.derived(args, np.zeros(1), directions, own=own, by_kernel=by_kernel)
+    ((y, guard), _), ((to, of_guard), _) = found
+    parts = y, guard, to[..., :size], to[..., size], to[..., size + 1]
+    return Images(*(part[:count] for part in (*parts, of_guard[:, :size], of_guard[:, size], of_guard[:, size + 1])))
 
 
-def _image(stepper, mechanics: Mechanics, y: State, h, status, pointing, ending, next_status, next_pointing):
-    contact, following = Contact(status, pointing), Contact(next_status, next_pointing)
+class Ends(NamedTuple):
+    """The contact mode of a phase, how it ends, and the mode that follows; as arrays."""
+
+    status: Int[np.ndarray, "..."]
+    pointing: Float[np.ndarray, "..."]
+    ending: Int[np.ndarray, "..."]
+    next_status: Int[np.ndarray, "..."]
+    next_pointing: Float[np.ndarray, "..."]
+
+
+def _typed(modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    status, direction, ending = np.array(modes, float).T
+    return status.astype(np.int32), direction, ending.astype(np.int32)
+
+
+def _filled(own, by_kernel: bool):
+    """The arrays of all phases; for XLA, which compiles each number of them, filled up to one of few numbers."""
+    if by_kernel:
+        return own
+    count = len(jax.tree.leaves(own)[0])
+    fill = np.minimum(np.arange(power_of_4(max(count, LEAST))), count - 1)
+    return jax.tree.map(lambda leaf: leaf[fill], own)
+
+
+def _first(own):
+    return jax.tree.map(lambda leaf: leaf[0], own)
+
+
+def _image_of_phase(args, numbers):
+    how, scene, y, h, ends = args
+    del numbers
+    mechanics = mechanics_about_sliding(scene)
+    stepper = for_derivatives(how.method, mechanics)
+    contact, following = Contact(ends.status, ends.pointing), Contact(ends.next_status, ends.next_pointing)
     n, none = y.shape[0] // 2, jnp.zeros((), y.dtype)
     begin = physics.on_constraint(mechanics, contact, y)
     end = physics.on_constraint(mechanics, contact, stepper.in_one_mode(mechanics, contact, begin, h))
     velocity = n + mechanics.tangential
     guards = jnp.append(physics.guards(mechanics, contact, none, end), -end[velocity])
-    ended = jnp.arange(2) == ending
+    ended = jnp.arange(2) == ends.ending
     _, after = physics.transition(mechanics, contact, none, end, ended, none)
     after = jnp.where(
-        ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after)
+        ends.ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after)
     )
-    return after, jnp.sum(jnp.where(jnp.arange(3) == ending, guards, 0.0))
+    return (after, jnp.sum(jnp.where(jnp.arange(3) == ends.ending, guards, 0.0))), ()
 
 
 class Inside(NamedTuple):
@@ -177,31 +187,27 @@ class Inside(NamedTuple):
 
 def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
     """Guards and states along all phases, including both ends of each."""
-    count = len(phases.modes)
-    most = power_of_4(max(count, LEAST))
-    fill = np.minimum(np.arange(most), count - 1)
-    own = np.array(phases.modes, float)[fill]
-    found = _inside(scene, stepper, phases.y[fill], phases.h[fill], own[:, 0].astype(np.int32), own[:, 1])
-    return Inside(*(np.asarray(part)[:count] for part in found))
+    by_kernel, (status, direction, _) = has_kernel(scene, stepper), _typed(phases.modes)
+    own = _filled((phases.y, phases.h, status, direction), by_kernel)
+    _, rows = _looks((How(stepper), scene), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
+    return Inside(*(part[: len(phases.modes)] for part in rows))
 
 
-@compiled
-def _inside(scene, stepper, y, h, status, pointing):
-    mechanics = mechanics_about_sliding(scene)
+def _inside_of_phase(args, shares):
+    how, scene, y, h, status, direction = args
+    mechanics, contact = mechanics_about_sliding(scene), Contact(status, direction)
+    none = jnp.zeros((), y.dtype)
 
-    def of_phase(y, h, status, pointing):
-        contact = Contact(status, pointing)
+    def to_next(before, share):
+        y, gone = before
+        y = how.method.in_one_mode(mechanics, contact, y, (share - gone) * h)
+        return (y, share), Inside(physics.guards(mechanics, contact, none, y), y)
 
-        def to_next(state, _):
-            following = stepper.in_one_mode(mechanics, contact, state, h / LOOKS)
-            return following, following
+    return (), jax.lax.scan(to_next, depending_on(mechanics, (y, none)), shares)[1]
 
-        _, rest = jax.lax.scan(to_next, y, None, length=LOOKS)
-        states = jnp.concatenate([y[None], rest])
-        none = jnp.zeros((), y.dtype)
-        return jax.vmap(lambda state: physics.guards(mechanics, contact, none, state))(states), states
 
-    return jax.vmap(of_phase)(y, h, status, pointing)
+# Of (how, scene, y, h, ends), and of (how, scene, y, h, status, direction).
+_image, _looks = KernelFunction(_image_of_phase), KernelFunction(_inside_of_phase)
 
 
 def parameter_direction(scene: Scene, name: str) -> Scene:

@@ -56,7 +56,9 @@ def _moved_with_jacobian(scene: Scene, stepper: EventExact, point: Point, crossi
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), size)), args)
     directions = eqx.tree_at(lambda args: args[2].y, still, np.eye(size))
     by_kernel = has_kernel(scene, stepper)
-    (found, _), (slopes, _) = motion_of_scene.derived(args, np.array([float(crossings)]), directions, by_kernel=by_kernel)
+    (found, _), (slopes, _) = motion_of_scene.derived(
+        args, np.array([float(crossings)]), directions, by_kernel=by_kernel
+    )
     at = found.at
     return Return(at.point, at.time, at.events, at.segments, found.arrived), slopes.at.point.y
 
@@ -69,7 +71,6 @@ def points_along(scene: Scene, stepper: EventExact, starts: Point, count: int) -
     starts = jax.tree.map(known_to_numpy, starts)
     own = starts, *(np.full(len(starts.y), last) for last in (np.int32(count), np.inf))
     numbers = np.arange(1.0, count + 1)
-    _, rows = motion_of_scene.many((How(stepper), scene), own, numbers, by_kernel=has_kernel(scene, stepper))
+    _, rows = motion_of_scene((How(stepper), scene), numbers, own=own, by_kernel=has_kernel(scene, stepper))
     each = [np.diff(part, axis=1, prepend=0) for part in (rows.time, rows.events, rows.segments)]
     return Return(rows.point, *each, np.all(np.isfinite(rows.point.y), axis=-1))
-

@@ -78,9 +78,10 @@ class Place(NamedTuple):
         return np.issubdtype(np.dtype(self.dtype), np.floating)
 
     def slopes(self, dots, count: int | None = None):
-        """The derivatives of the array along directions (the last axis), in a row of directions; or of so many of it."""
+        """The derivatives of the array along directions (the last axis), in such rows of directions; or of so many of it."""
         repeated, shape = (1, self.shape) if count is None else (count, (count, *self.shape))
-        return dots[self.start * repeated : (self.start + self.size) * repeated].reshape(*shape, dots.shape[-1])
+        part = dots[..., self.start * repeated : (self.start + self.size) * repeated, :]
+        return part.reshape(*dots.shape[:-2], *shape, dots.shape[-1])
 
     def of(self, numbers, count: int | None = None):
         """The array, in such rows of numbers; or so many of it, one after the other."""

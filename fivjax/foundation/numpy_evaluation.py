@@ -23,6 +23,7 @@ REPAID = 100
 P = ParamSpec("P")
 R = TypeVar("R")
 
+
 def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
     """`compiled`, but the first calls with known values are computed by NumPy; results are then arrays of NumPy."""
     otherwise = compiled(function)

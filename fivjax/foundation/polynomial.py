@@ -50,7 +50,11 @@ def _with_derivatives(c: Sequence[Array] | Array, x: Array, count: int) -> list[
     zeros = [jnp.zeros_like(c[-1] * x)] * count
     # A loop that XLA unrolls, and that kernels keep.
     found, _ = jax.lax.scan(
-        lambda found, own: (_one_further(found, x, own), None), [c[-1] + zeros[0], *zeros], c[:-1], reverse=True, unroll=True
+        lambda found, own: (_one_further(found, x, own), None),
+        [c[-1] + zeros[0], *zeros],
+        c[:-1],
+        reverse=True,
+        unroll=True,
     )
     return found[:2] + [math.factorial(j) * found[j] for j in range(2, count + 1)]
 

@@ -300,7 +300,10 @@ def _rounding(
     sizes, first = following(mechanics, load, jnp.abs(y), 1)
     changes, none = mechanics.homogeneous, jnp.zeros_like(load)
     _, rest = jax.lax.scan(
-        lambda sizes, divisor: following(changes, none, sizes, divisor), sizes, np.array([2.0, 3.0], y.dtype), unroll=True
+        lambda sizes, divisor: following(changes, none, sizes, divisor),
+        sizes,
+        np.array([2.0, 3.0], y.dtype),
+        unroll=True,
     )
     return jnp.concatenate([first[None], rest])
 
