@@ -206,9 +206,9 @@ def test_event_exact_interpolates_through_events_inside_a_step(paper_scene):
 
 def test_a_grazing_dip_inside_one_advance_is_found():
     """A gap that closes and opens again within one step must be seen, though it is open at both of the step's ends."""
-    from fivjax.steppers.event_exact import _march_to_roots
+    from fivjax.steppers.guard_roots import march_to_roots
 
-    march = jax.jit(_march_to_roots)
+    march = jax.jit(march_to_roots)
     with jax.enable_x64(True):
         for depth in (1e-1, 1e-4, 1e-8, 1e-12):
             # (x - 0.6)² - depth: positive at both ends, two roots in between.
@@ -223,13 +223,13 @@ def test_a_grazing_dip_inside_one_advance_is_found():
 
 def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
     """The march must stop at the first real root in [0, 1] and nowhere else; NumPy finds all roots."""
-    from fivjax.steppers.event_exact import _march_to_roots
+    from fivjax.steppers.guard_roots import march_to_roots
 
     rng = np.random.default_rng(1)
     coefficients = rng.normal(size=(400, 8)) / np.arange(1, 9)
     coefficients[:, 0] = np.abs(coefficients[:, 0]) + 1e-3
     with jax.enable_x64(True):
-        x, fires = map(np.asarray, jax.jit(_march_to_roots)(jnp.asarray(coefficients.T)))
+        x, fires = map(np.asarray, jax.jit(march_to_roots)(jnp.asarray(coefficients.T)))
     for row, position, fired in zip(coefficients, x, fires, strict=True):
         roots = np.roots(row[::-1])
         real = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0) & (roots.real < 1)].real)
@@ -250,12 +250,12 @@ def test_a_step_clipped_to_any_length_is_exact(paper_scene):
 
 def test_a_guard_about_to_run_out_is_not_taken_for_one_that_has_just_begun():
     """An advance may end a rounding short of a root. The next one must find it at once, not divide it out as its own start."""
-    from fivjax.steppers.event_exact import _march_to_roots
+    from fivjax.steppers.guard_roots import march_to_roots
 
     with jax.enable_x64(True):
 
         def march(*c):
-            x, fires = jax.jit(_march_to_roots)(jnp.array(c)[:, None])
+            x, fires = jax.jit(march_to_roots)(jnp.array(c)[:, None])
             return float(x[0]), bool(fires[0])
 
         assert march(1e-14, -1.0, 0.5) == (0.0, True)

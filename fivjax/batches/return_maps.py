@@ -238,8 +238,8 @@ def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
     return flatten(jax.vmap(of_group)(shared.tree, *own), row_axes=2)
 
 
-def _to_crossing(shared, y, status, direction, crossings, rows: int, how: How, careful: bool = False):
-    mechanics, longest = shared
+def _to_crossing(shared, row, rows: int, how: How, careful: bool = False):
+    (mechanics, longest), (y, status, direction, crossings) = shared, row
     start, method = Point(y, Contact(status, direction)), how.method
     method = for_derivatives(method, mechanics) if careful else method
     numbers = crossings - jnp.arange(rows, dtype=y.dtype)[::-1]
@@ -252,7 +252,7 @@ def _to_crossing(shared, y, status, direction, crossings, rows: int, how: How, c
 @compiled
 def _returned(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, *row):
-        section, end, path = _to_crossing(shared, *row, KEPT, How(EventExact()))
+        section, end, path = _to_crossing(shared, row, KEPT, How(EventExact()))
         return *section, end.at.events, end.at.time, path
 
     return of_block(one, shared, rows)
@@ -263,7 +263,7 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, y, *row):
         def along(direction):
             def state(y):
-                section, end, _ = _to_crossing(shared, y, *row, 1, How(EventExact()), careful=True)
+                section, end, _ = _to_crossing(shared, (y, *row), 1, How(EventExact()), careful=True)
                 return section[0], (*section, end.at.time)
 
             _, tangent, found = jax.jvp(state, (y,), (direction,), has_aux=True)
@@ -277,7 +277,7 @@ def _derived(shared: Flattened, rows: Flattened) -> Flattened:
 @compiled
 def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, *row):
-        _, end, _ = _to_crossing(shared, *row, 1, How(EventExact(), peaks=True))
+        _, end, _ = _to_crossing(shared, row, 1, How(EventExact(), peaks=True))
         return jnp.where(end.arrived, end.peak, jnp.nan)
 
     return of_block(one, shared, rows)

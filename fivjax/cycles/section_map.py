@@ -72,5 +72,5 @@ def points_along(scene: Scene, stepper: EventExact, starts: Point, count: int) -
     own = starts, *(np.full(len(starts.y), last) for last in (np.int32(count), np.inf))
     numbers = np.arange(1.0, count + 1)
     _, rows = motion_of_scene((How(stepper), scene), numbers, own=own, by_kernel=has_kernel(scene, stepper))
-    each = [np.diff(part, axis=1, prepend=0) for part in (rows.time, rows.events, rows.segments)]
-    return Return(rows.point, *each, np.all(np.isfinite(rows.point.y), axis=-1))
+    time, events, segments = (np.diff(part, axis=1, prepend=0) for part in (rows.time, rows.events, rows.segments))
+    return Return(rows.point, time, events, segments, np.all(np.isfinite(rows.point.y), axis=-1))

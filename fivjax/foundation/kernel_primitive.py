@@ -152,9 +152,9 @@ def _program_of(kernel: _Hashed):
 def _found_by_xla(kernel: Kernel, given, dots, instants) -> list:
     """What a kernel finds, by XLA: the same numbers in the same places."""
     if given.ndim > 1:
-        along = 0, None, 0 if instants.ndim > 1 else None
-        return jax.vmap(functools.partial(_found_by_xla, kernel), along)(given, dots, instants)
-    moving, width = kernel.wide + (False,) * len(kernel.form.arrays), max(kernel.width, 1)
+        axes = 0, None, 0 if instants.ndim > 1 else None
+        return jax.vmap(functools.partial(_found_by_xla, kernel), axes)(given, dots, instants)
+    moving = kernel.wide + (False,) * len(kernel.form.arrays)
 
     def arrays_from(numbers, chosen):
         found, start = [], 0

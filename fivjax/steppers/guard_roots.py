@@ -1,0 +1,120 @@
+"""Where guards run out along a step, from their Taylor series."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .. import contact as physics
+from ..contact import Mechanics
+from ..contact.rounding import zero_at_start
+from ..foundation.polynomial import ratio, value_and_slope, value_slope_and_bend
+
+MOST_ROOT_STEPS = 60
+
+
+def together(
+    mechanics: Mechanics, scaled: Float[Array, "k g"], fires: Bool[Array, " g"], first: Float[Array, ""]
+) -> Bool[Array, " g"]:
+    """Which of the guards of several contacts that run out at the end of the advance are one event.
+
+    An event of one contact acts at once on the contacts that the mass matrix couples with it. So their simultaneous events,
+    even if the instants differ by rounding, are one event. Simultaneous events of other contacts follow one after another,
+    perhaps with no time in between: each then has its own instant, and its own derivative.
+    """
+    count = 2 * len(mechanics.places)
+    chosen = jax.lax.argmax(fires, 0, jnp.int32)
+    among = physics.coupled_with(mechanics, jnp.minimum(chosen, count - 1) // 2)
+    own = jnp.arange(count) // 2 == chosen // 2
+    own_guards = jax.lax.stop_gradient(scaled[:, :count])
+    values, slopes = value_and_slope(own_guards, first)
+    size = jnp.sum(jnp.abs(own_guards), axis=0)
+    nearly = (values <= 64 * jnp.finfo(size.dtype).eps * size) & (slopes < 0)
+    coupled = jnp.repeat(among, 2) & jnp.any(fires[:count])
+    of_contacts = coupled & (fires[:count] | (nearly & ~own))
+    # The row of the section, if there is one, belongs to no contact.
+    return jnp.concatenate([of_contacts, fires[count:]])
+
+
+def march_to_roots(
+    c: Float[Array, "k g"],
+    rounding: Float[Array, "3 g"] | None = None,
+    exact: Bool[Array, " g"] | None = None,
+) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
+    r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
+
+    It marches from zero by steps d in which no root is possible: a lower bound on the second derivative gives
+    $g + g' d - B_2 d^2 / 2 > 0$, and where $g$, $g'$ and $g''$ are positive, one on the third gives
+    $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is needed at the flat start after a lift-off. On [0, 1] the negative coefficients
+    alone give the bounds. So no root is skipped, a dip below zero inside the interval is found at its first crossing, and near
+    a simple root the march converges quadratically. Roots at zero, where the status began, are divided out; with an `exact`
+    start, a small value there is no rounding error. A march that uses up its steps has still shown that there is no root up to
+    where it came.
+    """
+    eps = jnp.finfo(c.dtype).eps
+    none = jnp.zeros_like(c[0])
+    size, _ = jax.lax.scan(lambda size, own: (size + jnp.abs(own), None), none, c, unroll=True)
+    rounding = jnp.zeros((3, *none.shape), none.dtype) if rounding is None else rounding
+    exact = jnp.zeros_like(size, bool) if exact is None else exact
+    zeros = zero_at_start(c, size, rounding, exact)
+
+    def divided(carry, here):
+        """The coefficient that this one becomes, and what it adds to the bounds."""
+        (next_, next_but_one, third), bound_2, bound_3 = carry
+        own, k = here
+        after = next_, next_but_one, third
+        found = own
+        for place in range(3):
+            found = jnp.where(zeros[place], after[place], found)
+        falling = jnp.maximum(-found, 0.0)
+        bound_2 = bound_2 + k * (k - 1) * falling
+        bound_3 = bound_3 + k * (k - 1) * (k - 2) * falling
+        return ((own, next_, next_but_one), bound_2, bound_3), found
+
+    places = np.arange(len(c), dtype=c.dtype)
+    (_, bound_2, bound_3), c = jax.lax.scan(divided, ((none,) * 3, none, none), (c, places), reverse=True, unroll=True)
+    huge = 1.0 / eps
+
+    # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
+    spent = c[0] < 0
+
+    def open_(x, step):
+        return ~spent & (x < 1) & (step > 2 * eps * x)
+
+    def going(carry):
+        x, step, count = carry
+        return jnp.any(open_(x, step)) & (count < MOST_ROOT_STEPS)
+
+    def march(carry):
+        x, step, count = carry
+        value, slope, bend = value_slope_and_bend(c, x)
+        value = jnp.maximum(value, 0.0)
+        root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
+        # Two forms of the same root, each used where it has no cancellation.
+        falls = slope < 0
+        quadratic = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
+        cubic = ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
+        onward = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(quadratic, cubic), quadratic)
+        onward = jnp.where(open_(x, step), onward, step)
+        return jnp.where(open_(x, step), x + onward, x), onward, count + 1
+
+    x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
+    found = spent | ((x < 1) & (step <= 2 * eps * x))
+    return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
+
+
+def implicit_root(scaled: Float[Array, "k g"], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
+    """The root with the derivatives of an implicit function.
+
+    A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first
+    derivatives are right, after the second one the second derivatives, too.
+    """
+    # An index of 64 bits could not be lowered in a single-precision program.
+    chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
+    for _ in range(2):
+        values, slopes = value_and_slope(scaled, x)
+        value = jnp.sum(jnp.where(chosen, values, 0.0))
+        slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
+        correction = value / jnp.where(slope == 0, 1.0, slope)
+        x = x - (correction - jax.lax.stop_gradient(correction))
+    return x

@@ -1,0 +1,98 @@
+"""The Taylor series of motion in one contact mode, and of what ends it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, ModeForces, State
+from ..contact.rounding import largest_rounding
+
+
+class Series(NamedTuple):
+    """Taylor coefficients, in time measured in a unit; and the forces of the mode at the start."""
+
+    states: Float[Array, "k state"]
+    guards: Float[Array, "k *contacts 2"]
+    slip: Float[Array, "k *contacts"]
+    friction: Float[Array, "j *contacts"]  # of μ; only its value, if it is constant
+    mode: ModeForces
+
+
+def series_of(
+    mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
+) -> Series:
+    """Taylor coefficients of the motion in one contact mode, in time measured in `unit` (s).
+
+    The physics is linear in the state except for T = σμN, so it maps coefficients to coefficients; the constant terms (load,
+    belt speed) enter with the first. T = σμN is the product of two series.
+    """
+    n = y.shape[0] // 2
+    slip = physics.slip_speed(mechanics, contact, y)
+    friction = [mechanics.friction(slip)]
+    mode = ModeForces(mechanics, contact, friction[0])
+
+    def following(own: Mechanics, force, state: State, slip, otherwise, divisor):
+        """What follows from one coefficient of the state: the next, and those of the guards and of N."""
+        free = physics.free_acceleration(own, force, state)
+        forces = mode.added(own, free, otherwise)
+        guards = physics.guards_under(own, contact, *forces, slip, physics.gap(own, state))
+        rate = jnp.concatenate([state[n:], physics.acceleration_under(own, contact, free, *forces)])
+        return rate * (unit / divisor), guards, physics.total_forces(own, *forces)[1]
+
+    changes, none = mechanics.homogeneous, jnp.zeros_like(load)
+    state, guards, normal_force = following(mechanics, load, y, slip, None, 1)
+    if mechanics.friction.constant:
+
+        def next_one(state: State, divisor):
+            slip = physics.slip_speed(changes, contact, state)
+            further, guards, _ = following(changes, none, state, slip, None, divisor)
+            return further, (state, guards, slip)
+
+        # A loop that XLA unrolls, and that kernels keep.
+        _, rows = jax.lax.scan(next_one, state, np.arange(2.0, order + 2.0, dtype=y.dtype), unroll=True)
+        first = y, guards, slip
+        states, guards, slips = (jnp.concatenate([one[None], more]) for one, more in zip(first, rows, strict=True))
+        return Series(states, guards, slips, friction[0][None], mode)
+    next_term = mechanics.friction.in_time(slip, order)
+    states, all_guards, slips, normal_forces = [y], [guards], [slip], [normal_force]
+    for k in range(1, order + 1):
+        states.append(state)
+        slips.append(physics.slip_speed(changes, contact, state))
+        friction.append(next_term(slips, friction))
+        otherwise = contact.direction * sum(
+            (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
+        )
+        state, guards, normal_force = following(changes, none, state, slips[k], otherwise, k + 1)
+        all_guards.append(guards)
+        normal_forces.append(normal_force)
+    return Series(jnp.stack(states), jnp.stack(all_guards), jnp.stack(slips), jnp.stack(friction), mode)
+
+
+def guard_rounding(
+    mechanics: Mechanics,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    unit: Float[Array, ""],
+    mode: ModeForces,
+) -> Float[Array, "3 *contacts 2"]:
+    """Bounds on the rounding of the first three coefficients of the guards."""
+    mechanics, contact, load, y, mode = jax.lax.stop_gradient((mechanics, contact, load, y, mode))
+
+    def following(own: Mechanics, force, sizes: State, divisor):
+        guards, rates = physics.magnitudes(own, contact, force, sizes, mode)
+        return rates * (unit / divisor), largest_rounding(guards)
+
+    sizes, first = following(mechanics, load, jnp.abs(y), 1)
+    changes, none = mechanics.homogeneous, jnp.zeros_like(load)
+    _, rest = jax.lax.scan(
+        lambda sizes, divisor: following(changes, none, sizes, divisor),
+        sizes,
+        np.array([2.0, 3.0], y.dtype),
+        unroll=True,
+    )
+    return jnp.concatenate([first[None], rest])
