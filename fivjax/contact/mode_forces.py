@@ -1,6 +1,6 @@
 r"""The contact forces of a mode, as a linear function of the accelerations that the contacts would have without them.
 
-For one contact the forces in the three statuses are written out. For several, the demands of all contacts are one linear
+For one contact the forces are written out. For several, the demands of all contacts are one linear
 system: with the Delassus matrix G and the contact forces λ, the row of a contact's T says $(G λ)_t = -a_t$ (stick),
 $T - σ μ N = 0$ (slide) or $T = 0$ (detach); that of its N says $(G λ)_n = -a_n$ (stick, slide) or $N = 0$ (detach). Its inverse
 is worked out once for the whole time that a mode lasts.
@@ -22,18 +22,18 @@ class ModeForces(eqx.Module):
 
     contact: Contact
     dragging: Float[Array, "*contacts"]  # σμ
-    compliance: Float[Array, ""] | None  # G_nn + σμ G_nt, of one contact
+    of_one: "_OneContact | None"
     answer: Float[Array, "k k"] | None  # the inverse of the system of several contacts: from right-hand sides to (T, N)
 
     def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]):
         self.contact = contact
         self.dragging = contact.direction * mu
-        self.compliance = self.answer = None
+        self.of_one = self.answer = None
         if mechanics.several:
             sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
             self.answer = inverse(mode_matrix(mechanics, sticking, closed, self.dragging))
         else:
-            self.compliance = mechanics.normal_compliance(contact.direction, mu)
+            self.of_one = _OneContact(mechanics, contact, mu)
 
     def added(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Each | None = None) -> tuple[Each, Each]:
         """(T, N) in N that the mode adds to those at `mechanics.rest`.
@@ -46,24 +46,17 @@ class ModeForces(eqx.Module):
             otherwise = more if otherwise is None else otherwise + more
         if self.answer is not None:
             return self._of_several(self.answer, mechanics, free, otherwise)
-        slide_t, slide_n = self._sliding(mechanics, free, otherwise)
-        stick_t, stick_n = sticking_forces(mechanics, free)
-        open_t = open_n = jnp.zeros_like(slide_n)
-        if mechanics.rest is not None:
-            open_t, open_n = -mechanics.rest.tangential_force, -mechanics.rest.normal_force
-        return (
-            by_status(self.contact, stick=stick_t, slide=slide_t, detach=open_t),
-            by_status(self.contact, stick=stick_n, slide=slide_n, detach=open_n),
+        assert self.of_one is not None
+        status = self.contact.status
+        tangential_force, normal_force = self.of_one.forces(
+            mechanics, free, None if otherwise is None else jnp.where(status == Status.SLIDE, otherwise, 0.0)
         )
-
-    def _sliding(self, mechanics: Mechanics, free, otherwise) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        pressed = free[mechanics.normal]
-        if otherwise is None:
-            normal_force = -pressed / self.compliance
-            return self.dragging * normal_force, normal_force
-        _, g_tn, _ = mechanics.compliance
-        normal_force = -(pressed + g_tn * otherwise) / self.compliance
-        return self.dragging * normal_force + otherwise, normal_force
+        if mechanics.rest is None:
+            return tangential_force, normal_force
+        return (
+            jnp.where(status == Status.DETACH, -mechanics.rest.tangential_force, tangential_force),
+            jnp.where(status == Status.DETACH, -mechanics.rest.normal_force, normal_force),
+        )
 
     def _of_several(
         self, answer, mechanics: Mechanics, free, otherwise
@@ -91,6 +84,34 @@ def mode_matrix(
             jnp.concatenate([jnp.where(touching, g_tn.T, 0.0), jnp.where(touching, g_nn, one)], axis=1),
         ]
     )
+
+
+class _OneContact(eqx.Module):
+    """How the forces of a single contact follow from its free accelerations $a_t$ and $a_n$: $N$ is a sum over both, and $T$
+    one over both and $N$. Divisions by compliances are done once.
+    """
+
+    normal: tuple[Float[Array, ""], Float[Array, ""]]  # kg
+    tangential: tuple[Float[Array, ""], Float[Array, ""]]  # kg
+    dragging: Float[Array, ""]  # σμ while it slides
+
+    def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, ""]):
+        g_tt, g_tn, g_nn = mechanics.compliance
+        sticks, slides, none = contact.status == Status.STICK, contact.status == Status.SLIDE, jnp.zeros_like(mu)
+        stick = jnp.where(sticks, 1.0 / (g_tt * g_nn - g_tn**2), 0.0)
+        slide = jnp.where(slides, 1.0 / mechanics.normal_compliance(contact.direction, mu), 0.0)
+        self.normal = g_tn * stick, -g_tt * stick - slide
+        self.tangential = -g_nn * stick, g_tn * stick
+        self.dragging = jnp.where(slides, contact.direction * mu, none)
+
+    def forces(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Float[Array, ""] | None):
+        free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
+        if otherwise is not None:
+            _, g_tn, _ = mechanics.compliance
+            free_n = free_n + g_tn * otherwise
+        normal_force = self.normal[0] * free_t + self.normal[1] * free_n
+        tangential_force = self.tangential[0] * free_t + self.tangential[1] * free_n + self.dragging * normal_force
+        return (tangential_force if otherwise is None else tangential_force + otherwise), normal_force
 
 
 def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -147,6 +147,8 @@ def simpler(name: str, parts: list):
                 return other
             if isinstance(own, bool):
                 return other if own == (name == "and") else own
+    if name == "sub" and isinstance(parts[0], str) and parts[0] == parts[1]:
+        return 0.0
     if (name == "sub" and _is(parts[1], 0)) or (name == "div" and _is(parts[1], 1)):
         return parts[0]
     if name in ("div", "neg") and _is(parts[0], 0):

@@ -134,6 +134,10 @@ class Writer:
                 return View(first[1], (start,), value.shape, natural(value.shape), kind)
         key = kind, tuple(map(text_of, entries))
         base = self._computed(key)
+        if base is None and is_known(value) and entries:
+            base = self.name(kind, "a")
+            self.put(f"static const {kind} {base}[{len(entries)}] = {{{', '.join(key[1])}}};")
+            self._blocks[-1][key] = base
         if base is None:
             base = self.array(value.size, kind)
             self.copy(value, base, kind)

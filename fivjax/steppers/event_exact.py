@@ -64,7 +64,7 @@ class EventExact(AbstractStepper):
     round: ClassVar = 64
     interpolation_cls: ClassVar = staticmethod(lambda **info: _Restepped(**info))
 
-    def __init__(self, order: int = 16, tolerance: float = 1e-15, dt: float = math.inf):
+    def __init__(self, order: int = 20, tolerance: float = 1e-15, dt: float = math.inf):
         arguments.whole_number("order", order, minimum=4)
         arguments.real_number("tolerance", tolerance, above=0)
         if not (isinstance(dt, float) and dt == math.inf):

@@ -51,53 +51,45 @@ def march_to_roots(
     start, a small value there is no rounding error. A march that uses up its steps has still shown that there is no root up to
     where it came.
     """
-    eps = jnp.finfo(c.dtype).eps
-    none = jnp.zeros_like(c[0])
-    size, _ = jax.lax.scan(lambda size, own: (size + jnp.abs(own), None), none, c, unroll=True)
-    rounding = jnp.zeros((3, *none.shape), none.dtype) if rounding is None else rounding
-    exact = jnp.zeros_like(size, bool) if exact is None else exact
+    count = c.shape[1]
+    rounding = jnp.zeros((3, count), c.dtype) if rounding is None else rounding
+    exact = jnp.zeros(count, bool) if exact is None else exact
+    # One after the other: a march of few steps does not wait for a long one.
+    return jax.lax.map(lambda of_one: _first_root(*of_one), (c.T, rounding.T, exact))
+
+
+def _first_root(
+    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""]
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    eps, size = float(jnp.finfo(c.dtype).eps), jnp.sum(jnp.abs(c))
     zeros = zero_at_start(c, size, rounding, exact)
-
-    def divided(carry, here):
-        """The coefficient that this one becomes, and what it adds to the bounds."""
-        (next_, next_but_one, third), bound_2, bound_3 = carry
-        own, k = here
-        after = next_, next_but_one, third
-        found = own
-        for place in range(3):
-            found = jnp.where(zeros[place], after[place], found)
-        falling = jnp.maximum(-found, 0.0)
-        bound_2 = bound_2 + k * (k - 1) * falling
-        bound_3 = bound_3 + k * (k - 1) * (k - 2) * falling
-        return ((own, next_, next_but_one), bound_2, bound_3), found
-
-    places = np.arange(len(c), dtype=c.dtype)
-    (_, bound_2, bound_3), c = jax.lax.scan(divided, ((none,) * 3, none, none), (c, places), reverse=True, unroll=True)
+    c = jax.lax.dynamic_slice(jnp.pad(c, (0, 3)), (sum(zero.astype(jnp.int32) for zero in zeros),), c.shape)
+    k = np.arange(len(c))
+    falling = jnp.maximum(-c, 0.0)
+    bound_2, bound_3 = (jnp.sum(falling * of.astype(c.dtype)) for of in (k * (k - 1), k * (k - 1) * (k - 2)))
     huge = 1.0 / eps
-
     # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
     spent = c[0] < 0
 
-    def open_(x, step):
-        return ~spent & (x < 1) & (step > 2 * eps * x)
-
     def going(carry):
         x, step, count = carry
-        return jnp.any(open_(x, step)) & (count < MOST_ROOT_STEPS)
+        return ~spent & (x < 1) & (step > 2 * eps * x) & (count < MOST_ROOT_STEPS)
 
     def march(carry):
-        x, step, count = carry
-        value, slope, bend = value_slope_and_bend(c, x)
+        x, _, count = carry
+        value, slope, bend = jax.lax.cond(
+            x > 0, lambda x: value_slope_and_bend(c, x), lambda x: (c[0], c[1], 2 * c[2]), x
+        )
         value = jnp.maximum(value, 0.0)
         root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
         # Two forms of the same root, each used where it has no cancellation.
         falls = slope < 0
-        quadratic = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
+        step = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
         cubic = ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
-        onward = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(quadratic, cubic), quadratic)
-        onward = jnp.where(open_(x, step), onward, step)
-        return jnp.where(open_(x, step), x + onward, x), onward, count + 1
+        step = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(step, cubic), step)
+        return x + step, step, count + 1
 
+    none = jnp.zeros_like(size)
     x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
     found = spent | ((x < 1) & (step <= 2 * eps * x))
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)

@@ -51,12 +51,15 @@ def trusted(states: Float[Array, "k state"], tolerance: float) -> Float[Array, "
     # At rest, but accelerated: a load has just jumped.
     starts = size(2) > 0
 
-    def reach(last):
-        # Where |c_last| h^last = tolerance |c_j| h^j; the larger h of j = 0 and 1, because either coefficient may vanish. In
-        # slow motion of a stiff structure the last term may underflow; it then counts as the smallest normal number.
-        end = jnp.maximum(size(last), tiny)
-        steps = [(tolerance * size(j) / end) ** (1.0 / (last - j)) for j in (0, 1, 2)]
-        longest = jnp.where(moves, jnp.maximum(steps[0], steps[1]), jnp.where(starts, steps[2], jnp.inf))
-        return jnp.where(moves | starts, jnp.minimum(longest, LONGEST_STEP), jnp.inf)
+    logs = [jnp.log(tolerance * size(j)) for j in (0, 1, 2)]
 
-    return jnp.minimum(reach(order), reach(order - 1))
+    def reach(last):
+        # The logarithm of h where |c_last| h^last = tolerance |c_j| h^j; the larger h of j = 0 and 1, because either
+        # coefficient may vanish. In slow motion of a stiff structure the last term may underflow; it then counts as the
+        # smallest normal number.
+        end = jnp.log(jnp.maximum(size(last), tiny))
+        steps = [(logs[j] - end) / (last - j) for j in (0, 1, 2)]
+        return jnp.where(moves, jnp.maximum(steps[0], steps[1]), steps[2])
+
+    longest = jnp.minimum(jnp.exp(jnp.minimum(reach(order), reach(order - 1))), LONGEST_STEP)
+    return jnp.where(moves | starts, longest, jnp.inf)
