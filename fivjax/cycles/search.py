@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..contact import Contact, State, Status, status_from_forces
+from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision
@@ -327,9 +327,12 @@ def _released_states(scene: Scene, loads: Float[jax.Array, " e"]) -> State:
     return jax.vmap(lambda load: sliding_state(scene, load * scene.load.final) - rest)(loads)
 
 
+known_mechanics = by_numpy(mechanics_about_sliding)
+
+
 @by_numpy
-def _in_contact_mode(scene: Scene, y: State) -> Contact:
-    mechanics = mechanics_about_sliding(scene)
+def contacts_demanded(mechanics: Mechanics, y: Float[np.ndarray, "e state"]) -> Contact:
+    """The contact modes that the forces of states demand (deviations from sliding; leading axis)."""
     return jax.vmap(lambda y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(y)
 
 
@@ -348,7 +351,7 @@ def _released(scene: Scene, loads: Sequence[float], speeds: Sequence[float], sta
 
 def states_in_contact(scene: Scene, y: Float[jax.Array, "e state"]) -> Point:
     """States (deviations from sliding; leading axis) with the contact modes that their forces demand."""
-    return Point(y, _in_contact_mode(scene, y))
+    return Point(y, contacts_demanded(known_mechanics(scene), y))
 
 
 def _state_of(scene: Scene, start) -> np.ndarray:
@@ -383,7 +386,7 @@ def _guess(scene: Scene, stepper: EventExact, start) -> tuple[Point, list[int]]:
         start, status = start
     rest = np.asarray(sliding_state(scene, scene.load.final))
     y = np.asarray(_state_of(scene, start) - rest)
-    contact = jax.tree.map(lambda leaf: leaf[0], _in_contact_mode(scene, y[None]))
+    contact = jax.tree.map(lambda leaf: leaf[0], contacts_demanded(known_mechanics(scene), y[None]))
     if status is not None:
         known = [int(Status(int(one))) for one in np.atleast_1d(status)]
         contact = Contact(np.asarray(known, np.int32).reshape(contact.status.shape), contact.direction)

@@ -41,7 +41,7 @@ class Kernel:
         self.text = text(kept_value(written, own, form, wide, folder=folder_of_texts()))
         self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
         with ONE_AT_A_TIME:
-            self.kernel = _compiled(self.text.source, self.text.widths(), self.directions, width)
+            self.kernel = _compiled(self.text.source, self.text.widths, self.directions, width)
 
     def launched(self, given, instants, dots=None, pool: Executor | None = None):
         """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
@@ -54,7 +54,7 @@ class Kernel:
 
     def shapes(self, batch: tuple[int, ...], count: int) -> tuple[tuple[int, ...], ...]:
         """Those of what is found, for a batch of trajectories with so many instants."""
-        ends, rows, end_dots, row_dots = self.text.widths()
+        ends, rows, end_dots, row_dots = self.text.widths
         width = max(self.width, 1)
         of_rows = count * row_dots if self.width else 1
         return (*batch, ends), (*batch, count * rows), (*batch, end_dots, width), (*batch, of_rows, width)
@@ -91,7 +91,7 @@ class Kernel:
 
     def results(self, ends, rows):
         """The function's results from rows of numbers; these may have more axes before their own."""
-        total = self.text.widths()[1]
+        total = self.text.widths[1]
         parts = (
             [place.of(ends) for place in self.text.ends],
             [place.of(rows, rows.shape[-1] // total) for place in self.text.rows],

@@ -4,6 +4,7 @@ A small array is an array of Python objects: texts that name variables, or numbe
 `View` of a C array. Slices, transposes and their like are carried out here, so that the code has nothing of them.
 """
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -63,7 +64,7 @@ Value: TypeAlias = np.ndarray | View
 
 def count_of(shape) -> int:
     """How many numbers an array of this shape has."""
-    return int(np.prod(shape, dtype=int))
+    return math.prod(shape)
 
 
 def natural(shape) -> tuple[int, ...]:

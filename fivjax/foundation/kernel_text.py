@@ -1,5 +1,6 @@
 """The code of a kernel: a JAX function of one trajectory, in C++, with what its arrays hold."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -58,7 +59,11 @@ def _is_array(leaf) -> bool:
 
 
 def _dtype(leaf) -> str:
-    own = leaf.dtype if hasattr(leaf, "dtype") else np.dtype(float)
+    return _name_of(np.dtype(leaf.dtype) if hasattr(leaf, "dtype") else np.dtype(float))
+
+
+@functools.cache
+def _name_of(own: np.dtype) -> str:
     return "float64" if np.issubdtype(own, np.floating) else own.name
 
 
@@ -90,7 +95,8 @@ class Place(NamedTuple):
         return part.reshape((*numbers.shape[:-1], *shape)).astype(self.dtype, copy=False)
 
 
-class Text(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Text:
     """A kernel's code, and what its arrays hold: values, then tangents of those that are real numbers."""
 
     structures: tuple  # of the function's results
@@ -100,6 +106,7 @@ class Text(NamedTuple):
     end_dots: tuple[Place, ...]
     row_dots: tuple[Place, ...]
 
+    @functools.cached_property
     def widths(self) -> tuple[int, int, int, int]:
         """How many numbers each of these rows has, at least one."""
         ends, rows, end_dots, row_dots = (
