@@ -24,7 +24,7 @@ from ..foundation.polynomial import in_shares, value_and_slope
 from ..model.scene import Scene
 from .base import AbstractStepper, Advance, StepperState, Within, advance_between
 from .core import follow
-from .guard_roots import implicit_root, march_to_roots
+from .guard_roots import implicit_root, march_to_roots, together
 from .law_agreement import agreeing
 from .motion_series import Series, guard_rounding, series_of
 from .section import before_section, section_speed
@@ -148,7 +148,7 @@ class EventExact(AbstractStepper):
         reached = physics.on_constraint(mechanics, contact, reached)
         if not mechanics.friction.constant:
             reached = jnp.where(physics.is_beyond_the_model(mechanics, contact, series.friction[0]), jnp.nan, reached)
-        resting = RESTING[y.dtype.name] * reach * unit
+        resting = RESTING[y.dtype.name] * unit
         next_contact, y_next = physics.transition(mechanics, contact, load, reached, ended, resting)
         h = x * reach * unit
         return advance_between(y, reached, ended, y_next, next_contact, h, mechanics), states, unit
