@@ -17,7 +17,7 @@ from .mode_forces import ModeForces, by_status
 SHARES = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
 # Or if it is no larger than this many roundings of the terms that it is a sum of.
 ROUNDINGS = 64
-# Rebounds shorter than this share of the time in which the fastest vibration advances by a radian or so count as rest. Not of an
+# Rebounds shorter than this share of the time in which the fastest vibration advances by about one rad count as rest. Not of an
 # advance: what follows from a rebound more or less is far above rounding, and would depend on where advances end.
 RESTING = {"float64": 1e-7, "float32": 1e-4}
 
