@@ -25,6 +25,9 @@ R = TypeVar("R")
 COMPILED_QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 
+_ONE = jax.jit(lambda: jnp.ones((), bool))
+
+
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """`equinox.filter_jit`, with the compiler options `COMPILED_QUICKLY` on a CPU.
 
@@ -69,8 +72,8 @@ def power_of_4(count: int) -> int:
 
 def transformed(arguments) -> bool:
     """Whether a call is made under `jit`, `grad` or `vmap`."""
-    # Inside `jit` even a known number becomes a tracer.
-    return not (is_known(jnp.asarray(1)) and all(map(is_known, jax.tree.leaves(arguments))))
+    # Inside `jit` even the result of known numbers is a tracer.
+    return not (is_known(_ONE()) and all(map(is_known, jax.tree.leaves(arguments))))
 
 
 @functools.cache
