@@ -2,6 +2,9 @@
 
 import os
 import pickle
+import subprocess
+import sys
+import time
 from importlib import metadata
 from typing import NamedTuple
 
@@ -116,6 +119,7 @@ def test_the_folder_stays_small_and_what_was_used_last_stays(folder, monkeypatch
     (first,) = folder.iterdir()
     monkeypatch.setattr(kept_programs, "LARGEST", int(2.5 * first.stat().st_size))
     for how in (2.0, 1.0, 3.0):
+        time.sleep(0.05)  # file systems tell times apart by a few milliseconds
         function.in_a_new_process()(how, Y, np.asarray(1.0))
     assert first in list(folder.iterdir()) and len(list(folder.iterdir())) == 2
 
@@ -225,3 +229,42 @@ def test_a_value_of_what_a_user_wrote_is_made_each_time(folder):
     for _ in range(2):
         assert kept_value(lambda law: made.append(law) or law.strength, Own(0.3)) == 0.3
     assert len(made) == 2 and not folder.exists()
+
+
+IN_A_NEW_PROCESS = """
+import jax, numpy as np
+import jax._src.compiler as compiler
+compiled, before = [], compiler.compile_or_get_cached
+def counted(backend, computation, *args, **options):
+    compiled.append(str(computation.operation.attributes["sym_name"]))
+    return before(backend, computation, *args, **options)
+compiler.compile_or_get_cached = counted
+import fivjax as fj
+scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=1.0)
+from fivjax.linear.spectrum import eigenvalues
+print(repr(np.asarray(eigenvalues(scene)).tolist()), sum("eigenvalues" in name or "of_arrays" in name for name in compiled))
+"""
+
+
+def test_a_library_s_user_finds_compiled_programs_again_unless_told_otherwise(tmp_path):
+    """Without a compilation cache of JAX's, and with LAPACK in the program: the same bits, compiled once."""
+    found = []
+    for more in ({}, {}, {"FIVJAX_KEEP_PROGRAMS": "0"}):
+        env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), **more}
+        env.pop("JAX_COMPILATION_CACHE_DIR", None)
+        run = subprocess.run([sys.executable, "-c", IN_A_NEW_PROCESS], env=env, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+        found.append(run.stdout.split("]"))
+    assert found[0][0] == found[1][0] == found[2][0]
+    assert [int(count) for _, count in found] == [1, 0, 1]
+    assert list((tmp_path / "fivjax").rglob("_eigenvalues-*"))
+
+
+def test_a_program_that_calls_python_is_not_kept_as_compiled(folder):
+    """A callback is an address in this process."""
+
+    def doubled(y):
+        return jax.pure_callback(lambda y: 2 * y, jax.ShapeDtypeStruct(y.shape, y.dtype), y)
+
+    np.testing.assert_array_equal(kept(doubled)(Y), 2 * Y)
+    assert not any(kept_programs.EXECUTABLE in path.read_bytes() for path in folder.glob("*"))

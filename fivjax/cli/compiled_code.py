@@ -6,7 +6,7 @@ import sys
 import warnings
 from pathlib import Path
 
-from ..foundation.kept_folder import NO_HOME, NotKept, cannot_keep, folder_to_keep_in, tell
+from ..foundation.kept_folder import NotKept, cannot_keep, folder_of_caches, folder_to_keep_in, tell
 
 # The largest size of the compiled code that is kept, in bytes.
 LARGEST = 2**30
@@ -25,25 +25,13 @@ def keep_compiled_code() -> None:
     warnings.showwarning = _show
     if jax.config.jax_compilation_cache_dir is not None:
         return
-    home = _folder_of_caches()
+    home = folder_of_caches()
     folder = None if home is None else folder_to_keep_in(home / "fivjax")
     if folder is not None:
         _remove_partial(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_compilation_cache_max_size", LARGEST)
-
-
-def _folder_of_caches() -> Path | None:
-    """The user's, by the rules of freedesktop.org: a relative path does not count."""
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if named.is_absolute():
-        return named
-    try:
-        return Path.home() / ".cache"
-    except RuntimeError:
-        tell(NO_HOME)
-        return None
 
 
 def _remove_partial(folder: Path) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..contact import Contact, Status
 from ..foundation import arguments
-from ..foundation.compiling import compiled
 from ..foundation.digits import apart
+from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
@@ -237,7 +237,7 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
     return dataset
 
 
-@compiled
+@kept
 def _equilibrium(scene: Scene):
     return sliding_state(scene, scene.load.final)
 

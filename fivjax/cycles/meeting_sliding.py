@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Complex
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from .branch_points import Point
@@ -11,7 +11,7 @@ from .pseudo_arclength import Family
 from .special_points import MEETS_SLIDING, Special
 
 
-@compiled
+@kept
 def _sliding_matrix(scene: Scene):
     return linear_sliding(scene).matrix
 

@@ -57,6 +57,18 @@ def folder_to_keep_in(folder: str | Path) -> Path | None:
     return path
 
 
+def folder_of_caches() -> Path | None:
+    """The user's, by the rules of freedesktop.org: a relative path does not count."""
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if named.is_absolute():
+        return named
+    try:
+        return Path.home() / ".cache"
+    except RuntimeError:
+        tell(NO_HOME)
+        return None
+
+
 def tell(sentence: str, about: str = "what is not kept") -> None:
     """Warn, once in a process about each subject: what hinders one file hinders the next."""
     with _telling:

@@ -1,13 +1,14 @@
-"""Traced programs, kept for later processes in a folder of JAX's compilation cache.
+"""Compiled programs, kept for later processes in a folder of JAX's compilation cache, or where there is none in fivjax's own.
 
-That cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large ones. So
-the traced program is kept, too (`jax.export`), as are other values that take long to make. The file name is a digest of all
-that this depends on: fivjax's own source, the versions of Python and of the libraries whose code is traced, the device, the
-function, shapes and types of its arrays, and its other arguments.
+JAX's own cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large
+ones. So the compiled program itself is kept (`kept_executables`), or where that cannot be, the traced one (`jax.export`); as
+are other values that take long to make. The file name is a digest of all that this depends on: fivjax's own source, the
+versions of Python and of the libraries whose code is traced, the device and the processor, the function, shapes and types of
+its arrays, and its other arguments.
 
 A file has a program as JAX writes it, and the form of its result as text (`plain_trees`); nothing in it is unpickled. A damaged
 file is removed and made anew. Where an argument has a class or function from outside (a user's own friction law), its name does
-not tell what it does; such programs are traced in each process.
+not tell what it does; such programs are traced in each process. `FIVJAX_KEEP_PROGRAMS=0` keeps nothing in fivjax's own folder.
 """
 
 import contextlib
@@ -28,7 +29,8 @@ import jax
 
 from .compiling import compiled, less_thought, transformed
 from .forking import refuse_if_forked
-from .kept_folder import folder_to_keep_in, keep, make_room, read_kept
+from .kept_executables import NotSerializable, can_serialize, program_from, serialized
+from .kept_folder import folder_of_caches, folder_to_keep_in, keep, make_room, read_kept
 from .plain_trees import NotPlain, from_text, structure_to_text, to_text, with_zeros
 
 P = ParamSpec("P")
@@ -36,6 +38,10 @@ R = TypeVar("R")
 
 # The folder inside that of the compilation cache, and how many bytes it may hold: what was used longest ago is removed first.
 FOLDER, LARGEST = "fivjax-traced", 200 * 2**20
+# Set to 0, it keeps nothing where JAX has no compilation cache.
+OPT_OUT = "FIVJAX_KEEP_PROGRAMS"
+# What a file holds: a compiled program, or a traced one.
+EXECUTABLE, TRACED = b"executable", b"traced"
 # Libraries whose code may be in a program. What they define is fixed by their versions.
 LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy", "warp-lang")
 # What these packages define is fixed by their versions, or by fivjax's source.
@@ -43,9 +49,7 @@ KNOWN_PACKAGES = ("fivjax", "builtins", "functools", *LIBRARIES)
 
 
 def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable[P, R]:
-    """`compiling.compiled`, or `equinox.filter_jit` unless `quickly_compiled`; where JAX has a compilation cache, the traced
-    program is kept there for later processes.
-    """
+    """`compiling.compiled`, or `equinox.filter_jit` unless `quickly_compiled`; and the program is kept for later processes."""
     otherwise = compiled(function) if quickly_compiled else eqx.filter_jit(function)
     programs: dict[Any, Callable | None] = {}
     lock = threading.Lock()
@@ -103,8 +107,14 @@ class _Foreign(Exception):
 
 
 def _folder() -> str | None:
+    """The folder inside that of JAX's compilation cache, if there is one, else fivjax's own."""
     folder = jax.config.jax_compilation_cache_dir
-    return None if not folder or "://" in folder else os.path.join(folder, FOLDER)
+    if folder:
+        return None if "://" in folder else os.path.join(folder, FOLDER)
+    if os.environ.get(OPT_OUT, "") == "0":
+        return None
+    home = folder_of_caches()
+    return None if home is None else str(home / "fivjax" / FOLDER)
 
 
 def _program(
@@ -117,23 +127,26 @@ def _program(
     options = less_thought() if quickly_compiled else {}
 
     def ready(content: bytes) -> Callable:
+        kind, form, program = content.split(b"\0", 2)
+        result = from_text(form)
+        if kind == EXECUTABLE:
+            run = program_from(program)
+            return lambda arrays: jax.tree.unflatten(result, run(arrays))
         from jax import export
 
-        form, _, exported = content.partition(b"\0")
-        result = from_text(form)
-        exported = export.deserialize(bytearray(exported))
-        run = jax.jit(exported.call, compiler_options=options).lower(*arrays).compile()
-        return lambda arrays: jax.tree.unflatten(result, run(*arrays))
+        exported = export.deserialize(bytearray(program))
+        compiled = jax.jit(exported.call, compiler_options=options).lower(*arrays).compile()
+        return lambda arrays: jax.tree.unflatten(result, compiled(*arrays))
 
     found = _found(path, ready)
     if found is not None:
         return found
     try:
-        content = _traced(function, structure, rest, arrays)
+        content, program = _made(function, structure, rest, arrays, options)
     except (NotPlain, NotImplementedError):
         return None
     _keep(path, content)
-    return ready(content)
+    return ready(content) if program is None else program
 
 
 def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
@@ -167,8 +180,10 @@ def _keep(path: Path, content: bytes) -> None:
     make_room(path.parent, LARGEST)
 
 
-def _traced(function: Callable, structure, rest: tuple, arrays: Sequence) -> bytes:
-    """The form of a function's result, and the function traced for such arrays."""
+def _made(function: Callable, structure, rest: tuple, arrays: Sequence, options) -> tuple[bytes, Callable | None]:
+    """A function compiled for such arrays: what is kept of it, and a function of the arrays. Where the compiled program cannot
+    be kept, the traced one is, and is left to be compiled.
+    """
     forms = []
 
     def of_arrays(*arrays):
@@ -179,10 +194,19 @@ def _traced(function: Callable, structure, rest: tuple, arrays: Sequence) -> byt
         forms.append(jax.tree.structure(result))
         return jax.tree.leaves(result)
 
+    like = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]
+    if can_serialize():
+        lowered = jax.jit(of_arrays, keep_unused=True, compiler_options=options).lower(*like)
+        form, compiled = structure_to_text(forms[-1]).encode(), lowered.compile()
+        result = forms[-1]
+        with contextlib.suppress(NotSerializable):
+            content = b"\0".join([EXECUTABLE, form, serialized(lowered, compiled)])
+            return content, lambda arrays: jax.tree.unflatten(result, compiled(*arrays))
     from jax import export
 
-    exported = export.export(jax.jit(of_arrays))(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
-    return structure_to_text(forms[-1]).encode() + b"\0" + exported.serialize()
+    exported = export.export(jax.jit(of_arrays))(*like)
+    form = structure_to_text(forms[-1]).encode()
+    return b"\0".join([TRACED, form, exported.serialize()]), None
 
 
 def _digest(function: Callable, structure, rest: tuple) -> str:
@@ -192,10 +216,22 @@ def _digest(function: Callable, structure, rest: tuple) -> str:
         platform.python_version(),
         device.platform,
         device.device_kind,
+        _processor(),
         str(jax.config.jax_enable_x64),
     ]
     name = f"{function.__module__}.{function.__qualname__}"
     return hashlib.sha256(_pickled((_source(), built_on, name, structure, rest))).hexdigest()[:40]
+
+
+@functools.cache
+def _processor() -> str:
+    """What instructions it has, as far as the system tells: several machines may share a home folder."""
+    try:
+        told = Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0]
+        features = [line for line in told.splitlines() if line.lower().startswith(("flags", "features"))]
+    except OSError:
+        features = []
+    return " ".join([platform.machine(), *(features or [platform.processor()])])
 
 
 @functools.cache

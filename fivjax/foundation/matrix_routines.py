@@ -13,6 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Num
 
 
+def register() -> None:
+    """Make LAPACK known to JAX in this process, as it does by itself where it lowers a call of it."""
+    jax.jit(jnp.linalg.eigvals).lower(jnp.eye(2))
+
+
 def eigenvalues(matrix: Num[Array, "n n"]) -> Complex[Array, " n"]:
     """The eigenvalues of a general matrix, in any order. Differentiable where they are simple."""
     return _eigenvalues(matrix)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from ..foundation import arguments, matrix_routines
 from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.precision import is_known, real, returning_numpy
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.structure import Structure
@@ -105,13 +106,13 @@ def _check_frictions(mu) -> None:
             raise ValueError(f"Argument `mu` must be non-negative and finite, but holds {bad[0]:g}.")
 
 
-@compiled
+@kept
 def _eigenvalues(scene):
     found = matrix_routines.eigenvalues(sliding_motion(scene)[0])
     return found[jnp.lexsort((found.imag, found.real, jnp.abs(found.imag)))]
 
 
-@compiled
+@kept
 def _eigenvalues_over(structure, mu, direction):
     return jax.lax.map(lambda value: _eigenvalues(as_scene(structure, value, direction)), mu, batch_size=POINTS_AT_ONCE)
 

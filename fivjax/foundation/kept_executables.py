@@ -1,0 +1,60 @@
+"""Compiled programs as bytes, so that a later process neither traces nor compiles them.
+
+Only programs for a single CPU, which call nothing in this process but LAPACK: other calls are to addresses of the process that
+compiled them.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.extend.backend import get_backend
+
+from .matrix_routines import register
+
+# What calls of LAPACK are named by jaxlib.
+LAPACK = "lapack_"
+
+
+class NotSerializable(Exception):
+    """A program that cannot be kept as bytes."""
+
+
+def can_serialize() -> bool:
+    """Whether programs of this process may be kept as bytes."""
+    return jax.default_backend() == "cpu" and len(jax.devices()) == 1 and jax.process_count() == 1
+
+
+def serialized(lowered, compiled) -> bytes:
+    """A program that JAX has lowered and compiled, as bytes.
+
+    **Raises:** `NotSerializable` for one that calls other code, or where this JAX has no way to do it.
+    """
+    called = set(re.findall(r"custom_call @([\w.$]+)", lowered.as_text()))
+    if not all(name.startswith(LAPACK) for name in called):
+        raise NotSerializable(f"It calls {', '.join(sorted(called))}.")
+    try:
+        return compiled.runtime_executable().serialize()
+    except Exception as error:  # of a kind that JAX does not document
+        raise NotSerializable(str(error)) from None
+
+
+def program_from(content: bytes) -> Callable[[Sequence], list[jax.Array]]:
+    """A program from its bytes, as a function of all its arrays. The bytes must be what `serialized` gave, on such a machine.
+
+    **Raises:** whatever JAX raises for bytes that it cannot load.
+    """
+    # In this version of JAX, where devices are listed is not public; another one raises, and the program is compiled anew.
+    from jaxlib import xla_client
+
+    if LAPACK.encode() in content:
+        register()
+    devices = xla_client.DeviceList(tuple(jax.devices()))
+    executable = get_backend().deserialize_executable(content, devices, None)
+
+    def run(arrays: Sequence) -> list[jax.Array]:
+        found = executable.execute_sharded([jnp.asarray(array) for array in arrays])
+        return [of_device[0] for of_device in found.disassemble_into_single_device_arrays()]
+
+    return run
