@@ -143,7 +143,7 @@ def _program(
         return found
     try:
         content, program = _made(function, structure, rest, arrays, options)
-    except (NotPlain, NotImplementedError):
+    except (NotPlain, NotImplementedError, ValueError):  # what `jax.export` refuses
         return None
     _keep(path, content)
     return ready(content) if program is None else program

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
@@ -84,7 +84,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     return labelled(dataset, scene, analysis="stability chart", method="characteristic polynomial, Routh-Hurwitz")
 
 
-@compiled
+@kept
 def _chart(scene, names, columns):
     def polynomial(*values):
         point = scene.replace(**dict(zip(names, values, strict=True)))

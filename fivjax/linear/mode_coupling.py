@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation import arguments
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.structure import Structure
@@ -42,7 +42,7 @@ class Coalescence(eqx.Module):
 HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
 
 
-@compiled
+@kept
 def _coalescence(structure, direction):
     undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
     loop, scale = friction_loop(undamped, direction)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.precision import real
 from ..model.scene import Scene
 from .several_contacts import sliding_motion
@@ -50,7 +50,7 @@ class Sampler:
         return middle, self.many(np.array([middle]))[0]
 
 
-@compiled
+@kept
 def _matrices(scene, name, values):
     def at(value):
         point = scene.replace(**{name: value})

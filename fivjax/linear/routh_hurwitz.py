@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..foundation import arguments
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.matrix_routines import log_determinant
 from ..foundation.precision import real, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
@@ -81,7 +81,7 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     return _margin(in_contact_coordinates(structure), real(mu), real(direction))
 
 
-@compiled
+@kept
 def _margin(structure, mu, direction):
     scale = time_scale(structure)
     mass, damping, stiffness = sliding_matrices(structure, direction * mu)

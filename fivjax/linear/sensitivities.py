@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.quantities import QUANTITIES
 from ..io.datasets import labelled
@@ -104,7 +104,7 @@ def sensitivity(structure: Structure, *, direction: int = 1) -> Sensitivity:
     return Sensitivity(labelled(dataset, scene, analysis="sensitivity of mu_crit", mechanism=limit.mechanism.value))
 
 
-@compiled
+@kept
 def _slopes(structure: Structure, direction):
     """dμ_crit/dp and dC/dp by name of parameter."""
     values, build = _named_parameters(structure)

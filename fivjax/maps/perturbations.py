@@ -15,7 +15,7 @@ from jaxtyping import Array, Complex, Float
 from ..contact import Contact, Status
 from ..cycles.about_sliding import mechanics_about_sliding
 from ..cycles.section_motion import MOST_SEGMENTS
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import sliding_states
@@ -89,7 +89,7 @@ def stable_sliding(scene: Scene) -> StableSliding:
     return StableSliding(own, linear, shift, signals)
 
 
-@compiled
+@kept
 def _linear(scene: Scene) -> LinearSliding:
     return linear_sliding(scene)
 
@@ -248,12 +248,12 @@ def _highest(sizes: np.ndarray) -> list[int]:
     return [low + int(np.argmax(sizes[low:high])) for low, high in parts if high > low]
 
 
-@compiled
+@kept
 def _after(scene: Scene, stepper: EventExact, factors, time):
     return jax.vmap(lambda one: _after_one(scene, stepper, one, time))(factors)
 
 
-@compiled
+@kept
 def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
     return jax.jacfwd(lambda one: _after_one(scene, stepper, one, time))(factors)
 

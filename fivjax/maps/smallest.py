@@ -19,8 +19,8 @@ import numpy as np
 from ..cycles.own_coordinates import in_own_coordinates
 from ..cycles.stable_manifold import Saddle, critical_kick, saddle_of
 from ..foundation import arguments
-from ..foundation.compiling import compiled
 from ..foundation.digits import apart
+from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..model.load import Pulse
@@ -281,7 +281,7 @@ def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
     return float(least)
 
 
-@compiled
+@kept
 def _compiled_peaks(shares, envelope):
     return jax.vmap(lambda one: envelope_peak(one, envelope))(shares)
 

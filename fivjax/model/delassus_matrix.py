@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..foundation.compiling import compiled
+from ..foundation.kept_programs import kept
 from ..foundation.linear_solve import solve
 from ..foundation.precision import returning_numpy
 from .structure import Structure
@@ -54,7 +54,7 @@ def delassus(structure: Structure) -> Delassus:
     return _delassus(structure)
 
 
-@compiled
+@kept
 def _delassus(structure: Structure) -> Delassus:
     count = len(structure.contacts)
     w = jnp.concatenate([structure.tangential_directions, structure.normal_directions], axis=1)
