@@ -105,6 +105,14 @@ def warm() -> None:
             both = jax.jit(jax.value_and_grad(of))
             taken = milliseconds(functools.partial(finished, both, values))
             print(f"value and gradient by {count}, jitted: {taken:.2f} ms")
+    searches = {
+        "limit_cycle": lambda: fj.limit_cycle(scene),
+        "saddle_cycle": lambda: fj.saddle_cycle(scene),
+        "critical_perturbation, derivatives": lambda: fj.critical_perturbation(scene, derivatives=True),
+        "continue_cycle, mu 0.2 to 0.25": lambda: fj.continue_cycle(scene, "mu", (0.2, 0.25)),
+    }
+    for name, call in searches.items():
+        print(f"{name}: {milliseconds(call, 5):.0f} ms", flush=True)
 
 
 if __name__ == "__main__":
