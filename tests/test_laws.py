@@ -1,5 +1,6 @@
 """Friction laws of a user's own: tables, loops and branches against SciPy, restarted at every kink."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
+from fivjax.steppers.kernel_scope import has_kernel
 
 SPEEDS, VALUES = np.array([0.0, 1.5, 2.2, 10.0]), np.array([0.5, 0.45, 0.3, 0.28])
 
@@ -104,3 +106,17 @@ def test_where_a_law_has_kinks_sliding_is_not_proved_and_the_map_says_why():
     m = fj.basins(scene, q0=[0.3001], t_max=50.0, progress=False)
     assert m["verdict"].item() == fj.Verdict.UNDECIDED
     assert "`Table` may have kinks" in m.attrs["withheld"]
+
+
+class FromOutside(fj.AbstractFriction):
+    """Computed by Python at each step, as by a model that is no JAX function."""
+
+    def __call__(self, slip_speed):
+        like = jax.ShapeDtypeStruct(np.shape(slip_speed), slip_speed.dtype)
+        return jax.pure_callback(lambda v: 0.4 + 0.0 * v, like, slip_speed)
+
+
+@pytest.mark.parametrize("law, by_kernel", [(Table(), True), (Looped(), True), (Branched(), True), (FromOutside(), False)])
+def test_a_law_is_followed_by_a_kernel_if_its_trace_can_be_written(law, by_kernel):
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), belt_speed=1.0, load=fj.ConstantLoad(100.0))
+    assert has_kernel(eqx.tree_at(lambda scene: scene.friction, scene, law), fj.EventExact()) == by_kernel

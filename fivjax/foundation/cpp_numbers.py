@@ -58,6 +58,9 @@ BY_NUMBER = {
     "clamp": "({1} < {0} ? {0} : ({1} > {2} ? {2} : {1}))",
     "lt": "{} < {}",
     "le": "{} <= {}",
+    # Searches in tables compare so; they differ for what is no number only.
+    "lt_to": "{} < {}",
+    "le_to": "{} <= {}",
     "gt": "{} > {}",
     "ge": "{} >= {}",
     "eq": "{} == {}",
@@ -70,7 +73,7 @@ BY_NUMBER = {
 }
 # What leaves each number as it is.
 SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
-COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne", "is_finite")
+COMPARISONS = ("lt", "le", "lt_to", "le_to", "gt", "ge", "eq", "ne", "is_finite")
 
 
 def kind_of(aval) -> str:

@@ -1,7 +1,12 @@
 """Which motions kernels follow."""
 
-import jax
+import functools
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..foundation.kernel_text import Form, written
 from ..foundation.warp_library import is_installed
 from ..model.scene import Scene
 from .base import AbstractStepper
@@ -13,16 +18,44 @@ PACKAGE = __name__.partition(".")[0]
 
 
 def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
-    """Whether a kernel follows the motions of such scenes by this method.
-
-    Of laws from elsewhere it is not known whether they can be written as C++.
-    """
-    laws = scene.friction, scene.load, scene.structure
+    """Whether a kernel follows the motions of such scenes by this method."""
     return (
         isinstance(method, EventExact)
         and is_installed()
         and jax.default_backend() == "cpu"
         and scene.structure.size <= LARGEST
         and len(scene.structure.contacts) <= MOST_CONTACTS
-        and all(type(own).__module__.partition(".")[0] == PACKAGE for own in laws)
+        and _laws_can_be_written(scene)
     )
+
+
+def _laws_can_be_written(scene: Scene) -> bool:
+    """Whether friction and load can be written as C++: of laws from elsewhere this is tried."""
+    laws, count = (scene.friction, scene.load), len(scene.structure.contacts)
+    if all(type(own).__module__.partition(".")[0] == PACKAGE for own in (*laws, *getattr(scene.friction, "laws", ()))):
+        return True
+    form, _ = Form.of((*laws, np.zeros(() if count == 1 else count)))
+    try:
+        return _can_be_written(form)
+    except TypeError:  # it has fixed fields that cannot be told apart; or it fails, as XLA's trace will say
+        return False
+
+
+@functools.cache
+def _can_be_written(form: Form) -> bool:
+    try:
+        written(_values, form, ())
+    except NotImplementedError:
+        return False
+    return True
+
+
+def _values(args, instants):
+    """The values of laws, and how friction changes with time while slip does."""
+    friction, load, slip = args
+    values = [friction(slip)]
+    if not friction.constant:
+        next_term = friction.in_time(slip, 3)
+        values.append(next_term([slip, slip], values))
+    jumps = load.jumps
+    return (tuple(values), load(jnp.ravel(slip)[0]), jumps), ()
