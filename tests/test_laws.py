@@ -116,7 +116,9 @@ class FromOutside(fj.AbstractFriction):
         return jax.pure_callback(lambda v: 0.4 + 0.0 * v, like, slip_speed)
 
 
-@pytest.mark.parametrize("law, by_kernel", [(Table(), True), (Looped(), True), (Branched(), True), (FromOutside(), False)])
+@pytest.mark.parametrize(
+    ("law", "by_kernel"), [(Table(), True), (Looped(), True), (Branched(), True), (FromOutside(), False)]
+)
 def test_a_law_is_followed_by_a_kernel_if_its_trace_can_be_written(law, by_kernel):
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.3), belt_speed=1.0, load=fj.ConstantLoad(100.0))
     assert has_kernel(eqx.tree_at(lambda scene: scene.friction, scene, law), fj.EventExact()) == by_kernel
