@@ -216,6 +216,7 @@ def _digest(function: Callable, structure, rest: tuple) -> str:
         platform.python_version(),
         device.platform,
         device.device_kind,
+        str(len(jax.devices())),
         _processor(),
         str(jax.config.jax_enable_x64),
     ]
