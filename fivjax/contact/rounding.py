@@ -19,7 +19,7 @@ SHARES = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
 ROUNDINGS = 64
 # Rebounds shorter than this share of the time in which the fastest vibration advances by about one rad count as rest. Not of an
 # advance: what follows from a rebound more or less is far above rounding, and would depend on where advances end.
-RESTING = {"float64": 1e-7, "float32": 1e-4}
+RESTING = {"float64": 1e-8, "float32": 1e-4}
 
 
 def largest_rounding(sizes: Array) -> Array:
