@@ -268,3 +268,21 @@ def test_a_program_that_calls_python_is_not_kept_as_compiled(folder):
 
     np.testing.assert_array_equal(kept(doubled)(Y), 2 * Y)
     assert not any(kept_programs.EXECUTABLE in path.read_bytes() for path in folder.glob("*"))
+
+
+def test_a_program_that_does_not_run_is_compiled_anew(folder, monkeypatch):
+    """As one whose code is not whole, which JAX tells where it runs."""
+
+    def failing(content):
+        def run(arrays):
+            raise jax.errors.JaxRuntimeError("NOT_FOUND: a function")
+
+        return run
+
+    function = Counted()
+    first = values(function.in_a_new_process()(1.0, Y, np.asarray(2.0)))
+    monkeypatch.setattr(kept_programs, "program_from", failing)
+    if not jax.config.jax_compilation_cache_dir:
+        assert kept_programs.EXECUTABLE in next(folder.iterdir()).read_bytes()
+    found = values(function.in_a_new_process()(1.0, Y, np.asarray(2.0)))
+    np.testing.assert_array_equal(found["sine"], first["sine"])

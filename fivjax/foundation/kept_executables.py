@@ -22,8 +22,12 @@ class NotSerializable(Exception):
 
 
 def can_serialize() -> bool:
-    """Whether programs of this process may be kept as bytes."""
-    return jax.default_backend() == "cpu" and len(jax.devices()) == 1 and jax.process_count() == 1
+    """Whether programs of this process may be kept as bytes.
+
+    Not where JAX has a compilation cache: what it has read from there lacks functions once it is written again.
+    """
+    alone = jax.default_backend() == "cpu" and len(jax.devices()) == 1 and jax.process_count() == 1
+    return alone and not jax.config.jax_compilation_cache_dir
 
 
 def serialized(lowered, compiled) -> bytes:
@@ -35,7 +39,9 @@ def serialized(lowered, compiled) -> bytes:
     if not all(name.startswith(LAPACK) for name in called):
         raise NotSerializable(f"It calls {', '.join(sorted(called))}.")
     try:
-        return compiled.runtime_executable().serialize()
+        content = compiled.runtime_executable().serialize()
+        program_from(content)  # whether a later process can load it
+        return content
     except Exception as error:  # of a kind that JAX does not document
         raise NotSerializable(str(error)) from None
 
@@ -55,6 +61,7 @@ def program_from(content: bytes) -> Callable[[Sequence], list[jax.Array]]:
 
     def run(arrays: Sequence) -> list[jax.Array]:
         found = executable.execute_sharded([jnp.asarray(array) for array in arrays])
-        return [of_device[0] for of_device in found.disassemble_into_single_device_arrays()]
+        # Waited for, so that a program that cannot run fails here, where another can take its place.
+        return jax.block_until_ready([of_device[0] for of_device in found.disassemble_into_single_device_arrays()])
 
     return run

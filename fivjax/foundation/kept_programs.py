@@ -1,7 +1,7 @@
 """Compiled programs, kept for later processes in a folder of JAX's compilation cache, or where there is none in fivjax's own.
 
 JAX's own cache saves compilation only: to look a program up, JAX traces and lowers it first, which takes seconds for large
-ones. So the compiled program itself is kept (`kept_executables`), or where that cannot be, the traced one (`jax.export`); as
+ones. So the traced program is kept beside it (`jax.export`), or without that cache the compiled one (`kept_executables`); as
 are other values that take long to make. The file name is a digest of all that this depends on: fivjax's own source, the
 versions of Python and of the libraries whose code is traced, the device and the processor, the function, shapes and types of
 its arrays, and its other arguments.
@@ -71,7 +71,12 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
                 if key not in programs:
                     programs[key] = _program(function, folder, structure, rest, arrays, quickly_compiled)
         program = programs[key]
-        return otherwise(*args, **kwargs) if program is None else program(arrays)
+        if program is not None:
+            try:
+                return program(arrays)
+            except jax.errors.JaxRuntimeError:  # whatever was kept does not run here
+                programs[key] = None
+        return otherwise(*args, **kwargs)
 
     return call
 
