@@ -50,6 +50,33 @@ def test_bouncing_mass_and_stick_slip_block_forward():
         assert measure.relative(found, expected).max() < 1e-10
 
 
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_slip_that_a_jump_of_the_load_begins(mode):
+    """A mass held on the belt by a raised load, until that falls: it slips from the jump on, whose instant depends on nothing."""
+    stiffness, mu, force, speed, jump, end = 4.0, 0.3, 2.0, 0.5, 0.6, 1.1
+
+    def simulated(values):
+        belt, load = values["belt_speed"], fj.Pulse(values["force"], 3.0, duration=jump)
+        scene = fj.Scene(point_mass(stiffness), fj.Coulomb(values["mu"]), belt, load)
+        run = fj.simulate(scene, end, end, FEW, y0=jnp.stack([0.0 * belt, 0.0 * belt, belt, 0.0 * belt]))
+        return jnp.stack([run.displacement[-1, 0], run.velocity[-1, 0]])
+
+    def closed(values):
+        rate, t = jnp.sqrt(stiffness), end - jump
+        held = values["mu"] * values["force"] / stiffness
+        apart, swing = values["belt_speed"] * jump - held, values["belt_speed"] / rate
+        along = held + apart * jnp.cos(rate * t) + swing * jnp.sin(rate * t)
+        return jnp.stack([along, values["belt_speed"] * jnp.cos(rate * t) - apart * rate * jnp.sin(rate * t)])
+
+    with jax.enable_x64(True):
+        values = {"mu": jnp.asarray(mu), "force": jnp.asarray(force), "belt_speed": jnp.asarray(speed)}
+        jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
+        np.testing.assert_allclose(simulated(values), closed(values), rtol=1e-12)
+        found, expected = jacobian(simulated)(values), jax.jacfwd(closed)(values)
+    for name in values:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-10, atol=1e-10)
+
+
 def test_bouncing_mass_reverse():
     """In reverse mode a stretch may use only what it is given, and a step worked out elsewhere is refused by JAX."""
     _, found, expected = next(measure.closed_forms("reverse", FEW))

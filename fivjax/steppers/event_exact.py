@@ -140,7 +140,7 @@ class EventExact(AbstractStepper):
             fires = at_once
         else:
             fires = fires & at_once
-        x = jnp.where(jnp.any(fires), implicit_root(scaled, fires, first), first)
+        x = jnp.where(jnp.any(fires), implicit_root(scaled, fires, first, self.tolerance), first)
         ended = fires[:count].reshape(*contact.status.shape, 2)
         reached, _ = value_and_slope(states, x * reach)
         if at_section and not mechanics.several:

@@ -11,6 +11,9 @@ from ..contact.rounding import zero_at_start
 from ..foundation.polynomial import ratio, value_and_slope, value_slope_and_bend
 
 MOST_ROOT_STEPS = 60
+# A guard that starts further below zero, in shares of its size, has been put there by a jump: of the load, or of the forces of
+# another contact. What is not is the error of the series by which the last advance ended.
+JUMPED = 1e3
 
 
 def together(
@@ -95,18 +98,23 @@ def _first_root(
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
 
 
-def implicit_root(scaled: Float[Array, "k g"], fires: Bool[Array, " g"], x: Float[Array, ""]) -> Float[Array, ""]:
-    """The root with the derivatives of an implicit function.
+def implicit_root(
+    scaled: Float[Array, "k g"], fires: Bool[Array, " g"], x: Float[Array, ""], tolerance: float
+) -> Float[Array, ""]:
+    """The root with the derivatives of an implicit function, of a series with this relative error.
 
-    A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first
+    Where a jump has used up the guard at x = 0, no root moves: the event is at the instant of the jump. A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first
     derivatives are right, after the second one the second derivatives, too.
     """
     # An index of 64 bits could not be lowered in a single-precision program.
     chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
+    size = jnp.sum(jnp.where(chosen, jnp.abs(scaled), 0.0))
+    least = jnp.sum(jnp.where(chosen, scaled[0], 0.0))
+    jumped = (x == 0) & (least < -JUMPED * max(tolerance, float(jnp.finfo(scaled.dtype).eps)) * size)
     for _ in range(2):
         values, slopes = value_and_slope(scaled, x)
         value = jnp.sum(jnp.where(chosen, values, 0.0))
         slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
-        correction = value / jnp.where(slope == 0, 1.0, slope)
+        correction = jnp.where(jumped, 0.0, value / jnp.where(slope == 0, 1.0, slope))
         x = x - (correction - jax.lax.stop_gradient(correction))
     return x
