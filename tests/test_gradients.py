@@ -77,6 +77,20 @@ def test_slip_that_a_jump_of_the_load_begins(mode):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-10, atol=1e-10)
 
 
+def test_a_start_that_sticks_by_the_belt_speed():
+    """A faster belt takes a given start along by an impulse. The momentum of what the mass matrix couples to it stays as it is."""
+    mass = np.array([[1.0, 0.4, 0.0], [0.4, 2.0, 0.0], [0.0, 0.0, 1.0]])
+    own, y0 = structure(np.zeros((3, 3)), mass), np.array([0.0, 0.0, 0.0, 0.5, 0.3, 0.0])
+
+    def end(belt):
+        run = fj.simulate(fj.Scene(own, fj.Coulomb(0.3), belt, steady(1.0)), 2.0, 2.0, FEW, y0=y0)
+        return jnp.concatenate([run.displacement[-1], run.velocity[-1]])
+
+    with jax.enable_x64(True):
+        slope = jax.jacfwd(end)(0.5)
+    np.testing.assert_allclose(slope, [2.0, -0.4, 0.0, 1.0, -0.2, 0.0], atol=1e-12)
+
+
 def test_bouncing_mass_reverse():
     """In reverse mode a stretch may use only what it is given, and a step worked out elsewhere is refused by JAX."""
     _, found, expected = next(measure.closed_forms("reverse", FEW))

@@ -55,6 +55,7 @@ from .several_contacts import coupled_with as coupled_with
 from .transitions import on_constraint as on_constraint
 from .transitions import status_from_forces as status_from_forces
 from .transitions import stopped as stopped
+from .transitions import stuck as stuck
 from .transitions import transition as transition
 from .uniqueness import is_beyond_the_model as is_beyond_the_model
 from .uniqueness import slides_uniquely as slides_uniquely

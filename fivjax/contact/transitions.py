@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .contact_problem import NONE
+from .coordinates import spread
 from .forces import (
     State,
     acceleration,
@@ -35,6 +36,22 @@ def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
         gap_rate=jnp.where(touching, 0.0, gap_rate(mechanics, y)),
         tangential_velocity=jnp.where(sticking, mechanics.belt_speed, y[degrees_of_freedom(y) + mechanics.tangential]),
     )
+
+
+def stuck(mechanics: Mechanics, contact: Contact, y: State) -> State:
+    """A start that sticks, with the derivatives of its motion an instant later.
+
+    Its slip is zero, but may depend on a parameter: the belt's speed, or that of a given state. A slip that begins small ends
+    soon, by an impulse in proportion to it, which moves whatever the mass matrix couples to the contact. So the state is as
+    after the impulse that holds it: itself, but for its derivatives.
+    """
+    n = degrees_of_freedom(y)
+    relative = y[n:].at[mechanics.tangential].add(-mechanics.belt_speed)
+    own = mechanics.of_totals
+    impulses = ModeForces(own, contact, own.friction(jnp.zeros_like(contact.direction))).added(own, relative)
+    kick = sum(spread(*of) for of in zip((own.from_tangential, own.from_normal), impulses, strict=True))
+    holds = jnp.any(contact.status == Status.STICK)
+    return y.at[n:].add(jnp.where(holds, kick, 0.0))
 
 
 def transition(

@@ -146,7 +146,7 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
         unit=jnp.ones_like(none),
         ledger=ledger,
         end=none,
-        y_end=y0,
+        y_end=physics.stuck(mechanics, contact, y0),
         contact_end=contact,
         ledger_end=ledger,
         highest=jnp.abs(load),

@@ -207,7 +207,8 @@ def states_at(
     contact0, ledger0 = begun(scene, y0, instants, energy_data) if at_start is None else at_start
     # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
-    _, after = jax.lax.scan(step, (instants[0], y0, contact0, ledger0), ends)
+    begin = instants[0], physics.stuck(mechanics, contact0, y0), contact0, ledger0
+    _, after = jax.lax.scan(step, begin, ends)
     rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
 
     def with_start(first, rest):

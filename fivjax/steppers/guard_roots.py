@@ -103,8 +103,9 @@ def implicit_root(
 ) -> Float[Array, ""]:
     """The root with the derivatives of an implicit function, of a series with this relative error.
 
-    Where a jump has used up the guard at x = 0, no root moves: the event is at the instant of the jump. A Newton step from a converged root, with a constant slope, changes only the derivatives: after the first step the first
-    derivatives are right, after the second one the second derivatives, too.
+    Where a jump has used up the guard at x = 0, no root moves: the event is at the instant of the jump. A Newton step from a
+    converged root, with a constant slope, changes only the derivatives: after the first step the first derivatives are right,
+    after the second one the second derivatives, too.
     """
     # An index of 64 bits could not be lowered in a single-precision program.
     chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
