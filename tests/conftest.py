@@ -13,8 +13,8 @@ CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle.
 LONGEST = (
-    "energy maps gradients cycles several_contacts simulate cea steppers attractor verdicts windowed_returns notebooks "
-    "tradeoff calibrate checkpoint properties reproduce types precision propagators basins branches"
+    "energy maps gradients cycles several_contacts simulate cea steppers attractor verdicts returns_by_kernels notebooks "
+    "tradeoff calibrate checkpoint properties reproduce types precision kernels basins branches"
 )
 LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
 

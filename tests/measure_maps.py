@@ -1,6 +1,6 @@
 """Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [roofline]
+    python tests/measure_maps.py [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
 
 Each word picks one study; without any, all run (half an hour on two cores). The reference is `tests/oracle.py`.
 """
@@ -20,6 +20,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from unittest import mock
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -115,23 +116,22 @@ def refined() -> None:
 
 
 def kernels() -> None:
-    """Warm maps of two sizes with and without kernels, in turns: wall time, and whether their verdicts agree."""
-    for points, turns in ((64, 3), (256, 1)):
-        paper_map(points), without_kernels(points)  # compiled
-        for _ in range(turns):
-            walls, found = [], []
-            for make in (paper_map, without_kernels):
-                begin = time.perf_counter()
-                found.append(make(points))
-                walls.append(time.perf_counter() - begin)
-            one, other = (m["verdict"].values for m in found)
-            sizes = [np.where(np.asarray(m["verdict"]) == 1, m["amplitude"], 1.0) for m in found]
-            print(
-                f"{points} × {points}: {walls[0]:.1f} s by kernels, {walls[1]:.1f} s without, ratio {walls[0] / walls[1]:.2f}; "
-                f"verdicts that differ: {np.sum(one != other)}, amplitudes by "
-                f"{np.max(np.where(one == other, np.abs(sizes[0] / sizes[1] - 1), 0.0)):.1e} at most",
-                flush=True,
-            )
+    """Warm maps with and without kernels, in turns: wall time, and whether their verdicts agree."""
+    paper_map(64), without_kernels(64)  # compiled
+    for _ in range(2):
+        walls, found = [], []
+        for make in (paper_map, without_kernels):
+            begin = time.perf_counter()
+            found.append(make(64))
+            walls.append(time.perf_counter() - begin)
+        one, other = (m["verdict"].values for m in found)
+        sizes = [np.where(np.asarray(m["verdict"]) == 1, m["amplitude"], 1.0) for m in found]
+        print(
+            f"64 × 64: {walls[0]:.1f} s by kernels, {walls[1]:.1f} s without, ratio {walls[0] / walls[1]:.2f}; "
+            f"verdicts that differ: {np.sum(one != other)}, amplitudes by "
+            f"{np.max(np.where(one == other, np.abs(sizes[0] / sizes[1] - 1), 0.0)):.1e} at most",
+            flush=True,
+        )
 
 
 def axes() -> None:
@@ -162,7 +162,8 @@ def axes() -> None:
 
 
 def without_kernels(points: int):
-    with mock.patch("fivjax.batches.sharing.is_installed", return_value=False):
+    scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "batches.sharing"))
+    with mock.patch(scope, return_value=False), mock.patch(sharing, return_value=False):
         return paper_map(points)
 
 
@@ -238,85 +239,28 @@ def watched_memory():
         watching.join()
 
 
-def roofline() -> None:
-    """Arithmetic and memory traffic of a step of a map's trajectories, by XLA's count, compared with the speed of the machine."""
-    import jax
-    import jax.numpy as jnp
-
-    from fivjax.contact import Contact
-    from fivjax.cycles.about_sliding import mechanics_about_sliding, sliding_state
-    from fivjax.foundation.compiling import less_thought
-    from fivjax.steppers.windowed import Windowed
-
-    groups, beside, steps = 4, 16, 400
-    run = fj.simulate(scene(p=1.3), 2.0, 1e-3)
-    with jax.enable_x64(True):
-        rows = np.random.default_rng(0).choice(np.arange(200, 2000), (groups, beside))
-        states = np.concatenate([run.displacement[rows], run.velocity[rows]], axis=-1)
-        y = jnp.asarray(states - np.asarray(sliding_state(scene(), scene().load.final)))
-        begin = Contact(jnp.asarray(run.status[rows], jnp.int32), jnp.sign(3.0 - jnp.asarray(run.velocity[rows, 0])))
-        mu = jnp.linspace(0.2, 0.227, groups)
-        prepared = jax.vmap(lambda mu: Windowed().prepare(mechanics_about_sliding(scene().replace(mu=mu))))(mu)
-        none, long = jnp.zeros((groups, beside)), jnp.ones((groups, beside))
-        one = jax.vmap(jax.vmap(Windowed().advance, in_axes=(None, 0, 0, 0, 0)))
-
-        def step(y, contact):
-            after = one(prepared, contact, none, y, long)
-            return after.y, after.contact
-
-        def many(y, contact):
-            return jax.lax.fori_loop(0, steps, lambda _, now: step(*now), (y, contact))
-
-        counted = jax.jit(step, compiler_options=less_thought()).lower(y, begin).compile().cost_analysis()
-        timed = jax.jit(many, compiler_options=less_thought()).lower(y, begin).compile()
-        matrix, long_row = jnp.ones((1024, 1024)), jnp.ones(2**26)
-        product = jax.jit(lambda a: a @ a).lower(matrix).compile()
-        copy = jax.jit(lambda a: a + 1.0).lower(long_row).compile()
-
-        def seconds(program, *args) -> float:
-            found = []
-            for _ in range(5):
-                start = time.perf_counter()
-                jax.block_until_ready(program(*args))
-                found.append(time.perf_counter() - start)
-            return min(found)
-
-        peak, traffic = 2 * 1024**3 / seconds(product, matrix), 16 * 2**26 / seconds(copy, long_row)
-        each = seconds(timed, y, begin) / steps
-    flops, moved, count = counted["flops"], counted["bytes accessed"], groups * beside
-    table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / groups
-    print(f"{groups} structures with {beside} trajectories each: {1e6 * each / count:.2f} µs a trajectory-step")
-    print(f"a trajectory-step: {flops / count:.0f} operations, {moved / count / 1e3:.1f} kB between kernels")
-    print(f"by kernels, the same work in another order: {1e6 * kernel_step():.2f} µs a trajectory-step")
-    print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
-    print(f"the machine: {peak / 1e9:.0f} Gflop/s in a large product (all cores), {traffic / 1e9:.1f} GB/s in memory")
-    print(
-        f"reached: {flops / each / 1e9:.1f} Gflop/s, {flops / each / peak:.0%} of that; {moved / each / 1e9:.0f} GB/s in cache"
-    )
-
-
-def kernel_step() -> float:
-    """The time (s) of one step of trajectories that stay in motion, by a kernel on one core."""
-    import jax
-
+def steps() -> None:
+    """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
     from fivjax.batches.following import begun
     from fivjax.batches.kernels import Kernels
     from fivjax.batches.sharing import Batch, shared_by
-    from fivjax.steppers.windowed import Windowed
+    from fivjax.steppers.propagation import Propagation
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
     with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
-        batch = Batch(scene(), Windowed(by_kernel=True), ("mu",), ("p",), (), False, 16, False, pool)
+        batch = Batch(scene(), Propagation(), ("mu",), ("p",), (), False, 16, False, pool)
         shared = shared_by(batch, mu[:, None])
         trajectories = begun(batch, shared, group, np.full((len(group), 1), 1.3))
-        kernels = Kernels(shared, pool)
+        kernels, prepared = Kernels(shared, pool), shared.tree.prepared
         kernels.follow(group, trajectories, steps)
         found = []
         for _ in range(5):
             start = time.perf_counter()
             kernels.follow(group, trajectories, steps)
             found.append(time.perf_counter() - start)
-    return min(found) / (steps * len(group))
+    table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / len(mu)
+    print(f"{1e6 * min(found) / (steps * len(group)):.2f} µs a trajectory-step")
+    print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
 
 
 def paper_map(points: int, **options):
@@ -336,7 +280,7 @@ if __name__ == "__main__":
         "start": start,
         "memory": memory,
         "large": large,
-        "roofline": roofline,
+        "steps": steps,
     }
     for name in sys.argv[1:] or studies:
         print(f"--- {name}: {studies[name].__doc__}")

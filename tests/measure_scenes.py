@@ -262,6 +262,8 @@ def tangents(seed):
             None,
         )
     run = fj.simulate(scene, PERIODS * period, PERIODS * period / (4 * ROWS), y0=y0, progress=False)
+    if y0 is not None and run.status[0] == fj.Status.SLIDE and run.slip_velocity[0] == 0:
+        names.remove("belt_speed")  # a faster belt and a slower one begin in two directions: it has no derivative
     changes = run.t[np.flatnonzero(np.diff(run.status))]
     edges = np.append(changes, run.t[-1])[7:12]
     k = int(np.argmax(np.diff(edges))) if len(edges) > 1 else 0
@@ -335,6 +337,7 @@ def told(kind, errors, allowed):
 
 if __name__ == "__main__":
     np.seterr(over="ignore", invalid="ignore")  # the oracle looks for the end of slip beyond it
+    oracle.RESTS = 1e-9  # with the tests' 1e-7, what it cuts off of a chain of rebounds is some 1e-8
     names = [word for word in sys.argv[1:] if not word.isdigit()] or ["one", "several", "tangents"]
     given = [int(word) for word in sys.argv[1:] if word.isdigit()]
     shares = {"one": 6, "several": 2, "tangents": 2}

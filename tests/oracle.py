@@ -28,6 +28,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 STICK, SLIDE, DETACH = 0, 1, 2
 MAX_EVENT_RATE = 50_000.0  # events per simulated second, over 500 events
+RESTS = 1e-7  # a rebound slower than this share of its impact counts as rest
 
 
 class ZenoError(RuntimeError):
@@ -285,7 +286,7 @@ class _Mechanics:
         if sticks:
             v[it] = self.vb
         rebound = e * speed
-        v[iz] = rebound if rebound > 1e-7 * self.impact_speed else 0.0
+        v[iz] = rebound if rebound > RESTS * self.impact_speed else 0.0
         return v
 
 

@@ -1,23 +1,25 @@
 """Kernels: the same motion as by the oracle and by the series stepper, and the same maps as without kernels."""
 
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from test_propagators import SEEDS, at_rest, light_mass, lowest_later, marched, random_motion, touches_at
 from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.batches import sharing
 from fivjax.batches.kernel_programs import programs
+from fivjax.batches.progress import next_step_end
 from fivjax.contact import Mechanics, Status, status_from_forces
 from fivjax.foundation import warp_library
 from fivjax.foundation.compiling import compiled
 from fivjax.foundation.scalar_code import scalar_source
 from fivjax.foundation.warp_library import devices, load, warp
+from fivjax.steppers import kernel_scope
 from fivjax.steppers.kernel_advance import stepping
 from fivjax.steppers.kernel_laws import Form
 from fivjax.steppers.kernel_matrices import matrices
@@ -31,6 +33,39 @@ MOST = 5000
 def prepared(scene, y):
     mechanics = Mechanics(scene)
     return mechanics, propagators(mechanics), status_from_forces(mechanics, scene.load(0.0), y)
+
+
+@compiled
+def begun(method, scene, y):
+    mechanics = Mechanics(scene)
+    return method.prepare(mechanics), status_from_forces(mechanics, scene.load(0.0), y)
+
+
+def at_rest(scene) -> np.ndarray:
+    q = fj.sliding_equilibrium(scene)
+    return np.concatenate([q, np.zeros_like(q)])
+
+
+@compiled
+def advanced(method, prepared, scene, contact, y, t, t1):
+    end = jnp.minimum(next_step_end(scene.load, t, method.dt), t1)
+    after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t, True)
+    return after, jnp.where(after.h >= end - t, end, t + after.h)
+
+
+def marched(method, scene: fj.Scene, t1: float, y0=None):
+    """The state at `t1`, and (time, new status) of every status change on the way."""
+    with jax.enable_x64(True):
+        y = jnp.asarray(at_rest(scene) if y0 is None else y0, float)
+        (prepared, contact), t, seen = begun(method, scene, y), jnp.zeros(()), []
+        for _ in range(5000):
+            after, t = advanced(method, prepared, scene, contact, y, t, jnp.asarray(t1))
+            if int(after.contact.status) != int(contact.status):
+                seen.append((float(t), int(after.contact.status)))
+            y, contact = after.y, after.contact
+            if float(t) >= t1:
+                return np.asarray(y), seen
+        raise AssertionError("it did not arrive")
 
 
 MARCHES = {}
@@ -111,6 +146,57 @@ def by_kernel(scene: fj.Scene, t1: float, y0=None, mode=None):
     return states[count - 1], [(times[k], int(modes[k, 0])) for k in changed], times[1]
 
 
+def random_motion(seed: int) -> tuple[fj.Scene, np.ndarray]:
+    """Any symmetric structure of two to five coordinates, pressed on firmly enough to touch, on a belt that runs either way; and a
+    state in the air.
+    """
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 4
+
+    def definite(scale):
+        root = rng.normal(size=(n, n))
+        return scale * (root @ root.T / n + np.eye(n))
+
+    mass = np.diag(rng.uniform(0.2, 2.0, n))
+    normal, tangential = rng.permutation(n)[:2]
+    direction = np.where(np.arange(n) == normal, -1.0, 0.3 * rng.normal(size=n))
+    mu = rng.uniform(0.05, 0.6)
+    scene = fj.Scene(
+        fj.Structure(mass, definite(0.3), definite(1e3), direction, tangential=int(tangential), normal=int(normal)),
+        fj.Coulomb(mu, mu * rng.uniform(1.0, 1.5)),
+        belt_speed=rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 1.0),
+        load=fj.Pulse(50.0, rng.uniform(0.0, 4.0), duration=0.3),
+        restitution=rng.choice([0.0, 0.4]),
+    )
+    y0 = np.zeros(2 * n)
+    y0[normal] = 0.05
+    y0[n:] = 3 * rng.normal(size=n)
+    return scene, y0
+
+
+def light_mass() -> fj.Scene:
+    """A mass that a load holds 1 m above the belt: in the air it swings about there with one radian per second."""
+    # Contact, friction and load of the kind that a random structure of two coordinates has been compiled with.
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    return fj.Scene(structure, fj.Coulomb(0.1, 0.1), 1.0, fj.Pulse(1.0, 1.0, duration=1e3), restitution=0.0)
+
+
+def lowest_later(amplitude: float, t: float) -> np.ndarray:
+    """The state from which that mass is lowest at `t`, by its amplitude (m) below the rest position."""
+    return np.array([0.0, 1 - amplitude * np.cos(t), 0.0, -amplitude * np.sin(t)])
+
+
+def touches_at(amplitude: float, t: float):
+    """When it touches the belt on the way there: two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the
+    root of their depth.
+    """
+    return pytest.approx(t - np.arccos(1 / amplitude), abs=1e-15 / (amplitude - 1) ** 0.5 + 1e-14)
+
+
+# Each number of coordinates, and each choice of two for the contact, is compiled anew: these are of one kind.
+SEEDS = (0, 12, 28)
+
+
 @pytest.mark.parametrize("name", [name for name in CASES if name != "falling friction"])
 def test_states_and_events_agree_with_the_oracle(name):
     """SciPy's `solve_ivp` with events and restarts, written apart from the package."""
@@ -155,8 +241,14 @@ def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch):
     axes = dict(mu=[0.15, 0.2, 0.227], p=np.linspace(0.0, 3.0, 9))
     scene = paper_scene.replace(belt_speed=3.0)
     found = fj.bistability_map(scene, **axes, progress=False)
-    monkeypatch.setattr(sharing, "is_installed", lambda: False)
-    expected = fj.bistability_map(scene, **axes, progress=False)
+    for module in (sharing, kernel_scope):
+        monkeypatch.setattr(module, "is_installed", lambda: False)
+    kernel_scope._tell_once.cache_clear()
+    with pytest.warns(UserWarning, match="pip install warp-lang"):
+        expected = fj.bistability_map(scene, **axes, progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it is said once
+        assert not kernel_scope.has_kernel(scene, fj.EventExact())
     np.testing.assert_array_equal(found.verdict, expected.verdict)
     cycles = found.verdict.values == fj.Verdict.LIMIT_CYCLE
     assert np.any(cycles) and not np.all(cycles)

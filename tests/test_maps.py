@@ -143,7 +143,7 @@ def test_speed_dependent_friction_has_verdicts_too():
 @pytest.mark.slow
 def test_friction_that_falls_steeply_squeals_by_itself():
     """Eq. 1 with a steep fall. Its attractor is found by the return map of the series stepper, which is compiled for a minute;
-    for constant friction `test_windowed_returns` compares that map with another."""
+    for constant friction `test_returns_by_kernels` compares that map with another."""
     steep = fj.bistability_map(falling(0.5, 0.5), p=[1.01, 1.5], progress=False)
     assert steep["verdict"].values.tolist() == [1, 1]
 

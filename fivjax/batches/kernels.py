@@ -1,7 +1,6 @@
 """Trajectories followed, and return maps evaluated, by Warp kernels: one thread for each, on a CPU or on GPUs.
 
-A kernel does for one trajectory what `rounds` and `windowed_returns` do for blocks of them by XLA, with the same matrices and
-laws. No trajectory waits for the slowest of a block, and nothing is padded.
+No trajectory waits for the slowest of a block, as by XLA, and nothing is padded.
 """
 
 from concurrent.futures import Executor
@@ -96,7 +95,9 @@ class Kernels:
         }
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """What `moved_in_windows` gives, for motions from these states of the section; with the last `kept` crossings."""
+        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
+        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
+        """
         count, size = y.shape
         rows = np.empty((count, STATE + size))
         rows[:, CROSSINGS], rows[:, STATUS], rows[:, DIRECTION], rows[:, STATE:] = crossings, status, direction, y

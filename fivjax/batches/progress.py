@@ -16,7 +16,7 @@ from ..model.scene import Scene, steady_sliding
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
-from ..steppers.windowed import Windowed
+from ..steppers.propagation import Propagation
 from ..verdicts.sliding_proof import SlidingModes
 from ..verdicts.verdict import Verdict
 from .sharing import Shared
@@ -44,7 +44,7 @@ class Setting(eqx.Module):
     """The data with which a trajectory is followed."""
 
     scene: Scene
-    method: AbstractStepper | Windowed
+    method: AbstractStepper | Propagation
     shared: Shared
 
 
@@ -136,9 +136,8 @@ def step(setting: Setting, now: Progress) -> Progress:
     longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
-    # Exact steppers end on the section. `Windowed` interpolates crossings from its samples, which is good enough here.
-    at_section = not isinstance(method, Windowed)
-    after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section)
+    assert not isinstance(method, Propagation)
+    after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section=True)
     y, contact, h, rise = after.y, after.contact, after.h, after.rise
     t = jnp.where(h >= t - now.t, t, now.t + h)
     changed = contact.status != now.contact.status

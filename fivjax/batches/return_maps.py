@@ -1,8 +1,8 @@
 """The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
 
-The programs here do not depend on a map's axes: all maps of structures of one size and friction of one kind share them. If the
-trajectories of a map are followed by `Windowed`, so are these motions; derivatives, which it does not have, are then central
-differences.
+The programs here do not depend on a map's axes: all maps of structures of one size and friction of one kind share them. Where
+kernels follow the trajectories of a map, they follow these motions too; derivatives, which those by matrices (`Kernels`) do not
+have, are then central differences.
 """
 
 from functools import cached_property
@@ -19,17 +19,17 @@ from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.section import section_weights
-from ..steppers.windowed import Windowed
 from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
 from .kernels import Kernels
 from .series_kernels import SeriesKernels
 from .sharing import Batch
-from .windowed_returns import FEW, KEPT, SIDE_BY_SIDE, in_rows_of_several, moved_in_windows
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
+# Number of states on the section that XLA keeps of a motion, the last ones.
+KEPT = 16
 DERIVED_BLOCK = 16
 # Steps of central differences, relative to a state's size: about the cube root of the rounding unit; smaller ones where motions
 # have other events that far away. And the most crossings over which a difference is taken.
@@ -77,7 +77,6 @@ class ReturnMaps:
         tree, self.kernels = shared.tree, kernels
         longest = np.asarray(tree.longest_return)
         self.mechanics = flatten((tree.mechanics, longest))
-        self.windows = flatten((tree.prepared, longest)) if isinstance(batch.method, Windowed) else None
         # How well trajectories' latest crossings are known, relative to their size: they tell which to ask for attractors.
         exact = kernels is not None or isinstance(batch.method, EventExact)
         self.known_to = ROUNDED if exact else INTERPOLATED
@@ -144,19 +143,16 @@ class ReturnMaps:
     def _returns(self, group, at: Section, crossings, kept: int, peaks: bool) -> Images:
         if self.kernels is not None:
             return _images(self.kernels.returns(group, *at, crossings, peaks, kept))
-        if self.windows is not None:
-            images = _images(self._in_windows(group, at, crossings, peaks))
-        else:
-            # Most need no peaks, so these are of another program.
-            peak = self.peaks(group, at, crossings) if peaks else np.zeros(len(at.y))
-            images = _images((*self._exactly(_returned, self.block, group, at, crossings), peak))
+        # Most need no peaks, so these are of another program.
+        peak = self.peaks(group, at, crossings) if peaks else np.zeros(len(at.y))
+        images = _images((*self._exactly(_returned, self.block, group, at, crossings), peak))
         return images._replace(path=images.path[:, KEPT - kept :])
 
     def derived(
         self, group, at: Section, crossings
     ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
         """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
-        if self.windows is not None:
+        if isinstance(self.kernels, Kernels):
             return self._differences(group, at, crossings)
         if isinstance(self.kernels, SeriesKernels) and len(group):
             (*section, time), derivatives = self.kernels.derived(group, *at, crossings)
@@ -166,7 +162,7 @@ class ReturnMaps:
 
     def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
         """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
-        if self.windows is not None or self.kernels is not None:
+        if self.kernels is not None:
             return self.returns(group, at, crossings, peaks=True).peak
         return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
 
@@ -213,17 +209,12 @@ class ReturnMaps:
                 break
         return base.at, base.time, derivatives
 
-    def _in_windows(self, group, at: Section, crossings, peaks: bool):
-        rows = _rows(at, crossings, np.full(len(at.y), peaks))
-        width, size = (SIDE_BY_SIDE, self.block) if in_rows_of_several(group) else (1, FEW)
-        return in_blocks(moved_in_windows, self.windows, group, rows, width, self.pool, size=size).tree
-
     def _exactly(self, program, size: int, group, at: Section, crossings):
         return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree
 
 
-def _rows(at: Section, crossings, *more) -> Flattened:
-    return at.flattened(np.broadcast_to(np.asarray(crossings, np.int32), len(at.y)).copy(), *more)
+def _rows(at: Section, crossings) -> Flattened:
+    return at.flattened(np.broadcast_to(np.asarray(crossings, np.int32), len(at.y)).copy())
 
 
 def _images(found) -> Images:

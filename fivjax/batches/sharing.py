@@ -25,8 +25,7 @@ from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_advance import MOST_COORDINATES
 from ..steppers.kernel_scope import has_kernel
-from ..steppers.propagation import MATRIX_ROWS
-from ..steppers.windowed import Windowed
+from ..steppers.propagation import MATRIX_ROWS, Propagation
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 from .flattened import Flattened, flatten
@@ -55,7 +54,7 @@ class Batch(NamedTuple):
     """The data that all trajectories of a run have in common, and how they are computed."""
 
     scene: Scene
-    method: AbstractStepper | Windowed
+    method: AbstractStepper | Propagation
     names: tuple[str, ...]  # parameters that differ between groups
     history: tuple[str, ...]  # parameters of the kick
     states: tuple[int, ...]  # indices of the initial state for which trajectories have values of their own
@@ -67,7 +66,7 @@ class Batch(NamedTuple):
     @property
     def by_kernel(self) -> bool:
         """Whether kernels follow the trajectories by matrices prepared for each group."""
-        return isinstance(self.method, Windowed) and self.method.by_kernel
+        return isinstance(self.method, Propagation)
 
     @property
     def by_series(self) -> bool:
@@ -75,7 +74,7 @@ class Batch(NamedTuple):
         return isinstance(self.method, EventExact) and has_kernel(self.scene, self.method)
 
 
-def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed:
+def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagation:
     """The stepper that gives the same motion of many trajectories in less time, if there is one."""
     one = len(scene.structure.contacts) == 1
     if method != EventExact() or not scene.friction.constant or not one:
@@ -83,14 +82,14 @@ def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Windowed
     small = scene.structure.size <= MOST_COORDINATES
     # Only of a law that is known can it be said that a kernel can be made of it.
     if small and isinstance(scene.friction, Coulomb) and is_installed():
-        return Windowed(by_kernel=True)
-    return method if has_kernel(scene, method) else Windowed()
+        return Propagation()
+    return method
 
 
 def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
     """The version of Warp, where its kernels follow the trajectories of such a run."""
     by = method if energy else in_bulk(method, scene)
-    by_kernel = by.by_kernel if isinstance(by, Windowed) else has_kernel(scene, by)
+    by_kernel = isinstance(by, Propagation) or has_kernel(scene, by)
     return {"warp": metadata.version("warp-lang")} if by_kernel else {}
 
 
@@ -137,7 +136,7 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
 
 
 @kept
-def _prepared(scene: Scene, method: AbstractStepper | Windowed, names: tuple[str, ...], values):
+def _prepared(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)

@@ -48,23 +48,6 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def computed_once(function, like):
-    """`function()`, computed once and kept. `like` has the structure and types of the result.
-
-    XLA on a CPU repeats arithmetic in every kernel that uses its result, so the cost of a long chain with many results grows
-    with the square of its length. It repeats nothing across the border of a loop, even of one that runs once; this makes maps
-    seven times faster. On other devices the loop would only prevent fusion, so it is left out there.
-    """
-    if jax.default_backend() != "cpu":
-        return jax.tree.map(lambda new, old: new.astype(old.dtype), function(), like)
-    once = jnp.ones_like(jax.tree.leaves(like)[0], bool).ravel()[0]
-
-    def body(carry):
-        return jnp.zeros_like(once), jax.tree.map(lambda new, old: new.astype(old.dtype), function(), carry[1])
-
-    return jax.lax.while_loop(lambda carry: carry[0], body, (once, like))[1]
-
-
 def power_of_4(count: int) -> int:
     """The smallest power of 4 at or above a count. Arrays padded to it have few different sizes, so few are compiled."""
     return 4 ** -(-(count - 1).bit_length() // 2)

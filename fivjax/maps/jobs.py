@@ -22,7 +22,7 @@ from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from ..steppers.windowed import Windowed
+from ..steppers.propagation import Propagation
 from .job_files import JobFile
 
 
@@ -30,7 +30,7 @@ class Task(NamedTuple):
     """The data that all jobs of a run have in common."""
 
     scene: Scene  # with NumPy arrays, because JAX arrays lose double precision when they are unpickled
-    method: AbstractStepper | Windowed
+    method: AbstractStepper | Propagation
     names: tuple[str, ...]  # parameters that differ between groups
     history: tuple[str, ...]  # parameters of the kick
     states: dict[str, int]  # initial displacements and velocities, with their indices in the state

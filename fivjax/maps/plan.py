@@ -13,7 +13,7 @@ from ..batches.blocks import MANY
 from ..batches.sharing import HISTORY, bytes_per_trajectory, in_bulk
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from ..steppers.windowed import Windowed
+from ..steppers.propagation import Propagation
 from .jobs import Task
 from .trajectories import Grid, Listed, Places
 
@@ -21,8 +21,8 @@ from .trajectories import Grid, Listed, Places
 SIDE_BY_SIDE = 16
 # The cost of a trajectory in a row of its own, relative to one in a full row.
 COST_OF_STANDING_ALONE = 4
-# The most trajectories of a job, with `Windowed` and with other steppers: a second or two of work, because an interrupt loses
-# as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
+# The most trajectories of a job, with `Propagation` and with other steppers: a second or two of work, because an interrupt
+# loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
 GROUPS_IN_A_JOB = 512
@@ -84,7 +84,7 @@ def planned(
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def in_a_job(method: AbstractStepper | Windowed, each: float, of_group: float) -> int:
+def in_a_job(method: AbstractStepper | Propagation, each: float, of_group: float) -> int:
     """The most trajectories of a job, if each takes `each` bytes and so many, on average, are of one group."""
-    by_time = IN_A_JOB if isinstance(method, Windowed) else IN_A_LONG_JOB
+    by_time = IN_A_JOB if isinstance(method, Propagation) else IN_A_LONG_JOB
     return max(1, min(by_time, int(OF_A_JOB // each), int(GROUPS_IN_A_JOB * of_group)))

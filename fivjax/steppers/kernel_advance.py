@@ -1,8 +1,9 @@
-"""`Windowed` for one trajectory at a time, as Warp functions that run on a CPU or a GPU.
+"""Exact motion through contact events under constant friction, as Warp functions that run on a CPU or a GPU.
 
-The matrices are those of `propagation`, the laws of contact those of `contact`. A loop for one trajectory looks at the
-intervals of the window one after the other and stops at the first that may have an event; arrays of trajectories, which
-`Windowed` steps, have to look at all. Motions agree to rounding; advances may end elsewhere.
+In one contact mode the motion is then linear: the states at equally spaced later times are matrices times the present state
+(`propagation`). They are samples over a *window* of time ahead, with the Bernstein control points of the guards between them.
+A loop looks at the intervals one after the other and stops at the first that may have an event; only there the Taylor series,
+again a matrix times the state, is searched for the instant. What ends a mode and what follows comes from `contact`.
 """
 
 import functools

@@ -6,7 +6,9 @@ from ..foundation.warp_library import warp
 from .kernel_matrices import BLOCK, abreast, blocks_of, padded, places_of
 from .kernel_types import Types
 from .propagation import INTERVALS, ORDER
-from .window_roots import ROOT_STEPS
+
+# Terms of the series in each of the first steps of Newton's method, which are enough for nearly all roots: few at first.
+ROOT_STEPS = (5, 5, ORDER)
 
 
 class Arithmetic(NamedTuple):

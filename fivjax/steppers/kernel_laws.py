@@ -105,10 +105,10 @@ def _written_out(form: Form) -> dict[str, tuple[str, int]]:
         return Contact(mode[0].astype(jnp.int32), mode[1])
 
     def exact_of(mode):
-        return physics.exactly_zero(contact_of(mode))[:, None]
+        return physics.exactly_zero(contact_of(mode))
 
     def limits_of(sizes):
-        return sizes[:6].reshape(3, 2, 1)
+        return sizes[:6].reshape(3, 2)
 
     def held(mechanics, mode, y):
         return physics.on_constraint(form.mechanics(mechanics), contact_of(mode), y)
@@ -121,24 +121,20 @@ def _written_out(form: Form) -> dict[str, tuple[str, int]]:
         return jnp.concatenate([y, jnp.stack([contact.status.astype(y.dtype), contact.direction])])
 
     def has_begun(mode, start, sizes):
-        zeros, _ = leading(start.reshape(4, 2, 1), limits_of(sizes), exact_of(mode))
+        zeros, _ = leading(start.reshape(4, 2), limits_of(sizes), exact_of(mode))
         return jnp.any(zeros > 0)[None]
 
     def is_safe(mode, start, hull, sizes):
-        hull = hull[: 2 * ORDER].reshape(ORDER, 2, 1)
-        return first_is_safe(start.reshape(4, 2, 1), hull, limits_of(sizes), exact_of(mode))
+        hull = hull[: 2 * ORDER].reshape(ORDER, 2)
+        return first_is_safe(start.reshape(4, 2), hull, limits_of(sizes), exact_of(mode))
 
     def brackets(mode, guards, sizes):
-        start, end, inside = (
-            guards[:10].reshape(5, 2, 1),
-            guards[2 * ORDER + 2 : 2 * ORDER + 4, None],
-            jnp.ones(1, bool),
-        )
-        found = bracketed(start, end, limits_of(sizes), exact_of(mode), inside)
+        start, end = guards[:10].reshape(5, 2), guards[2 * ORDER + 2 : 2 * ORDER + 4]
+        found = bracketed(start, end, limits_of(sizes), exact_of(mode))
         return jnp.concatenate([jnp.ravel(part).astype(start.dtype) for part in jax.tree.leaves(found)])
 
     def fastest_sample(speeds, steps):
-        return fastest(speeds[:, None], steps)
+        return fastest(speeds, steps[0])[None]
 
     kinds = {
         "mechanics": t.mechanics,

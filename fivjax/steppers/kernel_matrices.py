@@ -48,7 +48,7 @@ def matrices(prepared: Propagators, n: int, tangential: int, normal: int) -> Flo
     """The matrices of several scenes (leading axis), mode by mode: sticking, sliding in either direction, detached."""
     window, series, sizes = (np.asarray(part) for part in (prepared.window, prepared.series, prepared.sizes))
     count = len(window)
-    hull, control, samples = np.split(window[:, 8:], np.cumsum((2 * ORDER, 6 * INTERVALS)), axis=1)
+    hull, control, samples = np.split(window, np.cumsum((2 * ORDER, 6 * INTERVALS)), axis=1)
     guards, displacements = np.split(series, [2 * (ORDER + 2)], axis=1)
     control = control.reshape(count, 3, INTERVALS, 2, -1).transpose(0, 2, 1, 3, 4).reshape(count, INTERVALS, 6, -1)
     samples = samples.reshape(count, INTERVALS + 1, 2 * n, -1)

@@ -1,11 +1,17 @@
-"""Roots of guards and of the tangential velocity within an interval, for kernels; see `window_roots`."""
+"""Roots of guards and of the tangential velocity within an interval: bracketed, then refined by Newton's method."""
 
 from typing import Any, NamedTuple
 
 from ..foundation.warp_library import warp
-from .kernel_arithmetic import Arithmetic
+from .kernel_arithmetic import ROOT_STEPS, Arithmetic
 from .kernel_types import Types
-from .window_roots import LOWEST_STEPS, MOST_ROOT_STEPS, PEAK_STEPS, RISE_STEPS, ROOT_STEPS
+
+MOST_ROOT_STEPS = 60
+# Steps of Newton's method in a bracket, for the root of a velocity that changes sign in an interval; bisection is seldom
+# needed.
+RISE_STEPS = 12
+# Steps of Newton's method for where a guard is lowest, and for a peak, from the sample next to it.
+LOWEST_STEPS, PEAK_STEPS = 6, 5
 
 
 class Roots(NamedTuple):

@@ -1,6 +1,7 @@
 """The matrices that give a scene's motion over a window of time, in each contact mode, under constant friction."""
 
 import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,15 +24,29 @@ MATRIX_ROWS = 4 * (INTERVALS + ORDER)
 
 
 class Propagators(eqx.Module):
-    """The matrices of one scene. Their columns are those of `stacked`: the four contact modes side by side."""
+    """The matrices of one scene. Their columns are the entries of (state, load, 1) that are not zero, of the four contact modes
+    side by side.
+    """
 
     mechanics: Mechanics
     interval: Float[Array, ""]  # between two samples, s
-    window: Float[Array, "r c"]  # see `Window`
-    series: Float[Array, "q c"]  # see `Series`
-    sizes: Float[
-        Array, "8 c"
-    ]  # for rounding of the guards' first three coefficients, and for their difference from cubics
+    window: Float[Array, "r c"]  # the samples of the state, with bounds on the guards between them
+    series: Float[Array, "q c"]  # the Taylor series in an interval
+    # For rounding of the guards' first three coefficients, and for their difference from cubics.
+    sizes: Float[Array, "8 c"]
+
+
+class Propagation(eqx.Module):
+    """How kernels step in place of `EventExact`: the same motion to rounding, by matrices prepared for each scene.
+
+    It needs one contact and constant friction, and gives no derivatives.
+    """
+
+    dt: ClassVar = math.inf
+    round: ClassVar = 16
+
+    def prepare(self, mechanics: Mechanics) -> Propagators:
+        return propagators(mechanics)
 
 
 def propagators(mechanics: Mechanics) -> Propagators:
@@ -57,7 +72,7 @@ def propagators(mechanics: Mechanics) -> Propagators:
     hulls = jnp.einsum("jk,kwgc->jwgc", _bernstein(ORDER), coefficients)[1:]
     values, slopes = guards @ samples, coefficients[1] @ samples
     control = jnp.stack([values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3])
-    window = [coefficients[:4], hulls, control, samples[:, :, : 2 * n]]
+    window = [hulls, control, samples[:, :, : 2 * n]]
     series = [coefficients, jnp.sum(coefficients, axis=0), powers[:, :, :n]]
 
     sizes, rates = jax.vmap(lambda way: _magnitudes(mechanics, way))(ways)
@@ -91,19 +106,6 @@ def _columns(n: int, normal: int) -> tuple[np.ndarray, np.ndarray]:
     """Which entries of (state, load, 1) are not zero: in contact (no gap, no gap rate), and detached."""
     everything = np.arange(2 * n + 2)
     return everything[(everything != normal) & (everything != n + normal)], everything
-
-
-def stacked(
-    mechanics: Mechanics, contact: Contact, load: Float[Array, " l"], y: Float[Array, "state l"]
-) -> Float[Array, "c l"]:
-    """(state, load, 1) in the columns of the present contact mode, zero in the others."""
-    n, normal = y.shape[0] // 2, mechanics.normal
-    rest = jnp.stack([load, jnp.ones_like(load)])
-    closed = jnp.concatenate([y[:normal], y[normal + 1 : n + normal], y[n + normal + 1 :], rest])
-    sliding = contact.status == Status.SLIDE
-    ways = [contact.status == Status.STICK, sliding & (contact.direction > 0), sliding & (contact.direction < 0)]
-    columns = [jnp.where(way, closed, 0.0) for way in ways]
-    return jnp.concatenate([*columns, jnp.where(contact.status == Status.DETACH, jnp.concatenate([y, rest]), 0.0)])
 
 
 def _affine(mechanics: Mechanics, contact: Contact) -> tuple[Float[Array, "m m"], Float[Array, "2 m"]]:

@@ -31,7 +31,7 @@ and the norm are part of the result.
 in the ellipsoid and has the cycle's contact mode. This test compares one state with one attractor and does not depend on other
 trajectories. Coexisting cycles have ellipsoids of their own, and a trajectory has the amplitude of the cycle that captured it.
 
-The state of a crossing must be known much better than the radius. The states that `Windowed` interpolates from its samples have
+The state of a crossing must be known much better than the radius. The states that `WhereSwitched` interpolates have
 errors of some thousandths, which is only enough to choose the trajectories to test.
 """
 

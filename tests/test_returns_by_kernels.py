@@ -1,4 +1,4 @@
-"""The section's return map by windows: the one that the series stepper has, many at a time."""
+"""The section's return map by kernels with matrices: the one that the series stepper has."""
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
@@ -12,27 +12,25 @@ from fivjax.batches.kernels import Kernels
 from fivjax.batches.return_maps import ReturnMaps, Section
 from fivjax.batches.sharing import Batch, shared_by
 from fivjax.batches.tori import section_at
-from fivjax.contact import Contact
-from fivjax.foundation.compiling import compiled
-from fivjax.steppers.windowed import Windowed
+from fivjax.steppers.propagation import Propagation
 
 CROSSINGS = 6
 
 
-@pytest.fixture(scope="module", params=["by XLA", "by kernels"])
-def maps(request):
+@pytest.fixture(scope="module")
+def maps():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
-        batch = Batch(scene, Windowed(request.param == "by kernels"), ("mu",), (), (), False, 8, False, pool)
+        batch = Batch(scene, Propagation(), ("mu",), (), (), False, 8, False, pool)
         shared = shared_by(batch, np.array([[0.12], [0.2], [0.227]]))
-        yield ReturnMaps(batch, shared, Kernels(shared, pool) if batch.by_kernel else None)
+        yield ReturnMaps(batch, shared, Kernels(shared, pool))
 
 
 @pytest.fixture(scope="module")
 def exactly(maps):
     """The same return maps by the series stepper, which the oracle agrees with."""
     same = copy.copy(maps)
-    same.windows = same.kernels = None
+    same.kernels = None
     return same
 
 
@@ -78,9 +76,6 @@ def test_the_peak_on_the_way_is_known_to_rounding(maps, exactly, starts):
     np.testing.assert_allclose(maps.peaks(*starts, CROSSINGS), exactly.peaks(*starts, CROSSINGS), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "maps", ["by kernels", pytest.param("by XLA", marks=pytest.mark.slow)], indirect=True, scope="module"
-)
 def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     """In the coordinates that the section and the contact leave free: the others nobody can change."""
     group, at = (starts[0][:12], starts[1].rows(slice(12)))
@@ -91,32 +86,3 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     free = np.array([0, 1, 4])
     difference = (scale * (ours - theirs))[:, :, free]
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("maps", ["by XLA"], indirect=True)
-def test_the_peak_of_an_advance_may_be_anywhere_in_it(maps):
-    """Advances end between the samples of a window, where the velocity may be larger than at any of them; and the largest of the
-    samples may stand beside a lower peak than another one does.
-    """
-    random = np.random.default_rng(5)
-    status = np.repeat([fj.Status.SLIDE, fj.Status.DETACH], 3000).astype(np.int32)
-    y = random.normal(size=(6000, 6))
-    y[:3000, [2, 5]] = 0.0
-    y[3000:, 2] = 20.0  # far from landing, so that advances are long
-    with jax.enable_x64(True):
-        windows = jax.tree.map(lambda leaf: leaf[0], maps.windows.tree[0])
-        h = 16 * windows.interval * random.uniform(0.05, 1.0, 6000)
-
-        def both(status, y, h):
-            contact = Contact(status, jax.numpy.asarray(1.0))
-            after = Windowed().advance(windows, contact, 0.0 * h, y, h)
-            peak = Windowed().peak(windows, contact, 0.0 * h, y, after.h, after.end)
-            times = after.h * jax.numpy.linspace(0.0, 1.0, 400)
-            inside = jax.vmap(lambda t: fj.EventExact().in_one_mode(windows.mechanics, contact, y, t))(times)
-            speeds = jax.numpy.abs(inside[:, 3])
-            return peak, jax.numpy.max(speeds), jax.numpy.argmax(speeds)
-
-        peak, sampled, place = map(np.asarray, compiled(jax.vmap(both))(status, y / maps.weights, h))
-    assert np.any(place == 399) and np.any((place > 0) & (place < 399))
-    assert np.all(peak >= sampled * (1 - 1e-12)) and np.all(peak <= sampled * (1 + 1e-4))
