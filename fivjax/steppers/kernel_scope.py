@@ -36,7 +36,7 @@ def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
 def _tell_once() -> None:
     warnings.warn(
         "Warp is not installed, so XLA follows motions in place of kernels. Results are the same to rounding, but first calls "
-        "take up to a minute more, and maps some thirty times as long. `pip install warp-lang` installs it.",
+        "take up to a minute more, and maps some forty times as long. `pip install warp-lang` installs it.",
         stacklevel=2,
     )
 
