@@ -67,19 +67,9 @@ def transition(
     Without any such guard, nothing changes. A rebound that would be back on the belt within the time `resolution` (s) counts as
     rest: with restitution, bounces get shorter without end, and a stepper can follow only so many.
     """
-    any_ended = jnp.any(ended)
-    if mechanics.several:
-        # Costly, and seldom needed.
-        return jax.lax.cond(
-            any_ended, lambda: _following(mechanics, contact, load, y, ended, resolution), lambda: (contact, y)
-        )
-    following, y_next = _following(mechanics, contact, load, y, ended, resolution)
-    return (
-        Contact(
-            status=jnp.where(any_ended, following.status, contact.status),
-            direction=jnp.where(any_ended, following.direction, contact.direction),
-        ),
-        jnp.where(any_ended, y_next, y),
+    # Costly, and seldom needed.
+    return jax.lax.cond(
+        jnp.any(ended), lambda: _following(mechanics, contact, load, y, ended, resolution), lambda: (contact, y)
     )
 
 

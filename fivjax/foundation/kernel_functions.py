@@ -142,6 +142,8 @@ class KernelFunction:
 
 def _parts(args: tuple, own: tuple) -> tuple[Form, list, list]:
     """The form of one trajectory's arguments, the arrays that all share, and those that each has for itself."""
+    if not own:
+        return *Form.of(args), []
     first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
     return Form.of((*args, *first))[0], Form.of(args)[1], Form.of(own)[1]
 

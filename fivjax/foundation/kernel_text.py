@@ -28,8 +28,9 @@ class Form(NamedTuple):
     def of(cls, args) -> tuple["Form", list]:
         """The form of some arguments, and their arrays."""
         leaves, structure = jax.tree.flatten(args)
-        told = tuple(Array(np.shape(leaf), _dtype(leaf)) if _is_array(leaf) else leaf for leaf in leaves)
-        return cls(structure, told), [leaf for leaf in leaves if _is_array(leaf)]
+        arrays = list(map(_array, leaves))
+        told = tuple(leaf if array is None else array for leaf, array in zip(leaves, arrays, strict=True))
+        return cls(structure, told), [leaf for leaf, array in zip(leaves, arrays, strict=True) if array is not None]
 
     def args(self, arrays: Sequence) -> Any:
         """The arguments with these arrays."""
@@ -54,12 +55,19 @@ class Array(NamedTuple):
         return count_of(self.shape)
 
 
-def _is_array(leaf) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray | np.generic | float)
+_NUMBER = Array((), "float64")
 
 
-def _dtype(leaf) -> str:
-    return _name_of(np.dtype(leaf.dtype) if hasattr(leaf, "dtype") else np.dtype(float))
+def _array(leaf) -> Array | None:
+    """What is told of an array; of what is none, nothing."""
+    # In the order in which they are most frequent: a call looks at some hundred of them.
+    if isinstance(leaf, np.ndarray):
+        return Array(leaf.shape, _name_of(leaf.dtype))
+    if isinstance(leaf, float):
+        return _NUMBER
+    if isinstance(leaf, jax.Array | np.generic):
+        return Array(leaf.shape, _name_of(np.dtype(leaf.dtype)))
+    return None
 
 
 @functools.cache

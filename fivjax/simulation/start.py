@@ -18,7 +18,7 @@ def start_state(scene: Scene, y0) -> State:
         # The first function refuses a scene without equilibrium; inside a compiled function that is not possible.
         known = is_known(scene.belt_speed)
         q = sliding_equilibrium(scene) if known else steady_sliding(scene, scene.load.force)[0]
-        return real(np.concatenate([q, np.zeros_like(q)])) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
+        return np.concatenate([q, np.zeros_like(q)]) if is_known(q) else jnp.concatenate([q, jnp.zeros_like(q)])
     y = checked_start(n, y0)
     if is_known(y):
         # Rounding may put the state of a cycle, or of a run before, a little below the belt.
