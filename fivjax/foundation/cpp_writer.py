@@ -289,10 +289,13 @@ class Writer:
             return self._folded_in_loops(name, self.view(value, kind), axes)
         value = self.entries(value)
         for axis in sorted(axes, reverse=True):
-            parts = np.moveaxis(value, axis, 0)
-            value = np.asarray(parts[0], object)
-            for part in parts[1:]:
-                value = self.each(name, BY_NUMBER[name], [value, np.asarray(part, object)], kind)
+            parts = [np.asarray(part, object) for part in np.moveaxis(value, axis, 0)]
+            # By pairs, which do not wait for one another.
+            while len(parts) > 1:
+                pairs = zip(parts[::2], parts[1::2], strict=False)
+                last = parts[len(parts) // 2 * 2 :]
+                parts = [*(self.each(name, BY_NUMBER[name], list(pair), kind) for pair in pairs), *last]
+            value = parts[0]
         return value
 
     def _folded_in_loops(self, name: str, value: View, axes) -> Value:
