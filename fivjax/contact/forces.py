@@ -38,17 +38,30 @@ def gap_rate(mechanics: Mechanics, y: State) -> Each:
 
 def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
     """Accelerations without contact forces, or with those at `mechanics.rest`, in m/s²."""
+    matrices, (displacement, velocity) = free_matrices(mechanics), measured(mechanics, y)
+    return mechanics.free_load * load + (product(matrices[0], displacement) + product(matrices[1], velocity))
+
+
+def free_matrices(mechanics: Mechanics) -> tuple[Float[Array, "n s"], Float[Array, "n n"]]:
+    """What the free accelerations are of the displacements, as they are `measured`, and of the velocities."""
+    stretched = mechanics.springs is not None and mechanics.from_springs is not None
+    return mechanics.from_springs if stretched else mechanics.free_position, mechanics.free_velocity
+
+
+def measured(mechanics: Mechanics, y: State) -> tuple[Float[Array, " s"], Float[Array, " n"]]:
+    """Displacements, or with `mechanics.springs` the stretches of these, and velocities."""
     n = degrees_of_freedom(y)
-    acceleration = mechanics.free_load * load
-    position, displacement = mechanics.free_position, y[:n]
-    if mechanics.springs is not None and mechanics.from_springs is not None:
-        position, displacement = mechanics.from_springs, mechanics.springs.stretches(displacement)
-    if n > LARGEST_BY_COLUMNS:
-        return acceleration + position @ displacement + mechanics.free_velocity @ y[n:]
-    # Sums over columns rather than matrix products: in a batch these become one fused loop over trajectories.
-    for j in range(n):
-        acceleration = acceleration + position[:, j] * displacement[j] + mechanics.free_velocity[:, j] * y[n + j]
-    return acceleration
+    return (y[:n] if mechanics.springs is None else mechanics.springs.stretches(y[:n])), y[n:]
+
+
+def product(matrix: Float[Array, "m n"], vector: Float[Array, " n"]) -> Float[Array, " m"]:
+    """A matrix times a vector. Small ones as a sum over columns: in a batch this becomes one fused loop over trajectories."""
+    if len(vector) > LARGEST_BY_COLUMNS:
+        return matrix @ vector
+    total = matrix[:, 0] * vector[0]
+    for j in range(1, len(vector)):
+        total = total + matrix[:, j] * vector[j]
+    return total
 
 
 def total_forces(mechanics: Mechanics, tangential_force: Each, normal_force: Each) -> tuple[Each, Each]:
