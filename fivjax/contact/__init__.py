@@ -32,7 +32,10 @@ from .forces import acceleration_under as acceleration_under
 from .forces import added_forces as added_forces
 from .forces import contact_forces as contact_forces
 from .forces import free_acceleration as free_acceleration
+from .forces import free_matrices as free_matrices
 from .forces import gap as gap
+from .forces import measured as measured
+from .forces import product as product
 from .forces import relative_velocity as relative_velocity
 from .forces import slip_speed as slip_speed
 from .forces import total_forces as total_forces

@@ -44,8 +44,8 @@ def free_acceleration(mechanics: Mechanics, load: Float[Array, ""], y: State) ->
 
 def free_matrices(mechanics: Mechanics) -> tuple[Float[Array, "n s"], Float[Array, "n n"]]:
     """What the free accelerations are of the displacements, as they are `measured`, and of the velocities."""
-    stretched = mechanics.springs is not None and mechanics.from_springs is not None
-    return mechanics.from_springs if stretched else mechanics.free_position, mechanics.free_velocity
+    from_springs = mechanics.from_springs
+    return mechanics.free_position if from_springs is None else from_springs, mechanics.free_velocity
 
 
 def measured(mechanics: Mechanics, y: State) -> tuple[Float[Array, " s"], Float[Array, " n"]]:

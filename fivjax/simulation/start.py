@@ -11,7 +11,7 @@ from ..model.scene import Scene, scene_in_contact_coordinates, sliding_equilibri
 from ..model.sliding import contact_coordinates
 
 
-def start_state(scene: Scene, y0) -> State:
+def start_state(scene: Scene, y0) -> State | np.ndarray:
     """The state that a run starts from: `y0`, checked, or else the sliding equilibrium at rest."""
     n = scene.structure.size
     if y0 is None:

@@ -101,21 +101,33 @@ def _first_root(
 def implicit_root(
     scaled: Float[Array, "k g"], fires: Bool[Array, " g"], x: Float[Array, ""], tolerance: float
 ) -> Float[Array, ""]:
-    """The root with the derivatives of an implicit function, of a series with this relative error.
+    """The root `x` of the guards that fire, with the derivatives of an implicit function, of any order; of a series with this
+    relative error.
 
-    Where a jump has used up the guard at x = 0, no root moves: the event is at the instant of the jump. A Newton step from a
-    converged root, with a constant slope, changes only the derivatives: after the first step the first derivatives are right,
-    after the second one the second derivatives, too.
+    Where a jump has used up the guard at x = 0, no root moves: the event is at the instant of the jump.
     """
     # An index of 64 bits could not be lowered in a single-precision program.
     chosen = jnp.arange(fires.shape[0]) == jax.lax.argmax(fires, 0, jnp.int32)
     size = jnp.sum(jnp.where(chosen, jnp.abs(scaled), 0.0))
     least = jnp.sum(jnp.where(chosen, scaled[0], 0.0))
-    jumped = (x == 0) & (least < -JUMPED * max(tolerance, float(jnp.finfo(scaled.dtype).eps)) * size)
-    for _ in range(2):
-        values, slopes = value_and_slope(scaled, x)
-        value = jnp.sum(jnp.where(chosen, values, 0.0))
-        slope = jax.lax.stop_gradient(jnp.sum(jnp.where(chosen, slopes, 0.0)))
-        correction = jnp.where(jumped, 0.0, value / jnp.where(slope == 0, 1.0, slope))
-        x = x - (correction - jax.lax.stop_gradient(correction))
+    rounding = JUMPED * max(tolerance, float(jnp.finfo(scaled.dtype).eps)) * size
+    jumped = jax.lax.stop_gradient((x == 0) & (least < -rounding))
+    return _moving_root(scaled, jax.lax.stop_gradient(x), jnp.where(jumped, False, chosen))
+
+
+@jax.custom_jvp
+def _moving_root(c: Float[Array, "k g"], x: Float[Array, ""], chosen: Bool[Array, " g"]) -> Float[Array, ""]:
+    """x, which is a root of the chosen polynomial; if none is chosen, it stays."""
+    del c, chosen
     return x
+
+
+@_moving_root.defjvp
+def _(primals, tangents):
+    c, _, chosen = primals
+    # With its own derivative, so that further ones are right as well.
+    x = _moving_root(*primals)
+    value, _ = value_and_slope(tangents[0], x)
+    _, slope = value_and_slope(c, x)
+    value, slope = (jnp.sum(jnp.where(chosen, part, 0.0)) for part in (value, slope))
+    return x, -value / jnp.where(slope == 0, 1.0, slope)

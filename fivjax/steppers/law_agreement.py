@@ -15,7 +15,7 @@ from .step_length import attainable
 
 # Where they are compared, besides where slip is fastest and slowest: at this many equal parts of the step.
 PARTS = 8
-TURNING_STEPS = 5
+TURNING_STEPS, NEAR = 5, 1e-4
 # The difference that counts as rounding, in units of the last place of μ.
 ROUNDINGS = 128
 # A step is not cut to less than this share: over so short a time, a kink at its very start has no effect.
@@ -37,8 +37,22 @@ def agreeing(
     ends just beyond it, so that the next one begins on the other side of a kink.
     """
     law, friction, slip, reach = jax.lax.stop_gradient((law, friction, slip, reach))
-    mu, u = in_shares(friction, reach), in_shares(slip, reach)
     sliding = contact.status == Status.SLIDE
+
+    def share():
+        return _agreeing(law, sliding, in_shares(friction, reach), in_shares(slip, reach), tolerance)
+
+    return jax.lax.cond(jnp.any(sliding), share, lambda: jnp.ones_like(reach))
+
+
+def _agreeing(
+    law: AbstractFriction,
+    sliding: Bool[Array, "*contacts"],
+    mu: Float[Array, "k *contacts"],
+    u: Float[Array, "k *contacts"],
+    tolerance: float,
+) -> Float[Array, ""]:
+    """The same from the series in shares of the step."""
     eps = float(jnp.finfo(mu.dtype).eps)
     allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
 
@@ -50,7 +64,7 @@ def agreeing(
     equal = jnp.arange(1, PARTS + 1, dtype=mu.dtype) / PARTS
     speeds = jax.vmap(lambda x: value_and_slope(u, x)[0])(equal)
     ends = [equal[jnp.argmax(sign * speeds, axis=0)] for sign in (1, -1)]
-    turning = [extremum(u, x, 0.0, jnp.ones_like(x), TURNING_STEPS) for x in ends]
+    turning = [_turning(u, x) for x in ends]
     places = jnp.concatenate([equal, *map(jnp.ravel, turning)])
     wrong = jax.vmap(parted)(places)
     high = jnp.min(jnp.where(wrong, places, jnp.inf))
@@ -68,3 +82,18 @@ def agreeing(
 
     _, high, _ = jax.lax.while_loop(going, halved, (low, high, jnp.zeros((), jnp.int32)))
     return jnp.clip(high, SHORTEST, 1.0)
+
+
+def _turning(u: Float[Array, "k *contacts"], x: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
+    """Nearly where slip is fastest or slowest, from the sample next to it."""
+
+    def going(carry):
+        _, change, count = carry
+        return jnp.any(jnp.abs(change) > NEAR) & (count < TURNING_STEPS)
+
+    def nearer(carry):
+        x, _, count = carry
+        further = extremum(u, x, 0.0, jnp.ones_like(x), 1)
+        return further, further - x, count + 1
+
+    return jax.lax.while_loop(going, nearer, (x, jnp.ones_like(x), jnp.zeros((), jnp.int32)))[0]

@@ -1,5 +1,6 @@
 """The Taylor series of motion in one contact mode, and of what ends it."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import largest_rounding
+from ..foundation.polynomial import added
 
 
 class Series(NamedTuple):
@@ -30,27 +32,41 @@ def series_of(
     The physics is linear in the state except for T = σμN, so it maps coefficients to coefficients; the constant terms (load,
     belt speed) enter with the first. T = σμN is the product of two series.
     """
-    n = y.shape[0] // 2
+    n, count = y.shape[0] // 2, len(mechanics.places)
     slip = physics.slip_speed(mechanics, contact, y)
     friction = [mechanics.friction(slip)]
     mode = ModeForces(mechanics, contact, friction[0])
 
-    def following(own: Mechanics, force, state: State, slip, otherwise, divisor):
-        """What follows from one coefficient of the state: the next, and those of the guards and of N."""
-        free = physics.free_acceleration(own, force, state)
-        forces = mode.added(own, free, otherwise)
-        guards = physics.guards_under(own, contact, *forces, slip, physics.gap(own, state))
-        rate = jnp.concatenate([state[n:], physics.acceleration_under(own, contact, free, *forces)])
-        return rate * (unit / divisor), guards, physics.total_forces(own, *forces)[1]
+    changes = mechanics.homogeneous
+    # Everything is linear in the state and in what friction has besides σμN: matrices, worked out once for all coefficients.
+    held = functools.partial(_held, changes, contact, mode)
+    matrices = [jax.vmap(held, in_axes=1, out_axes=1)(matrix) for matrix in physics.free_matrices(changes)]
+    beside = None
+    if not mechanics.friction.constant:
+        ones = jnp.eye(count, dtype=y.dtype).reshape(count, *slip.shape)
+        beside = jax.vmap(lambda one: held(jnp.zeros(n, y.dtype), one), out_axes=1)(ones)
 
-    changes, none = mechanics.homogeneous, jnp.zeros_like(load)
-    state, guards, normal_force = following(mechanics, load, y, slip, None, 1)
+    def further(state: State, slip, otherwise, divisor):
+        """What follows from one coefficient of the state: the next, and those of the guards and of N."""
+        of_displacements, of_velocities = map(physics.product, matrices, physics.measured(changes, state))
+        found = of_displacements + of_velocities
+        if beside is not None:
+            found = found + physics.product(beside, jnp.ravel(otherwise))
+        acceleration, *forces = jnp.split(found, (n, n + count))
+        forces = [jnp.reshape(force, slip.shape) for force in forces]
+        guards = physics.guards_under(changes, contact, *forces, slip, physics.gap(changes, state))
+        return jnp.concatenate([state[n:], acceleration]) * (unit / divisor), guards, forces[1]
+
+    free = physics.free_acceleration(mechanics, load, y)
+    forces = mode.added(mechanics, free)
+    guards = physics.guards_under(mechanics, contact, *forces, slip, physics.gap(mechanics, y))
+    state = unit * jnp.concatenate([y[n:], physics.acceleration_under(mechanics, contact, free, *forces)])
     if mechanics.friction.constant:
 
         def next_one(state: State, divisor):
             slip = physics.slip_speed(changes, contact, state)
-            further, guards, _ = following(changes, none, state, slip, None, divisor)
-            return further, (state, guards, slip)
+            following, guards, _ = further(state, slip, None, divisor)
+            return following, (state, guards, slip)
 
         # A loop that XLA unrolls, and that kernels keep.
         _, rows = jax.lax.scan(next_one, state, np.arange(2.0, order + 2.0, dtype=y.dtype), unroll=True)
@@ -58,18 +74,25 @@ def series_of(
         states, guards, slips = (jnp.concatenate([one[None], more]) for one, more in zip(first, rows, strict=True))
         return Series(states, guards, slips, friction[0][None], mode)
     next_term = mechanics.friction.in_time(slip, order)
-    states, all_guards, slips, normal_forces = [y], [guards], [slip], [normal_force]
+    states, all_guards, slips = [y], [guards], [slip]
+    normal_forces = [physics.total_forces(mechanics, *forces)[1]]
     for k in range(1, order + 1):
         states.append(state)
         slips.append(physics.slip_speed(changes, contact, state))
         friction.append(next_term(slips, friction))
-        otherwise = contact.direction * sum(
-            (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
-        )
-        state, guards, normal_force = following(changes, none, state, slips[k], otherwise, k + 1)
+        otherwise = contact.direction * added(friction[j] * normal_forces[k - j] for j in range(1, k + 1))
+        state, guards, normal_force = further(state, slips[k], otherwise, k + 1)
         all_guards.append(guards)
         normal_forces.append(normal_force)
     return Series(jnp.stack(states), jnp.stack(all_guards), jnp.stack(slips), jnp.stack(friction), mode)
+
+
+def _held(
+    mechanics: Mechanics, contact: Contact, mode: ModeForces, free: Float[Array, " n"], otherwise=None
+) -> Float[Array, " k"]:
+    """Accelerations in a mode from the free ones, with the T and N of all contacts below."""
+    forces = mode.added(mechanics, free, otherwise)
+    return jnp.concatenate([physics.acceleration_under(mechanics, contact, free, *forces), *map(jnp.ravel, forces)])
 
 
 def guard_rounding(
