@@ -2,10 +2,12 @@
 
     python tests/measure_engine.py first    # CPU seconds of fresh processes, in those of a first solve of diffrax in the same run
     python tests/measure_engine.py warm     # milliseconds of calls after the first
+    python tests/measure_engine.py bulk     # cycles of vibration of many trajectories in one call
 
 `first` runs every call twice in a cache of kernels of its own: with nothing built, and with the kernels that the first run
 kept. A process' CPU seconds include its imports and all threads. Ratios are what counts: the machine may be busy, and a solve of
-diffrax in the same minutes is as slow as the rest.
+diffrax in the same minutes is as slow as the rest. `bulk` counts 68 cycles in a second of motion, the paper's frequency, and the
+CPU seconds of one thread.
 """
 
 import functools
@@ -115,6 +117,57 @@ def warm() -> None:
         print(f"{name}: {milliseconds(call, 5):.0f} ms", flush=True)
 
 
+def bulk() -> None:
+    import jax
+    import numpy as np
+
+    import fivjax as fj
+    from fivjax.foundation.kernel_text import Form
+    from fivjax.simulation import motion
+
+    lanes, times = 512, np.array([[0.0, 1.0]])
+    one = fj.belt_oscillator()
+    parts = [np.kron(np.eye(2), np.asarray(matrix)) for matrix in (one.mass, one.damping, one.stiffness)]
+    load = np.tile(np.asarray(one.load_direction), 2)
+    # Beside the first contact one with another belt speed, or events of both were at one instant.
+    two = fj.Structure(*parts, load, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)])
+    kinds = {
+        "constant friction": lambda mu, v, pulse: fj.Scene(one, fj.Coulomb(mu), v, pulse),
+        "falling friction": lambda mu, v, pulse: fj.Scene(one, fj.ExponentialDecay(mu, 0.9 * mu, 0.5), v, pulse),
+        "two contacts": lambda mu, v, pulse: fj.Scene(two, fj.Coulomb(mu), [v, 1.003 * v], pulse),
+    }
+    ranges = {
+        "mixed": ((0.15, 0.2275), (1.0, 3.0), (1.1, 1.6)),
+        "on the cycle": ((0.22, 0.2275), (1.0, 1.5), (1.25, 1.6)),
+        "quiet": ((0.05, 0.15), (2.9, 3.0), (1.1, 1.3)),
+    }
+    how = motion.How(fj.EventExact(), False)
+    for kind, make in kinds.items():
+        for what, ends in ranges.items():
+            rng, rows, form = np.random.default_rng(3), [], None
+            for mu, v, p in zip(*(rng.uniform(*end, lanes) for end in ends), strict=True):
+                scene = make(float(mu), float(v), fj.Pulse(100.0, float(p)))
+                start = np.append(fj.sliding_equilibrium(scene), np.zeros(scene.structure.size))
+                form, arrays = Form.of((scene, start, np.asarray(4000, np.int32), how))
+                rows.append(np.concatenate([np.ravel(array).astype(float) for array in arrays]))
+            given, told = np.array(rows), []
+            numbers = [array.size for array in form.arrays]
+            # The derivatives by friction and belt speed, for constant friction.
+            moved = [jax.tree.leaves((scene, start))[place] for place in range(len(numbers) - 1)]
+            wide = (*(np.ndim(leaf) == 0 and float(leaf) in (mu, v) for leaf in moved), False)
+            for directions in (0, 2) if kind == "constant friction" else (0,):
+                best = np.inf
+                for _ in range(4):
+                    begin = time.process_time()
+                    if directions:
+                        motion._by_kernel.derived_of_many(form, given, times, wide, np.eye(sum(wide)))
+                    else:
+                        motion._by_kernel.of_many(form, given, times)
+                    best = min(best, time.process_time() - begin)
+                told.append(f"{68 * lanes / best:.3g}{' with two directions' * bool(directions)}")
+            print(f"{kind}, {what}: {', '.join(told)} cycles per CPU s", flush=True)
+
+
 if __name__ == "__main__":
     kind, *names = sys.argv[1:]
-    first(names or CALLS) if kind == "first" else warm()
+    first(names or CALLS) if kind == "first" else {"warm": warm, "bulk": bulk}[kind]()
