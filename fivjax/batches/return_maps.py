@@ -232,7 +232,7 @@ def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
 def _to_crossing(shared, row, rows: int, how: How, careful: bool = False):
     (mechanics, longest), (y, status, direction, crossings) = shared, row
     start, method = Point(y, Contact(status, direction)), how.method
-    method = for_derivatives(method, mechanics) if careful else method
+    method = for_derivatives(method) if careful else method
     numbers = crossings - jnp.arange(rows, dtype=y.dtype)[::-1]
     end, path = to_crossing(how, method, mechanics, start, crossings, longest * crossings, numbers)
     found = end.at.point

@@ -39,7 +39,7 @@ def through_events(
 ) -> Response:
     """The response from `y0` at time 0, or else from steady sliding, for blocks that begin at `begin` (s)."""
     mechanics, edges = Mechanics(scene), sampled.edges(begin)
-    method = for_derivatives(method, mechanics)
+    method = for_derivatives(method)
     blocks, points, width = sampled.count, sampled.per_block, sampled.width
     start = jax.lax.stop_gradient(jnp.minimum(edges[0], 0.0))
     if y0 is not None:

@@ -112,7 +112,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
     mechanics, load = Mechanics(scene), scene.load.final
-    method, codes = for_derivatives(method, mechanics), jnp.array([Status.STICK, Status.DETACH])
+    method, codes = for_derivatives(method), jnp.array([Status.STICK, Status.DETACH])
 
     def add(total, segment: Segment):
         lines, impulses, spent = total
@@ -153,7 +153,7 @@ def waveform(
 ) -> Waveform:
     """Channels of a cycle at instants between 0 and its period (s), in any order. Differentiable in forward mode."""
     mechanics, load = Mechanics(scene), scene.load.final
-    method = for_derivatives(method, mechanics)
+    method = for_derivatives(method)
 
     def add(total, segment: Segment):
         values, seen, changes, landings = total

@@ -34,6 +34,7 @@ from .forces import contact_forces as contact_forces
 from .forces import free_acceleration as free_acceleration
 from .forces import free_matrices as free_matrices
 from .forces import gap as gap
+from .forces import held as held
 from .forces import measured as measured
 from .forces import product as product
 from .forces import relative_velocity as relative_velocity

@@ -1,7 +1,7 @@
 """Contact forces and accelerations in a given contact mode, at one instant."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .coordinates import at_places, spread, with_values
 from .mechanics import Mechanics
@@ -94,10 +94,14 @@ def acceleration_under(
     """Accelerations from the free ones and the contact forces added to those at rest, in m/s²."""
     pushed = spread(mechanics.from_tangential, tangential_force)
     total = free + pushed + spread(mechanics.from_normal, normal_force)
-    n = free.shape[0]
-    held = at_places(n, mechanics.normal, contact.status != Status.DETACH)
-    held = held | at_places(n, mechanics.tangential, contact.status == Status.STICK)
-    return jnp.where(held, 0.0, total)
+    return jnp.where(held(mechanics, contact), 0.0, total)
+
+
+def held(mechanics: Mechanics, contact: Contact) -> Bool[Array, " n"]:
+    """Which coordinates the status keeps from being accelerated."""
+    n = mechanics.free_load.shape[0]
+    closed = at_places(n, mechanics.normal, contact.status != Status.DETACH)
+    return closed | at_places(n, mechanics.tangential, contact.status == Status.STICK)
 
 
 def degrees_of_freedom(y: State) -> int:

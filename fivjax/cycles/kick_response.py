@@ -86,7 +86,7 @@ def _count(directions) -> int:
     return len(jax.tree.leaves(directions)[0])
 
 
-def _after_kick(args, numbers, adapted=lambda method, _: method):
+def _after_kick(args, numbers, adapted=lambda method: method):
     how, scene, start, crossings = args
     load = scene.load
     assert isinstance(load, Pulse)
@@ -98,7 +98,7 @@ def _after_kick(args, numbers, adapted=lambda method, _: method):
     contact = jax.tree.map(lambda own, other: jnp.where(quiet, own, other), start.contact, contact)
     longest = longest_return(scene) * crossings
     kick, start = Kick(more, load.duration), Point(start.y, contact)
-    return to_crossing(how, adapted(how.method, mechanics), mechanics, start, crossings, longest, numbers, kick)
+    return to_crossing(how, adapted(how.method), mechanics, start, crossings, longest, numbers, kick)
 
 
 def _derived_after_kick(args, numbers):

@@ -163,7 +163,7 @@ def _image_of_phase(args, numbers):
     how, scene, y, h, ends = args
     del numbers
     mechanics = mechanics_about_sliding(scene)
-    stepper = for_derivatives(how.method, mechanics)
+    stepper = for_derivatives(how.method)
     contact, following = Contact(ends.status, ends.pointing), Contact(ends.next_status, ends.next_pointing)
     n, none = y.shape[0] // 2, jnp.zeros((), y.dtype)
     begin = physics.on_constraint(mechanics, contact, y)

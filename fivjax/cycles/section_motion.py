@@ -140,17 +140,17 @@ def to_crossing(
     return Arrival(here(way), way.crossed, arrived, way.peak), rows
 
 
-def _of_mechanics(args, numbers, adapted=lambda method, _: method):
+def _of_mechanics(args, numbers, adapted=lambda method: method):
     how, mechanics, longest, start, crossings = args
-    method = adapted(how.method, mechanics)
+    method = adapted(how.method)
     return to_crossing(how, method, mechanics, start, crossings, longest * crossings, numbers)
 
 
-def _of_scene(args, numbers, adapted=lambda method, _: method):
+def _of_scene(args, numbers, adapted=lambda method: method):
     how, scene, start, crossings, time = args
     mechanics = mechanics_about_sliding(scene)
     longest = jnp.minimum(time, longest_return(scene) * crossings)
-    return to_crossing(how, adapted(how.method, mechanics), mechanics, start, crossings, longest, numbers)
+    return to_crossing(how, adapted(how.method), mechanics, start, crossings, longest, numbers)
 
 
 def _derived_of_mechanics(args, numbers):

@@ -187,7 +187,7 @@ def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, ev
 def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene, time, events, guard):
     def of(scene: Scene, time: Float[Array, ""]) -> Float[Array, ""]:
         mechanics, contact, more, y = _begun(scene)
-        short = for_derivatives(stepper, mechanics)
+        short = for_derivatives(stepper)
         duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
         in_kick = jnp.minimum(time, duration)
         none = jnp.zeros_like(more)

@@ -261,7 +261,7 @@ def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
 def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
     """The state after a history of the load that began in steady sliding."""
     mechanics, n = mechanics_about_sliding(scene), scene.structure.size
-    stepper = for_derivatives(stepper, mechanics)
+    stepper = for_derivatives(stepper)
 
     def piece(carry, factor):
         y, contact = carry

@@ -63,7 +63,7 @@ def _motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
 
 
 def _differentiated(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
-    return _followed(args, instants, for_derivatives(args[3].method, Mechanics(args[0])))
+    return _followed(args, instants, for_derivatives(args[3].method))
 
 
 _by_kernel = KernelFunction(_motion, _differentiated)

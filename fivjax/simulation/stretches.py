@@ -52,7 +52,7 @@ def _advances(begin: Begin, method: AbstractStepper, most: int | Array, derivati
     mechanics, load, energy_data = begin.mechanics, begin.load, begin.energy_data
     if derivatives is not None:
         # Anew in each stretch, because its reverse derivative may use nothing computed outside of it.
-        method = for_derivatives(method, mechanics)
+        method = for_derivatives(method)
 
     def enter(ledger, segment: Segment):
         return None if energy_data is None else accounts.enter(energy_data, method, mechanics, ledger, segment)

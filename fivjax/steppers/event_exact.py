@@ -6,7 +6,7 @@ accurate, where a guard is used up first, and the state there. Except for fricti
 """
 
 import math
-from typing import ClassVar, TypeVar
+from typing import ClassVar, TypeVar, cast
 
 import diffrax
 import equinox as eqx
@@ -26,14 +26,14 @@ from .base import AbstractStepper, Advance, StepperState, Within, advance_betwee
 from .core import follow
 from .guard_roots import implicit_root, march_to_roots, together
 from .law_agreement import agreeing
-from .motion_series import Series, guard_rounding, series_of
+from .motion_series import Series, fastest_in_mode, guard_rounding, series_of
 from .section import before_section, section_speed
-from .step_length import LONGEST_STEP, attainable, fastest_rate, time_unit, trusted
+from .step_length import LONGEST_STEP, attainable, time_unit, trusted
 
 Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
 # How much larger a step's relative error may be in a derivative than in the motion.
-LOOSER = 100
+LOOSER = 10
 
 
 class EventExact(AbstractStepper):
@@ -44,11 +44,11 @@ class EventExact(AbstractStepper):
     - A guard that starts at zero, because the status has just begun there, does not fire at its own start.
     - After an event the state is put exactly on its constraint, and the next status follows from the forces.
 
-    Event times are differentiable in forward and reverse mode: the root is corrected by Newton steps whose derivative is that
-    of the implicit function.
+    Event times are differentiable in forward and reverse mode, as roots of the series, by the implicit function.
 
     **Arguments:** `order` of the series; `tolerance`, the size of its last terms relative to the motion, which limits the
-    duration of an advance; `dt`, the longest advance in s (no limit by default).
+    duration of an advance; `dt`, the longest advance in s (no limit by default); `for_deviations`, whether steps are short
+    enough for small deviations from the motion, too: derivatives have it whatever is said here.
 
     **Raises:** `ValueError` for an order below 4, or a tolerance or `dt` that is not positive.
 
@@ -60,11 +60,14 @@ class EventExact(AbstractStepper):
     order_: int = eqx.field(static=True)
     tolerance: float
     dt: float
+    for_deviations: bool = eqx.field(static=True)
 
     round: ClassVar = 64
     interpolation_cls: ClassVar = staticmethod(lambda **info: _Restepped(**info))
 
-    def __init__(self, order: int = 20, tolerance: float = 1e-15, dt: float = math.inf):
+    def __init__(
+        self, order: int = 20, tolerance: float = 1e-15, dt: float = math.inf, *, for_deviations: bool = False
+    ):
         arguments.whole_number("order", order, minimum=4)
         arguments.real_number("tolerance", tolerance, above=0)
         if not (isinstance(dt, float) and dt == math.inf):
@@ -72,6 +75,7 @@ class EventExact(AbstractStepper):
         self.order_ = int(order)
         self.tolerance = float(tolerance)
         self.dt = float(dt)
+        self.for_deviations = bool(for_deviations)
 
     def order(self, terms) -> int:
         return self.order_
@@ -125,6 +129,8 @@ class EventExact(AbstractStepper):
             rounding = jnp.pad(rounding, ((0, 0), (0, 1)))
             exact = jnp.append(exact, mechanics.several)
         reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
+        if self.for_deviations:
+            reach = jnp.minimum(reach, self._angle(y.dtype) / unit / fastest_in_mode(mechanics, contact, series.mode))
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
@@ -190,6 +196,8 @@ class EventExact(AbstractStepper):
             series = series_of(mechanics, contact, load, y, self.order_, unit)
             longest = jax.lax.stop_gradient(jnp.minimum(trusted(series.states, self.tolerance), LONGEST_STEP) * unit)
             longest = jnp.minimum(longest, self.dt)
+            if self.for_deviations:
+                longest = jnp.minimum(longest, self._angle(y.dtype) / fastest_in_mode(mechanics, contact, series.mode))
             last = jnp.abs(left) <= longest
             part = jnp.where(last, left, jnp.sign(left) * longest)
             share = self._agreeing(mechanics, contact, series, part / unit)
@@ -201,6 +209,14 @@ class EventExact(AbstractStepper):
         begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
 
+    def _angle(self, dtype) -> float:
+        """By how much (rad) the phase of a vibration may advance in a step: for an angle a, the error of the series is
+        a^(order + 1) / (order + 1)!.
+        """
+        after = self.order_ + 1
+        tolerance = LOOSER * attainable(self.tolerance, dtype)
+        return (tolerance * math.factorial(after)) ** (1.0 / after)
+
     def _agreeing(self, mechanics: Mechanics, contact: Contact, series: "Series", reach) -> Float[Array, ""] | float:
         """The share of a step of this length, in units of time, over which friction is that of the law."""
         law = mechanics.friction
@@ -209,18 +225,16 @@ class EventExact(AbstractStepper):
         return agreeing(law, contact, series.friction, series.slip, reach, self.tolerance)
 
 
-def for_derivatives(stepper: Stepper, mechanics: Mechanics) -> Stepper:
+def for_derivatives(stepper: Stepper) -> Stepper:
     """The stepper with steps short enough for derivatives.
 
     The length of a step is chosen for the *motion*. Where a fast mode of vibration is at rest, steps are too long for a
-    deviation in that mode: if its phase advances by a (rad) in a step, the error of the series is a^(order + 1) / (order + 1)!.
+    deviation in that mode.
     """
     if not isinstance(stepper, EventExact):
         return stepper
-    rate, after = fastest_rate(mechanics), stepper.order_ + 1
-    tolerance = LOOSER * attainable(stepper.tolerance, rate.dtype)
-    angle = (tolerance * math.factorial(after)) ** (1.0 / after)
-    return eqx.tree_at(lambda own: own.dt, stepper, jnp.minimum(stepper.dt, angle / rate))
+    short = EventExact(stepper.order_, stepper.tolerance, stepper.dt, for_deviations=True)
+    return cast(Stepper, short)
 
 
 class _Restepped(AbstractLocalInterpolation):

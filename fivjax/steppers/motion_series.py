@@ -39,12 +39,12 @@ def series_of(
 
     changes = mechanics.homogeneous
     # Everything is linear in the state and in what friction has besides σμN: matrices, worked out once for all coefficients.
-    held = functools.partial(_held, changes, contact, mode)
-    matrices = [jax.vmap(held, in_axes=1, out_axes=1)(matrix) for matrix in physics.free_matrices(changes)]
+    under = functools.partial(_under, changes, contact, mode)
+    matrices = [jax.vmap(under, in_axes=1, out_axes=1)(matrix) for matrix in physics.free_matrices(changes)]
     beside = None
     if not mechanics.friction.constant:
         ones = jnp.eye(count, dtype=y.dtype).reshape(count, *slip.shape)
-        beside = jax.vmap(lambda one: held(jnp.zeros(n, y.dtype), one), out_axes=1)(ones)
+        beside = jax.vmap(lambda one: under(jnp.zeros(n, y.dtype), one), out_axes=1)(ones)
 
     def further(state: State, slip, otherwise, divisor):
         """What follows from one coefficient of the state: the next, and those of the guards and of N."""
@@ -87,7 +87,19 @@ def series_of(
     return Series(jnp.stack(states), jnp.stack(all_guards), jnp.stack(slips), jnp.stack(friction), mode)
 
 
-def _held(
+def fastest_in_mode(mechanics: Mechanics, contact: Contact, mode: ModeForces) -> Float[Array, ""]:
+    """A bound on how fast deviations vibrate in a mode, in 1/s: that of the coordinates that it leaves free."""
+    mechanics, contact, mode = jax.lax.stop_gradient((mechanics.homogeneous, contact, mode))
+    free = ~physics.held(mechanics, contact)
+
+    def largest(matrix):
+        rates = jax.vmap(functools.partial(_under, mechanics, contact, mode), in_axes=1, out_axes=1)(matrix)
+        return jnp.max(jnp.where(free, jnp.abs(rates[: len(free)]), 0.0))
+
+    return jnp.maximum(jnp.sqrt(largest(mechanics.free_position)), largest(mechanics.free_velocity))
+
+
+def _under(
     mechanics: Mechanics, contact: Contact, mode: ModeForces, free: Float[Array, " n"], otherwise=None
 ) -> Float[Array, " k"]:
     """Accelerations in a mode from the free ones, with the T and N of all contacts below."""
