@@ -46,16 +46,20 @@ def series_of(
         ones = jnp.eye(count, dtype=y.dtype).reshape(count, *slip.shape)
         beside = jax.vmap(lambda one: under(jnp.zeros(n, y.dtype), one), out_axes=1)(ones)
 
+    one, zero = jnp.ones_like(slip), jnp.zeros_like(slip)
+    of_slip = physics.guards_under(changes, contact, zero, zero, one, zero)
+    of_gap = physics.guards_under(changes, contact, zero, zero, zero, one)
+
     def further(state: State, slip, otherwise, divisor):
         """What follows from one coefficient of the state: the next, and those of the guards and of N."""
         of_displacements, of_velocities = map(physics.product, matrices, physics.measured(changes, state))
         found = of_displacements + of_velocities
         if beside is not None:
             found = found + physics.product(beside, jnp.ravel(otherwise))
-        acceleration, *forces = jnp.split(found, (n, n + count))
-        forces = [jnp.reshape(force, slip.shape) for force in forces]
-        guards = physics.guards_under(changes, contact, *forces, slip, physics.gap(changes, state))
-        return jnp.concatenate([state[n:], acceleration]) * (unit / divisor), guards, forces[1]
+        acceleration, guards, normal_force = jnp.split(found, (n, n + 2 * count))
+        guards = guards.reshape(of_slip.shape) + of_slip * slip[..., None]
+        guards = guards + of_gap * physics.gap(changes, state)[..., None]
+        return jnp.concatenate([state[n:], acceleration]) * (unit / divisor), guards, normal_force.reshape(slip.shape)
 
     free = physics.free_acceleration(mechanics, load, y)
     forces = mode.added(mechanics, free)
@@ -102,9 +106,12 @@ def fastest_in_mode(mechanics: Mechanics, contact: Contact, mode: ModeForces) ->
 def _under(
     mechanics: Mechanics, contact: Contact, mode: ModeForces, free: Float[Array, " n"], otherwise=None
 ) -> Float[Array, " k"]:
-    """Accelerations in a mode from the free ones, with the T and N of all contacts below."""
+    """Accelerations in a mode from the free ones; below, the guards of all contacts as far as they depend on forces, and N."""
     forces = mode.added(mechanics, free, otherwise)
-    return jnp.concatenate([physics.acceleration_under(mechanics, contact, free, *forces), *map(jnp.ravel, forces)])
+    zero = jnp.zeros_like(forces[0])
+    guards = physics.guards_under(mechanics, contact, *forces, zero, zero)
+    parts = physics.acceleration_under(mechanics, contact, free, *forces), guards, forces[1]
+    return jnp.concatenate(list(map(jnp.ravel, parts)))
 
 
 def guard_rounding(
