@@ -262,7 +262,7 @@ def tangents(seed):
             None,
         )
     run = fj.simulate(scene, PERIODS * period, PERIODS * period / (4 * ROWS), y0=y0, progress=False)
-    if y0 is not None and run.status[0] == fj.Status.SLIDE and run.slip_velocity[0] == 0:
+    if "belt_speed" in names and y0 is not None and run.status[0] == fj.Status.SLIDE and run.slip_velocity[0] == 0:
         names.remove("belt_speed")  # a faster belt and a slower one begin in two directions: it has no derivative
     changes = run.t[np.flatnonzero(np.diff(run.status))]
     edges = np.append(changes, run.t[-1])[7:12]
