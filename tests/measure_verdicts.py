@@ -8,13 +8,15 @@ certain to fade, or for ten thousand periods.
     python tests/measure_verdicts.py tori [--structures N] [--kicks K] [--seed S]
     python tests/measure_verdicts.py falling [--structures N] [--kicks K] [--seed S]
     python tests/measure_verdicts.py contacts [--structures N] [--kicks K] [--seed S]
+    python tests/measure_verdicts.py beside [--structures N] [--kicks K] [--seed S]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value; a
 disagreement counts unless the reference itself says otherwise of a kick that differs by 1e-14 to 1e-11;
 `folds` tries friction just below that at which the paper's limit cycle ends; `maps` the paper's map at belt speeds 1 and
 0.5; `tori` oscillators about the paper's at belt speeds at which many limit cycles are tori; `falling` such oscillators under friction
 that falls with slip speed; `contacts` structures with two to
-four contacts in as many scenes at once, each contact against `oracle` (`--kicks`: states tried in each scene); `cases` scenes
+four contacts in as many scenes at once, each contact against `oracle` (`--kicks`: states tried in each scene); `beside` maps of two
+oscillators as one structure, of which each has a reference of its own, and one is damped so much that it seldom squeals; `cases` scenes
 that once had wrong verdicts. `--threads` is for the reference only.
 """
 
@@ -432,6 +434,43 @@ def contacts(structures, kicks, seed):
     print("\n".join(examples))
 
 
+def beside(structures, kicks, seed, threads):
+    """Maps of two contacts: a limit cycle where either oscillator has one, sliding where both slide."""
+    rng, told, examples = np.random.default_rng(seed), Counter(), []
+    usual = fj.belt_oscillator().parameters
+    for i in range(structures):
+        ones = []
+        for damped in (1.0, 4.0):
+            parts = {name: float(usual[name]) * float(np.exp(rng.uniform(-0.2, 0.2))) for name in usual}
+            parts |= {name: damped * parts[name] for name in ("c1", "c2")}
+            v = float(rng.uniform(0.5, 3.0))
+            ones.append(fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(0.2), v, fj.Pulse(100.0, 1.2)))
+        (structure, _), belts = (
+            of_blocks(rng, [one.structure.matrices for one in ones]),
+            [one.belt_speed for one in ones],
+        )
+        scene = fj.Scene(structure, fj.Coulomb(0.2), np.array(belts), fj.Pulse(100.0, 1.2))
+        axes = {"mu": np.sort(rng.uniform(0.1, 0.3, 3)), "p": np.sort(rng.uniform(1.0, 4.0, kicks))}
+        verdict = np.ravel(fj.bistability_map(scene, progress=False, **axes)["verdict"].values)
+        own = [scenes_of(one, **axes) for one in ones]
+        truth = [judged(part, threads) for part in own]
+        slide = np.all([part.fate == "slides" for part in truth], axis=0)
+        squeal = np.any([(part.fate == "sustained") & ~part.shrinking for part in truth], axis=0)
+        told["trajectories"] += len(verdict)
+        for what, where in (("sliding", verdict == 0), ("cycles", verdict == 1), ("undecided", verdict == -1)):
+            told[what] += int(where.sum())
+        told["failed"] += int((verdict < -1).sum())
+        for what, wrong in (("false sliding", (verdict == 0) & squeal), ("false cycles", (verdict == 1) & slide)):
+            for k in np.flatnonzero(wrong):
+                parts = [(scenes[k], part.fate[k], part.amplitude[k]) for scenes, part in zip(own, truth, strict=True)]
+                sensitive = any(turns_on_rounding(*part, threads) for part in parts)
+                told["rounding decides" if sensitive else what] += 1
+                examples += [] if sensitive else [f"[{i}] {what}: {parts}"]
+        if i % 10 == 9 or i == structures - 1:
+            print(f"{i + 1} structures: {dict(told)}", flush=True)
+    print("\n".join(examples))
+
+
 def maps(side, threads):
     """The paper's map at two more belt speeds."""
     for v in (1.0, 0.5):
@@ -548,7 +587,7 @@ def cases(names):
 def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori", "falling", "contacts"])
+    parser.add_argument("study", choices=["random", "cases", "folds", "maps", "tori", "falling", "contacts", "beside"])
     parser.add_argument("names", nargs="*", choices=[[], *CASES], help="which cases")
     parser.add_argument("--structures", type=int, default=500)
     parser.add_argument("--kicks", type=int, default=40)
@@ -556,12 +595,9 @@ def main():
     parser.add_argument("--side", type=int, default=64)
     parser.add_argument("--threads", type=int, default=1)
     chosen = parser.parse_args()
-    if chosen.study == "random":
-        random(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
-    elif chosen.study == "falling":
-        falling(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
-    elif chosen.study == "tori":
-        tori(chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
+    drawn = {"random": random, "falling": falling, "tori": tori, "beside": beside}
+    if chosen.study in drawn:
+        drawn[chosen.study](chosen.structures, chosen.kicks, chosen.seed, chosen.threads)
     elif chosen.study == "contacts":
         contacts(chosen.structures, chosen.kicks, chosen.seed)
     elif chosen.study == "folds":

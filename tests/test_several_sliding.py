@@ -5,6 +5,7 @@ import pytest
 from scipy import linalg
 
 import fivjax as fj
+from fivjax.verdicts.sliding_proof import why_withheld
 
 
 def coupled(coupling: float = 0.0, stretch: float = 1.0) -> fj.Structure:
@@ -94,3 +95,10 @@ def test_modes_along_friction_and_what_has_no_steady_sliding():
     lifted = fj.Scene(upwards, fj.Coulomb(0.2), 3.0, fj.ConstantLoad(100.0))
     with pytest.raises(ValueError, match="There is no steady sliding: the normal forces would be"):
         fj.cea.growth_rate(lifted)
+
+
+def test_one_law_on_belts_of_two_speeds_is_looked_at_for_each_contact():
+    """A map says in the end why nothing was proved; the law is one, the speeds are two."""
+    steep = fj.ExponentialDecay(0.3, 0.1, 1.0)
+    for law in (fj.Coulomb(0.2), steep):
+        assert why_withheld(fj.Scene(coupled(), law, np.array([1.0, 2.0]), fj.Pulse(100.0, 1.2))) is None

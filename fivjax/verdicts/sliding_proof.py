@@ -183,9 +183,9 @@ def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], m
 @in_double_precision
 def why_withheld(scene: Scene) -> str | None:
     """Why no motion of this scene can be proved to slide for ever, as a sentence; None if that may be possible."""
-    friction = scene.friction
-    laws = friction.laws if isinstance(friction, FrictionPerContact) else (friction,)
-    for law, speed in zip(laws, np.broadcast_to(np.abs(np.asarray(scene.belt_speed)), len(laws)), strict=True):
+    friction, count = scene.friction, len(scene.structure.contacts)
+    laws = friction.laws if isinstance(friction, FrictionPerContact) else (friction,) * count
+    for law, speed in zip(laws, np.broadcast_to(np.abs(np.asarray(scene.belt_speed)), count), strict=True):
         name = type(law).__name__
         if law.constant:
             continue
