@@ -6,7 +6,6 @@ crosses the section.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,14 +50,10 @@ def flow_with_jacobian(
 
 
 def _moved_with_jacobian(scene: Scene, stepper: EventExact, point: Point, crossings: np.int32, time: float):
-    args = How(stepper), scene, jax.tree.map(known_to_numpy, point), crossings, time
-    size = len(point.y)
-    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), size)), args)
-    directions = eqx.tree_at(lambda args: args[2].y, still, np.eye(size))
+    start = jax.tree.map(known_to_numpy, point)
+    args, last = (How(stepper), scene, start, crossings, time), np.array([float(crossings)])
     by_kernel = has_kernel(scene, stepper)
-    (found, _), (slopes, _) = motion_of_scene.derived(
-        args, np.array([float(crossings)]), directions, by_kernel=by_kernel
-    )
+    (found, _), (slopes, _) = motion_of_scene.derived_by(args, last, start.y, np.eye(len(start.y)), by_kernel=by_kernel)
     at = found.at
     return Return(at.point, at.time, at.events, at.segments, found.arrived), slopes.at.point.y
 
