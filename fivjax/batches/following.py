@@ -17,8 +17,8 @@ from .progress import Progress, Setting, begin, placed, released, step
 from .series_kernels import SeriesKernels
 from .sharing import Batch, Shared, with_values
 
-# Trajectories that kernels have followed and that are asked for a verdict at a time.
-CONCLUDED = 256
+# Trajectories that kernels have followed and that are asked for a verdict at a time: a critical kick has a dozen.
+CONCLUDED = 32
 
 
 def begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarray, releases=None) -> Flattened:
