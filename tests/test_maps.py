@@ -148,6 +148,16 @@ def test_friction_that_falls_steeply_squeals_by_itself():
     assert steep["verdict"].values.tolist() == [1, 1]
 
 
+def test_a_motion_that_fades_under_falling_friction_is_no_limit_cycle():
+    """It shrinks by a hundredth in nine periods. Deep in the rounding of friction its return map has a fixed point, which once counted."""
+    parts = {"m1": 0.4711077588698081, "m2": 0.03928215682992882, "c1": 1.1603098365762052, "c2": 0.8402497940931635}
+    structure = fj.belt_oscillator(**parts, k1=92202.9240121235, k2=114318.91493599692)
+    law = fj.ExponentialDecay(0.0981615544706, 0.0594618940626, 0.446705808169)
+    scene = fj.Scene(structure, law, 1.0652197726764334, fj.Pulse(100.0, 1.2))
+    found = fj.bistability_map(scene, p=[3.19295618719819], progress=False)
+    assert found["verdict"].values.tolist() == [0]
+
+
 def test_trajectories_do_not_know_each_other(paper_scene, monkeypatch):
     """Neither their order nor the size of jobs may change a verdict; a poisoned one harms no other."""
     axes = {"mu": [0.1, 0.2, 0.227], "p": [1.1, 1.5, 2.0, 3.0]}

@@ -63,12 +63,13 @@ def stable_cycles(
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
         close = nearest <= (SETTLED if settled else np.where(lag > CROSSINGS, MORE_NEARLY, nearly))
-        near = np.flatnonzero(np.isfinite(size) & (size > 0) & close)
+        near = np.flatnonzero(np.isfinite(size) & maps.moves(group, states[:, -1]) & close)
     if not len(near):
         return []
     now, lag = last.rows(near), lag[near]
     closed = _closed(maps, group[near], now, lag)
-    periodic = np.flatnonzero(closed.residual <= CLOSED)
+    # Sliding closes upon itself as well.
+    periodic = np.flatnonzero((closed.residual <= CLOSED) & maps.moves(group[near], closed.at.y))
     if not len(periodic):
         return []
     _, points = maps.path(group[near[periodic]], closed.at.rows(periodic), int(np.max(lag[periodic])))

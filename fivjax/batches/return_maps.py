@@ -18,7 +18,7 @@ from ..cycles.section_motion import How, Point, to_crossing
 from ..foundation.compiling import compiled
 from ..model.sliding import contact_coordinates
 from ..steppers.event_exact import EventExact, for_derivatives
-from ..steppers.section import section_weights
+from ..steppers.section import FADED, section_weights
 from ..verdicts.free_directions import directions_of_several, free_coordinates
 from .blocks import BLOCK_OF_SEVERAL, in_blocks
 from .flattened import Flattened, flatten
@@ -85,9 +85,17 @@ class ReturnMaps:
         self.weights = np.asarray(batch.scene.structure.weights)
         # The direction of friction if the contact slides on the section, where the belt is faster.
         self.sliding = np.sign(np.asarray(tree.mechanics.belt_speed))
+        # The weighted size below which a motion of a group has faded.
+        velocities = np.atleast_1d(batch.scene.structure.size + contact_coordinates(self.structure)[0])
+        belts = np.abs(np.asarray(tree.mechanics.belt_speed)).reshape(len(longest), -1)
+        self.faded = FADED * np.max(self.weights[velocities] * belts, axis=1)
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
         # With several contacts, arrays of indices.
         self.tangential, self.normal = contact_coordinates(self.structure)
+
+    def moves(self, group, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
+        """Which of these deviations from sliding are of a motion that has not faded."""
+        return np.linalg.norm(self.weights * y, axis=1) > self.faded[group]
 
     @property
     def section(self) -> Float[np.ndarray, " n"]:

@@ -142,7 +142,7 @@ def _traced(
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGER:]
         ends = np.moveaxis(more, 1, 0)
-        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(CHANGES))
+        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(CHANGES)) & maps.moves(group[running], at.y)
         for k in np.flatnonzero(left):
             left[k] = not any(one.tube.home(ends[-tube.HOME :, k : k + 1]).item() for one in tori[running[k]])
         if length >= count:

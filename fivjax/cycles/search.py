@@ -18,6 +18,7 @@ from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..simulation.trajectory import Trajectory
 from ..steppers.event_exact import EventExact
+from ..steppers.section import FADED
 from .about_sliding import mechanics_about_sliding, sliding_state
 from .closing import close
 from .cycle import LimitCycle, limit_cycle_of, under_final_load
@@ -41,9 +42,6 @@ MOST_CROSSINGS = 12
 NEARLY = 0.1
 # Two cycles are the same if their amplitudes and periods differ by less than this share.
 SAME = 1e-6
-# A motion without events has faded if its size is below this share of the smaller of two: the belt's motion, and its own size
-# at the beginning.
-FADED = 1e-6
 # A motion that is neither periodic nor fading is tried as a torus each time it was examined so often.
 TORUS_AFTER = 8
 

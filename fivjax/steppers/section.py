@@ -25,6 +25,11 @@ class Rise(NamedTuple):
     at: State  # the state there; without meaning if there was none
 
 
+# A motion without events has faded if its size is below this share of the belt's motion. What closes upon itself there is the
+# sliding equilibrium, or what the rounding of friction makes of it.
+FADED = 1e-6
+
+
 def section_weights(contacts: int) -> Float[np.ndarray, " c"]:
     """The weight of each contact's tangential velocity in the section; 1 for a single contact."""
     return 1.0 + np.mod(GOLDEN * np.arange(contacts), 1.0)
