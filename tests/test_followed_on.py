@@ -43,6 +43,9 @@ class Line:
         y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
         return Images(Section(y, at.status, at.direction), events, RETURN * crossings, path, x)
 
+    def moves(self, group, y):
+        return y[:, 0] != 0
+
     def path(self, group, at, count):
         found = self.returns(group, at, count, count)
         return found.at, found.path
