@@ -15,6 +15,7 @@ from test_simulate import CASES, scene_of
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
 from fivjax.cycles.about_sliding import mechanics_about_sliding
+from fivjax.foundation import built_kernels
 from fivjax.foundation.compiling import compiled
 from fivjax.maps.engine import run_to_verdict
 from fivjax.plot import energy as plot_energy
@@ -388,6 +389,9 @@ def test_nothing_is_spent_on_a_ledger_that_nobody_asked_for(paper_scene, monkeyp
     def refuse(*_):
         raise AssertionError("the ledger was touched")
 
+    # Nothing of what was written before, by this process or another one.
+    monkeypatch.setattr(built_kernels, "_KERNELS", {})
+    monkeypatch.setattr(built_kernels, "kept_value", lambda function, *args, folder: function(*args))
     monkeypatch.setattr(fj.EventExact, "within", refuse)
     monkeypatch.setattr(accounts, "enter", refuse)
     monkeypatch.setattr(accounts.EnergyData, "__init__", refuse)
