@@ -28,9 +28,9 @@ from .sharing import Batch
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
+DERIVED_BLOCK = 16
 # Number of states on the section that XLA keeps of a motion, the last ones.
 KEPT = 16
-DERIVED_BLOCK = 16
 # Steps of central differences, relative to a state's size: about the cube root of the rounding unit; smaller ones where motions
 # have other events that far away. And the most crossings over which a difference is taken.
 STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
@@ -85,13 +85,13 @@ class ReturnMaps:
         self.weights = np.asarray(batch.scene.structure.weights)
         # The direction of friction if the contact slides on the section, where the belt is faster.
         self.sliding = np.sign(np.asarray(tree.mechanics.belt_speed))
-        # The weighted size below which a motion of a group has faded.
-        velocities = np.atleast_1d(batch.scene.structure.size + contact_coordinates(self.structure)[0])
-        belts = np.abs(np.asarray(tree.mechanics.belt_speed)).reshape(len(longest), -1)
-        self.faded = FADED * np.max(self.weights[velocities] * belts, axis=1)
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
         # With several contacts, arrays of indices.
         self.tangential, self.normal = contact_coordinates(self.structure)
+        # The weighted size below which a motion of a group has faded.
+        weights = np.atleast_1d(self.weights[self.structure.size + self.tangential])
+        belts = np.abs(np.asarray(tree.mechanics.belt_speed)).reshape(len(longest), -1)
+        self.faded = FADED * np.max(weights * belts, axis=1)
 
     def moves(self, group, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
         """Which of these deviations from sliding are of a motion that has not faded."""

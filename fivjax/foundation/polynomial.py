@@ -1,7 +1,7 @@
 """Polynomials by Horner's rule, from their coefficients in rising order: a list, or an array's first axis."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +18,6 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
     """A polynomial and its first two derivatives."""
     value, slope, bend = _with_derivatives(c, x, 2)
     return value, slope, bend
-
-
-def added(terms: Iterable[Array]) -> Array | float:
-    """A sum by pairs, which do not wait for one another: half of the time of a kernel's series was waiting."""
-    left = list(terms)
-    while len(left) > 1:
-        pairs = zip(left[::2], left[1::2], strict=False)
-        left = [*(one + other for one, other in pairs), *left[len(left) // 2 * 2 :]]
-    return left[0] if left else 0.0
 
 
 def in_shares(c: Array, unit: Array) -> Array:

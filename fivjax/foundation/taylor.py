@@ -14,8 +14,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
-from .polynomial import added
-
 
 class Series(NamedTuple):
     """A number, or an array, that depends on the function's argument: its Taylor coefficients, from the value on."""
@@ -46,7 +44,7 @@ def composed(outer: Sequence[Array], inner: Sequence[Array], powers: list[Array]
     # From the powers k - 1, of which only that of k = 1, the zeroth one, begins with a constant.
     before = [jnp.concatenate([first + (1 if m == 0 else 0), power[:-1]]) for m, power in enumerate(powers)]
     last = len(inner) - 1
-    powers.append(added(inner[j] * before[last - j] for j in range(1, last + 1)))
+    powers.append(sum((inner[j] * before[last - j] for j in range(2, last + 1)), inner[1] * before[last - 1]))
     return jnp.sum(f * powers[-1], axis=0)
 
 
@@ -153,24 +151,21 @@ def _product(a: Sequence[Array], b: Sequence[Array], multiply: Callable = jnp.mu
 def _quotient(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
     found: list[Array] = []
     for k, own in enumerate(a):
-        found.append((own - added(b[j] * found[k - j] for j in range(1, k + 1))) / b[0])
+        found.append((own - sum(b[j] * found[k - j] for j in range(1, k + 1))) / b[0])
     return tuple(found)
 
 
 def _integrated(value: Array, u: Sequence[Array], slope: Sequence[Array]) -> tuple[Array, ...]:
     """v with v' = s u', from its value and the series of s."""
-    return (
-        value,
-        *(jnp.asarray(added(j * u[j] * slope[k - j] for j in range(1, k + 1))) / k for k in range(1, len(u))),
-    )
+    return (value, *(jnp.asarray(sum(j * u[j] * slope[k - j] for j in range(1, k + 1))) / k for k in range(1, len(u))))
 
 
 def _by_itself(value: Array, u: Sequence[Array], a: float, b: float, c: float) -> tuple[Array, ...]:
     """v with v' = (a + b v + c v²) u', from its value."""
     v, slope = [value], [a + b * value + c * value * value]
     for k in range(1, len(u)):
-        v.append(added(j * u[j] * slope[k - j] for j in range(1, k + 1)) / k)
-        slope.append(b * v[k] + (c * added(v[i] * v[k - i] for i in range(k + 1)) if c else 0.0))
+        v.append(sum(j * u[j] * slope[k - j] for j in range(1, k + 1)) / k)
+        slope.append(b * v[k] + (c * sum(v[i] * v[k - i] for i in range(k + 1)) if c else 0.0))
     return tuple(v)
 
 
@@ -178,15 +173,15 @@ def _pair(values: tuple[Array, Array], u: Sequence[Array], sign: float) -> tuple
     """The series of sine and cosine (sign -1), or of their hyperbolic relatives (sign 1)."""
     sine, cosine = [values[0]], [values[1]]
     for k in range(1, len(u)):
-        sine.append(added(j * u[j] * cosine[k - j] for j in range(1, k + 1)) / k)
-        cosine.append(sign * added(j * u[j] * sine[k - j] for j in range(1, k + 1)) / k)
+        sine.append(sum(j * u[j] * cosine[k - j] for j in range(1, k + 1)) / k)
+        cosine.append(sign * sum(j * u[j] * sine[k - j] for j in range(1, k + 1)) / k)
     return sine, cosine
 
 
 def _power(u: Sequence[Array], exponent: Array | float) -> tuple[Array, ...]:
     found = [u[0] ** exponent]
     for k in range(1, len(u)):
-        found.append(added((exponent * j - (k - j)) * u[j] * found[k - j] for j in range(1, k + 1)) / (k * u[0]))
+        found.append(sum((exponent * j - (k - j)) * u[j] * found[k - j] for j in range(1, k + 1)) / (k * u[0]))
     return tuple(found)
 
 

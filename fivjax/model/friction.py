@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
-from ..foundation.polynomial import added
 from ..foundation.precision import in_double_precision, is_known, real
 from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
@@ -261,7 +260,7 @@ class ExponentialDecay(AbstractFriction):
         def next_term(slip, friction):
             order = len(slip) - 1
             falling = [friction[0] - self.mu_dynamic, *friction[1:]]
-            return -self.decay / order * added(j * slip[j] * falling[order - j] for j in range(1, order + 1))
+            return -self.decay / order * sum(j * slip[j] * falling[order - j] for j in range(1, order + 1))
 
         return next_term
 

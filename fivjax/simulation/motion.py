@@ -119,7 +119,7 @@ def _followed(args, instants, method: EventExact):
         )
         # A row at a jump of the load shows the load and the contact just after it.
         on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
-        contact = jax.lax.cond(on_jump, lambda: settled(mechanics, now.contact, load, y, True), lambda: now.contact)
+        contact = settled(mechanics, now.contact, load, y, on_jump)
         row = _row(mechanics, accounts_of, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
         return (now, lost, ending), row

@@ -162,9 +162,12 @@ def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array,
 
 def settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
     """The contact mode after a jump of the load, if there is a jump `now`."""
-    ended = now & (physics.guards(mechanics, contact, load, y) < 0)
-    after, _ = physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))
-    return after
+
+    def after() -> Contact:
+        ended = physics.guards(mechanics, contact, load, y) < 0
+        return physics.transition(mechanics, contact, load, y, ended, jnp.zeros_like(load))[0]
+
+    return jax.lax.cond(now, after, lambda: contact)
 
 
 def states_at(

@@ -17,7 +17,7 @@ from diffrax import AbstractLocalInterpolation
 from jaxtyping import Array, Float
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State
+from ..contact import Contact, Mechanics, State, Status
 from ..contact.rounding import RESTING
 from ..foundation import arguments
 from ..foundation.polynomial import in_shares, value_and_slope
@@ -222,7 +222,11 @@ class EventExact(AbstractStepper):
         law = mechanics.friction
         if law.constant:
             return 1.0
-        return agreeing(law, contact, series.friction, series.slip, reach, self.tolerance)
+        return jax.lax.cond(
+            jnp.any(contact.status == Status.SLIDE),
+            lambda: agreeing(law, contact, series.friction, series.slip, reach, self.tolerance),
+            lambda: jnp.ones_like(reach),
+        )
 
 
 def for_derivatives(stepper: Stepper) -> Stepper:

@@ -20,12 +20,13 @@ PACKAGE = __name__.partition(".")[0]
 
 def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
     """Whether a kernel follows the motions of such scenes by this method."""
-    if isinstance(method, EventExact) and not is_installed():
+    if not isinstance(method, EventExact):
+        return False
+    if not is_installed():
         _tell_once()
         return False
     return (
-        isinstance(method, EventExact)
-        and jax.default_backend() == "cpu"
+        jax.default_backend() == "cpu"
         and scene.structure.size <= LARGEST
         and len(scene.structure.contacts) <= MOST_CONTACTS
         and _laws_can_be_written(scene)

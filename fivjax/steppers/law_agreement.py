@@ -37,22 +37,8 @@ def agreeing(
     ends just beyond it, so that the next one begins on the other side of a kink.
     """
     law, friction, slip, reach = jax.lax.stop_gradient((law, friction, slip, reach))
+    mu, u = in_shares(friction, reach), in_shares(slip, reach)
     sliding = contact.status == Status.SLIDE
-
-    def share():
-        return _agreeing(law, sliding, in_shares(friction, reach), in_shares(slip, reach), tolerance)
-
-    return jax.lax.cond(jnp.any(sliding), share, lambda: jnp.ones_like(reach))
-
-
-def _agreeing(
-    law: AbstractFriction,
-    sliding: Bool[Array, "*contacts"],
-    mu: Float[Array, "k *contacts"],
-    u: Float[Array, "k *contacts"],
-    tolerance: float,
-) -> Float[Array, ""]:
-    """The same from the series in shares of the step."""
     eps = float(jnp.finfo(mu.dtype).eps)
     allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
 

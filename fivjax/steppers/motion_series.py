@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import largest_rounding
-from ..foundation.polynomial import added
 
 
 class Series(NamedTuple):
@@ -84,7 +83,9 @@ def series_of(
         states.append(state)
         slips.append(physics.slip_speed(changes, contact, state))
         friction.append(next_term(slips, friction))
-        otherwise = contact.direction * added(friction[j] * normal_forces[k - j] for j in range(1, k + 1))
+        otherwise = contact.direction * sum(
+            (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
+        )
         state, guards, normal_force = further(state, slips[k], otherwise, k + 1)
         all_guards.append(guards)
         normal_forces.append(normal_force)
