@@ -128,9 +128,7 @@ class EventExact(AbstractStepper):
             # With several contacts, a small distance from the section is no rounding error.
             rounding = jnp.pad(rounding, ((0, 0), (0, 1)))
             exact = jnp.append(exact, mechanics.several)
-        reach = jnp.minimum(jnp.minimum(h, self.dt) / unit, trusted(states, self.tolerance))
-        if self.for_deviations:
-            reach = jnp.minimum(reach, self._angle(y.dtype) / unit / fastest_in_mode(mechanics, contact, series.mode))
+        reach = jnp.minimum(h / unit, self._longest(mechanics, contact, series, unit))
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
@@ -194,10 +192,8 @@ class EventExact(AbstractStepper):
         def step(carry):
             y, left, _ = carry
             series = series_of(mechanics, contact, load, y, self.order_, unit)
-            longest = jax.lax.stop_gradient(jnp.minimum(trusted(series.states, self.tolerance), LONGEST_STEP) * unit)
-            longest = jnp.minimum(longest, self.dt)
-            if self.for_deviations:
-                longest = jnp.minimum(longest, self._angle(y.dtype) / fastest_in_mode(mechanics, contact, series.mode))
+            longest = jnp.minimum(self._longest(mechanics, contact, series, unit), LONGEST_STEP) * unit
+            longest = jax.lax.stop_gradient(longest)
             last = jnp.abs(left) <= longest
             part = jnp.where(last, left, jnp.sign(left) * longest)
             share = self._agreeing(mechanics, contact, series, part / unit)
@@ -208,6 +204,14 @@ class EventExact(AbstractStepper):
         # At least one step, so that there is a derivative with respect to `h` at zero, too.
         begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
+
+    def _longest(self, mechanics: Mechanics, contact: Contact, series: Series, unit) -> Float[Array, ""]:
+        """The longest step from where a series begins, in units of time, whatever the law of friction says."""
+        longest = jnp.minimum(self.dt / unit, trusted(series.states, self.tolerance))
+        if not self.for_deviations:
+            return longest
+        rate = fastest_in_mode(mechanics, contact, series.mode)
+        return jnp.minimum(longest, self._angle(rate.dtype) / unit / rate)
 
     def _angle(self, dtype) -> float:
         """By how much (rad) the phase of a vibration may advance in a step: for an angle a, the error of the series is
