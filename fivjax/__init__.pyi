@@ -2,11 +2,12 @@
 
 from . import design as design
 from . import plot as plot
+from .branches.continuation import continue_cycle as continue_cycle
+from .branches.continuation import cycle_at as cycle_at
+from .branches.tori_on_branches import tori_along as tori_along
 from .calibration.fit import calibrate as calibrate
 from .calibration.result import Calibration as Calibration
 from .contact import Status as Status
-from .cycles.continuation import continue_cycle as continue_cycle
-from .cycles.continuation import cycle_at as cycle_at
 from .cycles.cycle import LimitCycle as LimitCycle
 from .cycles.differentiation import CycleDerivatives as CycleDerivatives
 from .cycles.differentiation import cycle_derivatives as cycle_derivatives
@@ -16,7 +17,6 @@ from .cycles.saddle import saddle_cycle as saddle_cycle
 from .cycles.search import NoLimitCycle as NoLimitCycle
 from .cycles.search import limit_cycle as limit_cycle
 from .cycles.search import limit_cycles as limit_cycles
-from .cycles.tori_on_branches import tori_along as tori_along
 from .io.datasets import open as open
 from .io.datasets import save as save
 from .io.files import save_figure as save_figure
@@ -26,16 +26,16 @@ from .io.recording_files import read_recording as read_recording
 from .io.recordings import Recording as Recording
 from .io.references import citation as citation
 from .io.structure_files import read_structure as read_structure
+from .kicks.boundary_plane import boundary_section as boundary_section
+from .kicks.critical import critical_perturbation as critical_perturbation
+from .kicks.smallest import SmallestKick as SmallestKick
+from .kicks.smallest import smallest_kick as smallest_kick
+from .kicks.smallest_perturbation import NoSquealingKick as NoSquealingKick
+from .kicks.smallest_perturbation import SmallestPerturbation as SmallestPerturbation
+from .kicks.tradeoff_study import tradeoff as tradeoff
 from .linear import cea as cea
 from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
-from .maps.boundary_plane import boundary_section as boundary_section
-from .maps.smallest import SmallestKick as SmallestKick
-from .maps.smallest import smallest_kick as smallest_kick
-from .maps.smallest_perturbation import NoSquealingKick as NoSquealingKick
-from .maps.smallest_perturbation import SmallestPerturbation as SmallestPerturbation
-from .maps.threshold import critical_perturbation as critical_perturbation
-from .maps.tradeoff_study import tradeoff as tradeoff
 from .model.belt import belt_oscillator as belt_oscillator
 from .model.contact_coordinates import in_contact_coordinates as in_contact_coordinates
 from .model.contact_point import ContactPoint as ContactPoint

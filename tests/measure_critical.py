@@ -14,8 +14,8 @@ import numpy as np
 import reference
 
 import fivjax as fj
-from fivjax.cycles.stable_manifold import critical_kick
-from fivjax.maps.critical_derivatives import differentiable
+from fivjax.kicks.critical_derivatives import differentiable
+from fivjax.kicks.stable_manifold import critical_kick
 
 SPEEDS = (0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0)
 

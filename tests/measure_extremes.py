@@ -28,8 +28,8 @@ import refusing
 import xarray as xr
 
 import fivjax as fj
-from fivjax.batches.results import Verdicts
 from fivjax.maps import engine
+from fivjax.maps.results import Verdicts
 from fivjax.simulation.rows import states_at
 from fivjax.simulation.start import start_state
 from fivjax.steppers.base import MOST_ADVANCES

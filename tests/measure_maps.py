@@ -162,7 +162,7 @@ def axes() -> None:
 
 
 def without_kernels(points: int):
-    scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "batches.sharing"))
+    scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "maps.groups"))
     with mock.patch(scope, return_value=False), mock.patch(sharing, return_value=False):
         return paper_map(points)
 
@@ -241,9 +241,9 @@ def watched_memory():
 
 def steps() -> None:
     """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
-    from fivjax.batches.following import begun
-    from fivjax.batches.kernels import Kernels
-    from fivjax.batches.sharing import Batch, shared_by
+    from fivjax.maps.following import begun
+    from fivjax.maps.groups import Batch, shared_by
+    from fivjax.maps.matrix_kernels import Kernels
     from fivjax.steppers.propagation import Propagation
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600

@@ -10,11 +10,11 @@ from fivjax import cli
 # What compiles: the functions that the public ones call once their arguments are checked.
 ENGINES = (
     "fivjax.maps.bistability.run_to_verdict",
-    "fivjax.maps.threshold.run_to_verdict",
+    "fivjax.kicks.critical.run_to_verdict",
     "fivjax.simulation.trajectory.rows_in_parts",
     "fivjax.simulation.trajectory.rows_by_kernel",
     "fivjax.calibration.fit.misfit_of_waveform",
-    "fivjax.maps.tradeoff_study._end_state",
+    "fivjax.kicks.tradeoff_study._end_state",
     "fivjax.simulation.differentiation._differentiated",
 )
 

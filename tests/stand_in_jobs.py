@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fivjax.batches.results import not_run
 from fivjax.maps.jobs import Done, Job
+from fivjax.maps.results import not_run
 
 
 def verdicts_of(values: dict[str, np.ndarray]):

@@ -5,9 +5,9 @@ import pytest
 import reference
 
 import fivjax as fj
-from fivjax.batches.captures import CROSSINGS, Cycle
-from fivjax.batches.return_maps import Section
-from fivjax.batches.tori import (
+from fivjax.attractors import tube
+from fivjax.attractors.cycles import CROSSINGS, Cycle
+from fivjax.attractors.tori import (
     LONGER,
     TRACED,
     Torus,
@@ -18,8 +18,8 @@ from fivjax.batches.tori import (
     is_drifting,
     reached,
 )
-from fivjax.verdicts import tube
-from fivjax.verdicts.tube import Tube
+from fivjax.attractors.tube import Tube
+from fivjax.section.return_maps import Section
 
 STATES = 256
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -192,10 +192,10 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
 def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
     """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
-    for place in ("attractors.add_tori", "rounds.add_tori"):
-        monkeypatch.setattr(f"fivjax.batches.{place}", lambda *_: None)
-    monkeypatch.setattr("fivjax.batches.rounds.LEAST_TIME", 2.0)
-    monkeypatch.setattr("fivjax.batches.rounds.LEAST_PERIODS", 1.0)
+    for place in ("attractors.known.add_tori", "maps.rounds.add_tori"):
+        monkeypatch.setattr(f"fivjax.{place}", lambda *_: None)
+    monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
+    monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
     assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches.results import not_run
 from fivjax.maps import attractors_listed
 from fivjax.maps.attractors_listed import attractor_table
+from fivjax.maps.results import not_run
 
 GROUPS, EACH = 40, 3
 

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from fivjax.foundation.kept_programs import kept
-from fivjax.batches.blocks import in_blocks
-from fivjax.batches.flattened import flatten
+from fivjax.foundation.blocks import in_blocks
+from fivjax.foundation.flattened import flatten
 
 used = set()
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fivjax.attractors.neighbourhood import Returned, adapted_norm, neighbourhoods, side_by_side, trial
 from fivjax.contact import Status
-from fivjax.verdicts.capture import Returned, adapted_norm, neighbourhoods, side_by_side, trial
-from fivjax.verdicts.free_directions import free_coordinates
+from fivjax.section.free_directions import free_coordinates
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
 WEIGHTS = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])

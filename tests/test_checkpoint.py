@@ -14,12 +14,11 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.batches import rounds
-from fivjax.batches.attractors import Attractors
-from fivjax.batches.halfway import Halfway
-from fivjax.batches.kernels import Kernels
-from fivjax.batches.results import Ended, not_run, record
-from fivjax.maps import checkpoint, job_files, plan
+from fivjax.attractors.known import Attractors
+from fivjax.maps import checkpoint, job_files, plan, rounds
+from fivjax.maps.halfway import Halfway
+from fivjax.maps.matrix_kernels import Kernels
+from fivjax.maps.results import Ended, not_run, record
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 

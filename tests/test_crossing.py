@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches import rounds
-from fivjax.batches.results import counted, not_run
 from fivjax.foundation import progress
-from fivjax.maps import bistability, threshold
+from fivjax.kicks import critical
+from fivjax.maps import bistability, rounds
 from fivjax.maps.crossing import first_crossings
+from fivjax.maps.results import counted, not_run
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
@@ -60,7 +60,7 @@ def test_a_map_draws_no_boundary_across_undecided_trajectories(paper_scene, monk
 
 
 def found_by(monkeypatch, paper_scene, verdict_of, **options):
-    monkeypatch.setattr(threshold, "run_to_verdict", told(verdict_of))
+    monkeypatch.setattr(critical, "run_to_verdict", told(verdict_of))
     return fj.critical_perturbation(paper_scene, p_range=(1.0, 3.0), p_step=0.1, **options).isel(belt_speed=0)
 
 

@@ -14,11 +14,11 @@ from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
-from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.foundation import built_kernels
 from fivjax.foundation.compiling import compiled
 from fivjax.maps.engine import run_to_verdict
 from fivjax.plot import energy as plot_energy
+from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.simulation import energy as accounts
 from fivjax.steppers.core import Segment
 from fivjax.verdicts.verdict import Verdict

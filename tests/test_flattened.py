@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fivjax.batches.flattened import MOVED_AT_ONCE, flatten
+from fivjax.foundation.flattened import MOVED_AT_ONCE, flatten
 
 
 def tree_of(rows: int):

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
-from fivjax.batches import rounds
-from fivjax.batches.attractors import Attractors
-from fivjax.batches.progress import Progress
-from fivjax.batches.return_maps import Images, Section
-from fivjax.batches.uncaptured import fates
-from fivjax.verdicts.capture import LARGEST
+from fivjax.attractors.known import Attractors
+from fivjax.attractors.long_run import fates
+from fivjax.attractors.neighbourhood import LARGEST
+from fivjax.maps import rounds
+from fivjax.maps.progress import Progress
+from fivjax.section.return_maps import Images, Section
 
 GROWTH, RETURN = 2e-3, 0.1
 

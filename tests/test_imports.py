@@ -17,11 +17,11 @@ FLOORS = (
     ("model",),
     ("contact", "io"),
     ("steppers", "linear"),
-    ("simulation",),
+    ("section", "simulation"),
+    ("attractors", "calibration", "verdicts"),
     ("cycles",),
-    ("verdicts",),
-    ("batches", "calibration"),
-    ("maps", "plot"),
+    ("branches", "maps"),
+    ("kicks", "plot"),
     ("design", "paper", "notebook"),
 )
 LONGEST, MEDIAN = 400, 150

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches.flattened import flatten
 from fivjax.contact import Contact
 from fivjax.foundation import kept_folder, kept_programs
+from fivjax.foundation.flattened import flatten
 from fivjax.foundation.kept_folder import NotKept
 from fivjax.foundation.kept_programs import kept, kept_value
 from fivjax.foundation.plain_trees import NotPlain, from_text, structure_to_text, to_text

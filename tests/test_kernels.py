@@ -11,14 +11,14 @@ import pytest
 from test_simulate import CASES, scene_of
 
 import fivjax as fj
-from fivjax.batches import sharing
-from fivjax.batches.kernel_programs import programs
-from fivjax.batches.progress import next_step_end
 from fivjax.contact import Mechanics, Status, status_from_forces
 from fivjax.foundation import warp_library
 from fivjax.foundation.compiling import compiled
 from fivjax.foundation.scalar_code import scalar_source
 from fivjax.foundation.warp_library import devices, load, warp
+from fivjax.maps import groups as sharing
+from fivjax.maps.kernel_programs import programs
+from fivjax.maps.progress import next_step_end
 from fivjax.steppers import kernel_scope
 from fivjax.steppers.kernel_advance import stepping
 from fivjax.steppers.kernel_laws import Form

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches.results import not_run
 from fivjax.maps.refinement import finer, refined
+from fivjax.maps.results import not_run
 
 
 def test_an_axis_is_halved_in_each_of_its_intervals():

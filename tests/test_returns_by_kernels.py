@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches.kernels import Kernels
-from fivjax.batches.return_maps import ReturnMaps, Section
-from fivjax.batches.sharing import Batch, shared_by
-from fivjax.batches.tori import section_at
+from fivjax.attractors.tori import section_at
+from fivjax.maps.groups import Batch, shared_by
+from fivjax.maps.matrix_kernels import Kernels
+from fivjax.section.return_maps import ReturnMaps, Section
 from fivjax.steppers.propagation import Propagation
 
 CROSSINGS = 6
@@ -23,7 +23,8 @@ def maps():
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
         batch = Batch(scene, Propagation(), ("mu",), (), (), False, 8, False, pool)
         shared = shared_by(batch, np.array([[0.12], [0.2], [0.227]]))
-        yield ReturnMaps(batch, shared, Kernels(shared, pool))
+        tree = shared.tree
+        yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, Kernels(shared, pool), pool)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.batches import attractor_search
+from fivjax.attractors import search
 from fivjax.maps import trajectories
 from fivjax.maps.trajectories import Grid, Listed
 
@@ -30,16 +30,16 @@ def test_lists_are_seeded_as_grids_are_where_they_have_the_group():
 
 
 @pytest.mark.parametrize(("speed", "agreeing"), [(1.0, 1e-9), (3.0, 1e-3)])
-def test_what_is_continued_is_what_ensembles_find(paper_scene, monkeypatch, speed, agreeing):
+def test_what_is_continued_is_what_releases_find(paper_scene, monkeypatch, speed, agreeing):
     """Cycles at 1 m/s, to rounding; tori at 3 m/s, as far as a torus' amplitude is known."""
     searched = []
-    by_ensembles = attractor_search._by_ensembles
+    by_releases = search._by_releases
 
-    def counting(batch, kernels, shared, maps, groups, *rest):
-        searched.extend(shared.tree.values[groups, 0])
-        by_ensembles(batch, kernels, shared, maps, groups, *rest)
+    def counting(maps, equilibrium, groups, *rest):
+        searched.extend(MUS[np.searchsorted(MUS, maps.of_groups[0].friction.mu[groups])])
+        by_releases(maps, equilibrium, groups, *rest)
 
-    monkeypatch.setattr(attractor_search, "_by_ensembles", counting)
+    monkeypatch.setattr(search, "_by_releases", counting)
     axes = {"mu": MUS, "p": [1.0, 1.25, 2.0]}
     found = []
     for seeding in (1, 4):
@@ -53,7 +53,7 @@ def test_what_is_continued_is_what_ensembles_find(paper_scene, monkeypatch, spee
     np.testing.assert_allclose(continued["amplitude"], each["amplitude"], rtol=agreeing)
 
 
-def test_where_nothing_can_be_continued_there_is_an_ensemble(paper_scene, monkeypatch):
-    monkeypatch.setattr(attractor_search, "_continued", lambda *_: None)
+def test_where_nothing_can_be_continued_motions_are_released(paper_scene, monkeypatch):
+    monkeypatch.setattr(search, "_continued", lambda *_: None)
     m = fj.bistability_map(paper_scene.replace(belt_speed=1.0), mu=MUS[:2], p=[2.0], progress=False)
     assert m["verdict"].values.tolist() == [[1], [1]] and len(m["attractor_period"]) == 2

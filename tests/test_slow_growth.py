@@ -9,9 +9,9 @@ from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Contact
-from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.model.sliding import sliding_states
+from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.verdicts.sliding_proof import sliding_modes
 from fivjax.verdicts.slow_growth import slid_on
 

@@ -7,8 +7,8 @@ import reference
 from scipy.linalg import expm
 
 import fivjax as fj
-from fivjax.maps.perturbations import Histories, InitialStates
-from fivjax.maps.smallest import certified_excess
+from fivjax.kicks.perturbations import Histories, InitialStates
+from fivjax.kicks.smallest import certified_excess
 from fivjax.model.sliding import sliding_states
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))

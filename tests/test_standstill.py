@@ -13,10 +13,10 @@ import pytest
 import scipy.linalg
 
 import fivjax as fj
-from fivjax.batches import following, sharing
-from fivjax.batches.flattened import Flattened, flatten
 from fivjax.contact import Contact, Status
 from fivjax.foundation import linear_solve, matrix_factors, matrix_routines
+from fivjax.foundation.flattened import Flattened, flatten
+from fivjax.maps import following, groups
 from fivjax.steppers.event_exact import EventExact
 
 PACKAGE = Path(fj.__file__).parent
@@ -75,14 +75,14 @@ def chain(n: int, contacts: int) -> fj.Scene:
 
 def test_a_batch_of_trajectories_has_no_lapack():
     scene, names = chain(12, 1), ("mu",)
-    method = sharing.in_bulk(EventExact(), scene)
+    method = groups.in_bulk(EventExact(), scene)
     own = np.full((2, 1), 0.3)
-    prepare = lambda rows: sharing._prepared.__wrapped__(scene, method, names, rows)  # noqa: E731
+    prepare = lambda rows: groups._prepared.__wrapped__(scene, method, names, rows)  # noqa: E731
     of_preparing, (mechanics, prepared, linear, *rest) = of_program(prepare, own)
     assert "while" in of_preparing or "scan" in of_preparing, "elimination is a loop"
     for part in ("matrix", "frictionless"):
         getattr(linear, part)[:] = -np.eye(linear.matrix.shape[-1])
-    shared = flatten(sharing.Shared(own, mechanics, prepared, sharing.sliding_modes(linear), *rest))
+    shared = flatten(groups.Shared(own, mechanics, prepared, groups.sliding_modes(linear), *rest))
     columns = flatten((np.zeros((2, 1)), np.zeros(2)))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 
@@ -99,7 +99,7 @@ def test_a_batch_of_trajectories_has_no_lapack():
 
 def test_a_step_of_many_contacts_has_no_lapack():
     scene = chain(14, 6)
-    of_mechanics, mechanics = of_program(lambda _: sharing.mechanics_about_sliding(scene), 0.0)
+    of_mechanics, mechanics = of_program(lambda _: groups.mechanics_about_sliding(scene), 0.0)
     contact = Contact(jnp.full(6, Status.SLIDE, jnp.int32), jnp.ones(6))
 
     def step(mechanics, y):
@@ -181,12 +181,12 @@ def test_lapack_gets_one_matrix_at_a_time():
 
 PREPARING = """
 import numpy as np
-from fivjax.batches import sharing
+from fivjax.maps import groups as sharing
 from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
 from test_standstill import chain
 scene = chain(24, 1)
-run = in_double_precision(sharing._prepared)
+run = in_double_precision(groups._prepared)
 print(np.isfinite(run(scene, EventExact(), ("mu",), np.linspace(0.1, 0.5, 64)[:, None])[-1]).all())
 """
 MAP = """

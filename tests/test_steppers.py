@@ -10,8 +10,8 @@ from catalogue import LOW_ORDER
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
-from fivjax.cycles.about_sliding import mechanics_about_sliding
 from fivjax.foundation.compiling import compiled
+from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.steppers.core import follow
 
 # Of the lowest order, of the default one and of the highest; others are compiled anew, too.

@@ -8,12 +8,12 @@ import stand_in_jobs
 import xarray as xr
 
 import fivjax as fj
-from fivjax.batches.attractors import Attractors, Torus
-from fivjax.batches.captures import Cycle
+from fivjax.attractors.cycles import Cycle
+from fivjax.attractors.known import Attractors, Torus
+from fivjax.attractors.neighbourhood import Neighbourhood
+from fivjax.attractors.tube import Tube
 from fivjax.maps import engine, plan
 from fivjax.maps.attractor_files import from_bytes, to_bytes
-from fivjax.verdicts.capture import Neighbourhood
-from fivjax.verdicts.tube import Tube
 
 AXES = {"mu": np.linspace(0.1, 0.2, 6), "p": np.linspace(1.0, 3.0, 7)}
 

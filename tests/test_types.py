@@ -41,7 +41,7 @@ WORK = """
 import warnings
 
 import fivjax as fj
-import fivjax.batches.sharing
+import fivjax.maps.groups
 import fivjax.steppers.kernel_scope
 
 scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=3.0, load=fj.Pulse(100.0, 1.2))
@@ -51,7 +51,7 @@ assert fj.cea.eigenvalues(scene).shape == (4,)
 assert 0.227 < fj.cea.critical_friction(fj.belt_oscillator()) < 0.229
 # Warp's functions have types of their own.
 warnings.simplefilter("ignore")
-fivjax.batches.sharing.is_installed = fivjax.steppers.kernel_scope.is_installed = lambda: False
+fivjax.maps.groups.is_installed = fivjax.steppers.kernel_scope.is_installed = lambda: False
 found = fj.bistability_map(scene, mu=[0.1, 0.227], p=[1.0, 1.1, 1.2, 1.3], t_max=0.5, progress=False)
 assert found["verdict"].shape == (2, 4)
 """

@@ -31,7 +31,7 @@ class Tradeoff:
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=lambda: SceneOptions(p=1.3))
 
     def run(self) -> None:
-        from ..maps.tradeoff_study import table
+        from ..kicks.tradeoff_study import table
 
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
         dataset = fj.tradeoff(

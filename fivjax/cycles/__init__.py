@@ -1,1 +1,1 @@
-"""Limit cycles, computed by Newton's method, with Floquet multipliers; saddle cycles, tori, branches, critical kicks."""
+"""Limit cycles and saddle cycles of one scene: searched for, described, and next to known ones."""

@@ -10,19 +10,21 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..contact import Contact, State, Status
 from ..foundation.carried import depending_on
-from ..foundation.compiling import power_of_4
 from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
+from ..section.about_sliding import mechanics_about_sliding
+from ..section.crossings import MOST_SEGMENTS, How, Point, motion_to_section
+from ..section.peak_speed import higher_peak
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
-from .about_sliding import mechanics_about_sliding
-from .peak_speed import higher_peak
-from .section_map import flow_with_jacobian
-from .section_motion import MOST_SEGMENTS, How, Point
 
 HARMONICS = 16
+# A number of crossings that is never reached.
+NEVER = np.int32(np.iinfo(np.int32).max)
+# Rows for the segments of a period at first; more where they are not enough.
+LEAST_SEGMENTS = 64
 
 
 class Phase(NamedTuple):
@@ -85,10 +87,10 @@ def _around(args, numbers):
 _period = KernelFunction(_around)
 
 
-def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float, segments: int) -> Seen:
-    """Segments, peak tangential speed and harmonics of one period from a point on it, of some number of `segments`."""
+def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float) -> Seen:
+    """Segments, peak tangential speed and harmonics of one period from a point on it."""
     args = How(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
-    most = power_of_4(max(segments + 4, 64))
+    most = LEAST_SEGMENTS
     while True:
         end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, stepper))
         if end.count < most or most > MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
@@ -147,11 +149,22 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
     start = Point(segments.y[longest], jax.tree.map(lambda leaf: leaf[longest], segments.contact))
-    middle, _ = flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
-    _, matrix = flow_with_jacobian(scene, stepper, middle, period)
+    middle, _ = _flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
+    _, matrix = _flow_with_jacobian(scene, stepper, middle, period)
     free = free_coordinates(scene, segments.contact.status[longest])
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+def _flow_with_jacobian(
+    scene: Scene, stepper: EventExact, start: Point, time: float
+) -> tuple[Point, Float[np.ndarray, "state state"]]:
+    """The state after a given time (s), and its derivative by the start."""
+    start = jax.tree.map(known_to_numpy, start)
+    args, last = (How(stepper), scene, start, NEVER, float(time), np.False_), np.array([float(NEVER)])
+    by_kernel = has_kernel(scene, stepper)
+    (end, _), (slopes, _) = motion_to_section.derived_by(args, last, start.y, np.eye(len(start.y)), by_kernel=by_kernel)
+    return end.at.point, slopes.at.point.y
 
 
 def free_coordinates(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:

@@ -4,18 +4,19 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ..attractors.closing import FixedPoint
+from ..attractors.cycles import FAMILY
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.load import ConstantLoad
 from ..model.scene import Scene
+from ..section.about_sliding import sliding_state
+from ..section.crossings import Point
+from ..section.return_maps import ReturnMaps, Section
 from ..simulation.trajectory import Trajectory, simulate
 from ..steppers.event_exact import EventExact
-from .about_sliding import sliding_state
 from .around import Phase, floquet_multipliers, seen_around, word
-from .closing import Closed
-from .section_map import return_with_jacobian
-from .section_motion import Point
 
 # A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
@@ -23,8 +24,6 @@ MARGIN = 1e-9
 
 # So many phases of the word are printed.
 PRINTED_PHASES = 12
-# A multiplier of the section's return map this close to 1 counts as 1.
-FAMILY = 1e-7
 
 
 class LimitCycle(eqx.Module):
@@ -69,6 +68,9 @@ class LimitCycle(eqx.Module):
     points: Float[np.ndarray, "k state"]  # on the section, of one period or the torus, as deviations from sliding
     return_jacobian: Float[np.ndarray, "state state"]  # of the section's return map over one period
     rotation_number: float | None = None  # of a torus, in turns per return
+    reach: float | None = (
+        None  # of the neighbourhood that was seen to be drawn in, relative to its size; None if not asked for
+    )
 
     @property
     def frequency(self) -> float:
@@ -177,36 +179,31 @@ def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[n
 
 
 @in_double_precision
-def limit_cycle_of(scene: Scene, stepper: EventExact, closed: Closed) -> LimitCycle:
-    """The limit cycle of a fixed point of the return map."""
-    seen = seen_around(scene, stepper, closed.point, closed.period, closed.segments)
+def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitCycle:
+    """The limit cycle of a fixed point of the scene's return map."""
+    point, stepper = closed.point, EventExact()
+    seen = seen_around(scene, stepper, point, closed.period)
     largest = np.abs(section_multipliers(closed.jacobian))[0]
+    points = np.asarray(point.y)[None]
+    if closed.crossings > 1:
+        _, more = maps.path(np.zeros(1, int), Section.of(point), closed.crossings - 1)
+        points = np.concatenate([points, more[0]])
     return LimitCycle(
         scene=under_final_load(scene),
         kind="periodic",
         period=closed.period,
-        state=np.asarray(closed.point.y) + _equilibrium(scene),
-        contact=Contact(np.asarray(closed.point.contact.status), np.asarray(closed.point.contact.direction)),
+        state=np.asarray(point.y) + _equilibrium(scene),
+        contact=Contact(np.asarray(point.contact.status), np.asarray(point.contact.direction)),
         word=word(seen.segments),
         multipliers=floquet_multipliers(scene, stepper, seen.segments, closed.period),
-        stable=bool(largest < 1 - (MARGIN if np.ndim(closed.point.contact.status) == 0 else FAMILY)),
+        stable=bool(largest < 1 - (MARGIN if np.ndim(point.contact.status) == 0 else FAMILY)),
         amplitude=float(seen.amplitude),
         residual=closed.residual,
         crossings=closed.crossings,
         harmonics=seen.lines,
-        points=section_points(scene, stepper, closed.point, closed.crossings),
+        points=points,
         return_jacobian=closed.jacobian,
     )
-
-
-def section_points(scene: Scene, stepper: EventExact, point: Point, crossings: int) -> Float[np.ndarray, "k state"]:
-    """The points on the section during one period, beginning with the given one."""
-    points = [np.asarray(point.y)]
-    for _ in range(crossings - 1):
-        found, _ = return_with_jacobian(scene, stepper, point, 1)
-        point = found.point
-        points.append(np.asarray(point.y))
-    return np.stack(points)
 
 
 @in_double_precision

@@ -20,10 +20,10 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..model.contact_coordinates import from_contact_coordinates
 from ..model.scene import Scene
+from ..section.crossings import Point
 from .cycle import LimitCycle, point_of
 from .nearby import next_to
 from .own_coordinates import cycle_in_contact_coordinates
-from .section_motion import Point
 
 
 class CycleDerivatives(eqx.Module):

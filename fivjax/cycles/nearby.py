@@ -10,9 +10,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
+from ..attractors.closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
 from ..contact import Contact, same_mode
 from ..foundation import arguments
 from ..foundation.compiling import compiled
@@ -21,13 +23,12 @@ from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
 from ..model.scene import Scene
+from ..section.about_sliding import sliding_state
+from ..section.crossings import How, Point, motion_to_section
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
-from .about_sliding import sliding_state
-from .closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
 from .cycle import LimitCycle, point_of, under_final_load
 from .own_coordinates import in_own_coordinates
-from .section_motion import How, Point, motion_of_scene
 
 
 class NearbyCycle(eqx.Module):
@@ -206,11 +207,13 @@ def _image(scene: Scene, contact: Contact, crossings):
     """The return map with period and peak, as a function of the state on the section; its further result is the contact mode
     there, and whether the section was reached.
     """
-    how, numbers = How(EventExact(), peaks=True), jnp.asarray(crossings, jnp.float64)[None]
+    how, numbers = How(EventExact()), jnp.asarray(crossings, jnp.float64)[None]
 
     def image(y):
-        (at, _, arrived, peak), _ = motion_of_scene(
-            (how, scene, Point(y, contact), crossings, math.inf), numbers, by_kernel=has_kernel(scene, how.method)
+        (at, _, arrived, peak), _ = motion_to_section(
+            (how, scene, Point(y, contact), crossings, math.inf, np.True_),
+            numbers,
+            by_kernel=has_kernel(scene, how.method),
         )
         return _Image(at.point.y, at.time, jnp.where(arrived, peak, jnp.nan)), (at.point.contact, arrived)
 

@@ -16,9 +16,9 @@ import numpy as np
 from ..foundation import arguments
 from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision
+from ..kicks.critical import critical_perturbation
+from ..kicks.critical_derivatives import differentiable
 from ..linear.design import DesignOutcome
-from ..maps.critical_derivatives import differentiable
-from ..maps.threshold import critical_perturbation
 from ..model.load import Pulse
 from ..model.scene import Scene
 from .least_change import smallest_change

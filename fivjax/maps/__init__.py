@@ -1,1 +1,1 @@
-"""Maps and basins, critical kicks, the cost of accuracy; and the jobs, executors and stores that run them."""
+"""Verdicts on many trajectories: maps and basins; the rounds, jobs, executors and stores that run them."""

@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 
-from ..batches.attractors import Attractors, Torus
-from ..batches.captures import Cycle
-from ..verdicts.capture import Neighbourhood
-from ..verdicts.tube import Tube
+from ..attractors.cycles import Cycle
+from ..attractors.known import Attractors, Torus
+from ..attractors.neighbourhood import Neighbourhood
+from ..attractors.tube import Tube
 
 
 def to_bytes(found: dict[bytes, Attractors]) -> bytes:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Int
 
-from ..batches.results import Verdicts
 from ..verdicts.verdict import Verdict
+from .results import Verdicts
 
 # Amplitudes and periods of the same cycle, computed from different guesses, agree to this relative error.
 SAME = 1e-6

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..batches.results import by_name, not_run
 from ..foundation import arguments
 from ..linear.critical import critical_friction
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
+from .results import by_name, not_run
 
 # The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
 MOST_TRAJECTORIES = 10**8

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from ..batches.results import Verdicts
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
@@ -20,6 +19,7 @@ from .datasets import map_dataset
 from .engine import MOST_STEPS, run_to_verdict
 from .executors import with_workers
 from .refinement import audit_note, finer, refined
+from .results import Verdicts
 from .resuming import keeper_at
 from .trajectories import Grid
 

@@ -15,8 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ..batches.attractors import Attractors
-from ..batches.results import Verdicts, by_name, not_run
+from ..attractors.known import Attractors
 from ..foundation.seals import Damaged
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
@@ -25,6 +24,7 @@ from .attractor_files import from_bytes, to_bytes
 from .checkpoint_file import KIND as KIND
 from .checkpoint_file import Contents
 from .job_files import file_of
+from .results import Verdicts, by_name, not_run
 from .trajectories import Places
 
 # Time between writes, s: long enough to cost nothing, short enough to lose little.

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import xarray as xr
 
-from ..batches.results import CHAOTIC, Verdicts
-from ..batches.sharing import kernels_by
 from ..io.datasets import labelled
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
@@ -15,7 +13,9 @@ from ..verdicts.sliding_proof import why_withheld
 from ..verdicts.verdict import FAILURES, MEANING, Verdict
 from .attractors_listed import attractor_table
 from .crossing import first_crossings
+from .groups import kernels_by
 from .refinement import Refined
+from .results import CHAOTIC, Verdicts
 from .trajectories import Grid
 
 

@@ -15,19 +15,19 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from ..batches.attractors import Attractors
-from ..batches.blocks import workers as cores
-from ..batches.results import Verdicts, counted, not_run
-from ..batches.sharing import grouped
+from ..attractors.known import Attractors
+from ..foundation.blocks import workers as cores
 from ..foundation.progress import Work, following
 from ..foundation.stopping import stop_requests, waited_for
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
 from .executors import Workers
+from .groups import grouped
 from .handing_out import hand_out
 from .jobs import Done, Job, run_job
 from .plan import Plan, planned
+from .results import Verdicts, counted, not_run
 from .trajectories import Places
 
 # The most steps of a trajectory: enough for 10⁵ cycles with their events; a map of such trajectories takes hours.

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..batches.halfway import Halfway
-from ..batches.results import Verdicts, by_name
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
 from .attractor_files import from_bytes, to_bytes
+from .halfway import Halfway
+from .results import Verdicts, by_name
 from .trajectories import Places
 
 # Time between writes, s, and before a part of the work that may take as long as that.

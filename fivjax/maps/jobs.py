@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..batches import rounds
-from ..batches.attractors import Attractors
-from ..batches.results import Verdicts, not_run
-from ..batches.sharing import Batch
+from ..attractors.known import Attractors
 from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
+from . import rounds
+from .groups import Batch
 from .job_files import JobFile
+from .results import Verdicts, not_run
 
 
 class Task(NamedTuple):

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ..batches.blocks import MANY
-from ..batches.sharing import HISTORY, bytes_per_trajectory, in_bulk
+from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
+from .groups import HISTORY, bytes_per_trajectory, in_bulk
 from .jobs import Task
 from .trajectories import Grid, Listed, Places
 

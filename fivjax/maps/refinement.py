@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..batches.results import Verdicts, not_run
 from ..verdicts.verdict import Verdict
+from .results import Verdicts, not_run
 from .shares import wilson
 from .trajectories import Places
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from .. import contact as physics
-from ..batches.sharing import bytes_per_trajectory, in_bulk, kernels_by
-from ..cycles.about_sliding import mechanics_about_sliding
 from ..foundation import arguments
 from ..foundation.traced_code import digest, is_from_outside
 from ..model.description import code_of, describe
 from ..model.scene import Scene
+from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
+from .groups import bytes_per_trajectory, in_bulk, kernels_by
 from .plan import in_a_job
 from .store import Store, is_store
 from .trajectories import Grid

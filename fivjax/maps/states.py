@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..batches.attractors import Attractors
+from ..attractors.known import Attractors
 from ..cycles.cycle import under_final_load
 from ..model.scene import Scene
 from ..model.structure import Structure

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..batches.attractors import Attractors
-from ..batches.results import Verdicts, by_name, not_run
+from ..attractors.known import Attractors
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
 from .attractor_files import from_bytes, to_bytes
 from .job_files import file_of
+from .results import Verdicts, by_name, not_run
 from .store_folder import check_begun, create, locked, zarr
 from .trajectories import Grid, Places, Tiles
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..batches.sharing import HISTORY, grouped
+from .groups import HISTORY, grouped
 
 # Indices of trajectories in a run; those of one job, for instance.
 Places = Int[np.ndarray, " r"]

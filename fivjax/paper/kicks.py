@@ -4,8 +4,8 @@ import numpy as np
 import xarray as xr
 
 from .. import plot
+from ..kicks.critical import critical_perturbation
 from ..linear import cea
-from ..maps.threshold import critical_perturbation
 from . import pictures
 from . import scenes as paper
 from .findings import Made, given, number, statement

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
-from ..cycles.tori_on_branches import turning
+from ..branches.tori_on_branches import turning
 from .maps import bistability
 from .style import BLACK, COLOURS, GREEN, axis_label, check_dataset, legend_above, new_figure
 

@@ -11,17 +11,7 @@ from matplotlib.lines import Line2D
 from ..simulation.trajectory import Trajectory
 from ._windows import Window, align_zeros, inside, ledger, legend_between, legend_of_figure, shade, styles
 from .contact_status import STATUS_NAMES
-from .style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-    check_dataset,
-    legend_above,
-    new_figure,
-)
+from .style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILION, check_dataset, legend_above, new_figure
 
 PER_CYCLE = {"contact_work": "energy from the contact", "energy_gain": "energy gained"}
 

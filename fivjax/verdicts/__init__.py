@@ -1,1 +1,1 @@
-"""What can be proved about the end of a trajectory."""
+"""What can be proved of a motion by itself: it slides for ever, sticks for ever, or goes on sliding for a known time."""

@@ -1,0 +1,349 @@
+"""Tori of many groups: the sets that long motions trace on the section, whether these attract, whether neighbours part on them,
+how high they go.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..contact import Status
+from ..section.return_maps import ReturnMaps, Section
+from . import tube
+from .cycles import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
+from .parting import parting_rates
+from .tube import Tube, thinned, tree_of
+
+# Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
+TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
+# States on the section in a row that make the set: so many, and twice as many of a motion that beats slowly; and how many at a
+# time: after each, motions that have come to a torus that is known are left out, and those whose extent changes by this factor,
+# as on the way to a cycle. Near a resonance beats are so slow that it takes more states to tell them from a drift.
+TRACED, LONGER, LONGEST, AT_A_TIME, CHANGES = 2048, 4096, 12288, 512, 1.5
+# The mean of the states may change with time by so much of their extent, and their extent by this share. A fade that takes
+# thousands of periods is such a set, too, and starts further in are home while they pass it.
+DRIFT, SHRINKS = 5e-3, 0.05
+# A motion that comes back this close, relative to the extent of its states, within `CROSSINGS`, is on a cycle. One that is
+# locked weakly to a cycle of more crossings is better taken as on a torus: motions from about it trace the rest of that, once
+# they have come to it, after so many returns. Its states are in clusters: distances between neighbours are mostly smaller than
+# this share of those on a curve.
+REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
+# Crossings in which starts on the tube's edge have to be back in this share of it, which is less than what captures: next to a
+# slow fade there is a direction in which they come back hardly at all. The first few starts tell most sets that do not attract.
+BACK_WITHIN, BACK_TO, FIRST = 1536, 0.25, 4
+# Starts about a torus that are followed further. In chaos neighbours part by so much per return, and more.
+FURTHER, PARTING = 4, 0.05
+# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
+LOCKED = -0.01
+# On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
+# within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
+SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
+# The largest speed in the later half of the states is the torus' amplitude if that in the earlier half differs by no more than
+# this share. Else the motion is followed further, for so many returns at most: a set whose amplitude still drifts is not
+# accepted. (What shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats
+# may be rare.)
+SETTLED, SETTLED_WITHIN = 7.5e-4, 24576
+# Returns that starts about a torus take from the edge of the tube to the torus, once they are back.
+COME_NEARER = 128
+
+
+class Traced(NamedTuple):
+    """What a motion that may be on a torus traces on the section."""
+
+    states: Float[np.ndarray, "k 2n"]  # weighted deviations, in order
+    amplitude: float  # m/s
+
+
+class Torus(NamedTuple):
+    """A set of crossing states about which everything was seen to come back."""
+
+    tube: Tube  # about weighted deviations; all comes back from its edge, and half of it captures
+    amplitude: float  # m/s
+    period: float  # mean time between crossings, s
+
+
+def tori_from(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    cycles: list[list[Cycle]],
+    tori: list[list[Torus]],
+    report,
+    tubes=TUBES,
+) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
+    """The tori that motions from these states are on, by row; and the cycles of locked ones, with their rows. `cycles` and
+    `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
+    """
+    traced = _traced(maps, group, at, tori, max(TRACED, tubes[-1][1]))
+    around = _traced_around(maps, group, traced)
+    found: dict[int, Torus] = {}
+    locked: list[tuple[int, Cycle]] = []
+    # A tube that is wider says more, where everything in it comes back.
+    for radius, count in tubes:
+        # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
+        own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
+        for paths in (traced | around, *own):
+            tried = [(row, Tube(thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
+            tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
+            if not tried:
+                continue
+            new, of_locked = _attracting(maps, group, tried, cycles, report)
+            found |= {row: Torus(one, traced[row].amplitude, period) for row, (one, period) in new.items()}
+            locked += of_locked
+            for row in {*new, *(row for row, _ in of_locked)}:
+                del traced[row]
+                around.pop(row, None)
+    return found, locked
+
+
+def reached(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    latest: Float[np.ndarray, "m 2n"],
+    known: list[tuple[Int[np.ndarray, " r"], Torus]],
+) -> dict[int, Torus]:
+    """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
+    `captures.captured`, `latest` tells which to ask, and their next crossings decide.
+    """
+    near = []
+    for rows, torus in known:
+        within = 0.5 + maps.known_to / torus.tube.radius
+        near.append(rows[torus.tube.holds(maps.weights * latest[rows], within)])
+    asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
+    if not len(asked):
+        return {}
+    _, paths = maps.path(group[asked], at.rows(asked), tube.HOME)
+    found: dict[int, Torus] = {}
+    for (_, torus), rows in zip(known, near, strict=True):
+        open_ = np.array([row for row in rows if row not in found], int)
+        if len(open_):
+            ends = maps.weights * np.moveaxis(paths[np.searchsorted(asked, open_)], 1, 0)
+            found |= dict.fromkeys(open_[torus.tube.home(ends)].tolist(), torus)
+    return found
+
+
+def _traced(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, tori: list[list[Torus]], count: int
+) -> dict[int, Traced]:
+    """At least so many states of those motions, by row, that may be on a torus that is none of the known ones."""
+    running, paths, peaks = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1])), np.zeros((len(group), 0))
+    traced: dict[int, Traced] = {}
+    for length in range(AT_A_TIME, SETTLED_WITHIN + 1, AT_A_TIME):
+        if not len(running):
+            break
+        if length == AT_A_TIME:
+            # Most are left out after this, and peaks take as long as the motion.
+            at, more = maps.path(group[running], at, AT_A_TIME)
+        else:
+            at, _, _, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
+            peaks = np.concatenate([peaks, highest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
+        more *= maps.weights
+        paths = np.concatenate([paths, more], axis=1)[:, -LONGEST:]
+        ends = np.moveaxis(more, 1, 0)
+        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(CHANGES)) & maps.moves(group[running], at.y)
+        for k in np.flatnonzero(left):
+            left[k] = not any(one.tube.home(ends[-tube.HOME :, k : k + 1]).item() for one in tori[running[k]])
+        if length >= count:
+            whole = np.moveaxis(paths[:, -LONGER:], 1, 0)
+            drifting = is_drifting(whole) & is_drifting(np.moveaxis(paths, 1, 0))
+            left &= goes_on(whole)
+            for k in np.flatnonzero(left):
+                amplitude = _settled(peaks[k])
+                if amplitude is not None and not drifting[k]:
+                    traced[int(running[k])] = Traced(paths[k, -LONGER:].copy(), amplitude)
+                    left[k] = False
+                left[k] &= length < LONGER or (not drifting[k] if amplitude is None else length < LONGEST)
+        if length == LONGER and np.any(left):
+            # What never settles is chaos, mostly.
+            growth, *_ = parting_rates(maps, group[running[left]], at.rows(left))
+            left[left] = growth < PARTING
+        running, at, paths, peaks = running[left], at.rows(left), paths[left], peaks[left]
+    return traced
+
+
+def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray | np.floating, "*m"]:
+    """The root mean square distance of points from their mean."""
+    away = weighted - np.mean(weighted, axis=0)
+    return np.sqrt(np.einsum("k...j,k...j->...", away, away) / len(away))
+
+
+def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*state"]:
+    """A mean whose weights vanish smoothly at both ends: of a quasi-periodic sequence it is much better than equal weights."""
+    x = (np.arange(len(values)) + 0.5) / len(values)
+    weights = np.exp(-1.0 / (x * (1 - x)))
+    return np.tensordot(weights / np.sum(weights), values, axes=1)
+
+
+def _settled(peaks: Float[np.ndarray, " k"]) -> float | None:
+    """The largest of successive peaks (m/s), unless it differs much from half of them to the other."""
+    earlier, later = np.max(peaks[: len(peaks) // 2]), np.max(peaks[len(peaks) // 2 :])
+    return float(later) if abs(later / earlier - 1) <= SETTLED else None
+
+
+def _growth(paths: Float[np.ndarray, "k *m 2n"]) -> Float[np.ndarray, "*m"]:
+    """The logarithm of the growth of the extent of states from the first third of them to the last."""
+    third = len(paths) // 3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(extent(paths[-third:]) / extent(paths[:third]))
+
+
+def is_drifting(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
+    """Whether the mean or the extent of weighted states on the section changes with time."""
+    third = len(paths) // 3
+    with np.errstate(invalid="ignore"):
+        early, late = (smooth_mean(part) for part in (paths[:third], paths[-third:]))
+        moved = np.linalg.norm(late - early, axis=-1) > DRIFT * extent(paths)
+        return moved | ~(np.abs(_growth(paths)) <= SHRINKS)
+
+
+def goes_on(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
+    """Whether a motion goes on, by its weighted states on the section, and the last of them is none of those up to `CROSSINGS`
+    before.
+    """
+    with np.errstate(invalid="ignore"):
+        width = extent(paths)
+        moving = width > ROUNDING * np.mean(np.linalg.norm(paths, axis=-1), axis=0)
+        apart = np.linalg.norm(paths[-1 - CROSSINGS : -1] - paths[-1], axis=-1)
+        return moving & (np.min(apart, axis=0) > REPEATS * width)
+
+
+def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
+    """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will."""
+    states = thinned(path, TUBES[0][1])
+    return bool(np.median(_spacing(states)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
+
+
+def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
+    """The distance of each state to the nearest of the others."""
+    return tree_of(states).query(states, k=2)[0][:, 1]
+
+
+def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
+    """The motions that are in clusters, with the states that others about them trace; their amplitudes are their own."""
+    rows = [row for row, one in traced.items() if _in_clusters(one.states)]
+    if not rows:
+        return {}
+    own, at = _starts(maps, group[rows], [Tube(traced[row].states, tube.RADIUS) for row in rows])
+    _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // tube.STARTS)
+    states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
+    return {
+        row: traced[row]._replace(states=whole)
+        for row, whole in zip(rows, states, strict=True)
+        if np.all(np.isfinite(whole))
+    }
+
+
+def _attracting(
+    maps: ReturnMaps,
+    groups: Int[np.ndarray, " g"],
+    tubes: list[tuple[int, Tube]],
+    known: list[list[Cycle]],
+    report,
+) -> tuple[dict[int, tuple[Tube, float]], list[tuple[int, Cycle]]]:
+    """Which of these tubes, each with its row, are about tori, with the mean time between crossings (s); and the cycles of tori
+    that are locked.
+    """
+    own = np.array([groups[row] for row, _ in tubes])
+    back, last = _back(maps, own, [one for _, one in tubes], report)
+    if not len(back):
+        return {}, []
+    chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
+    group = own[chosen // tube.STARTS]
+    at = maps.returns(group, last.rows(chosen), COME_NEARER).at
+    growth, period, later, path = parting_rates(maps, group, at)
+    growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
+    lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
+    closing_in = np.flatnonzero(growth < LOCKED)
+    cycles: list[tuple[int, Cycle]] = []
+    locked: list[int] = []
+    of_group = {int(groups[row]): known[row] for row, _ in tubes}
+    # One motion of each after the other, because most lead to the same cycle. What is no torus for sure has no better
+    # attractor than a cycle with a narrow neighbourhood.
+    for nominee, settled in (*((k, False) for k in range(0, FURTHER, FURTHER // NOMINATED)), (0, True)):
+        left = closing_in[~np.isin(closing_in, locked)]
+        asks = FURTHER * (left[~lasting[left]] if settled else left) + nominee
+        if not len(asks):
+            continue
+        for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS, settled):
+            of_torus = asks[rows] // FURTHER
+            cycles.append((tubes[back[of_torus[0]]][0], cycle))
+            locked += list(of_torus)
+    with np.errstate(invalid="ignore"):
+        kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
+    tori = {}
+    for k in kept[np.isfinite(period[kept])]:
+        row, one = tubes[back[k]]
+        tori[row] = one, float(period[k])
+    return tori, cycles
+
+
+def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[Cycle]) -> bool:
+    """Whether a stable cycle lies in the inner half of a tube: motions there may come to that instead."""
+    return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
+
+
+def _back(
+    maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube], report
+) -> tuple[Int[np.ndarray, " t"], Section]:
+    """From the edges of which tubes all starts come back; and where the starts are then, tube by tube."""
+    weights, count = maps.weights, tube.STARTS
+    own, last = _starts(maps, group, tubes)
+    back, ok = np.zeros(len(own), bool), np.ones(len(tubes), bool)
+    smallest = np.array([np.min(np.linalg.norm(one.states, axis=1)) for one in tubes])
+    place, of_tube = np.arange(len(own)) % count, np.arange(len(own)) // count
+    for among in (place < FIRST, place >= FIRST):
+        running = np.flatnonzero(among & ok[of_tube])
+        crossed = 0
+        while crossed < BACK_WITHIN and len(running):
+            report(0)
+            # Most are back soon; the others are looked at in growing steps.
+            further = min(max(tube.HOME, crossed // 2), BACK_WITHIN - crossed)
+            crossed += further
+            image = maps.returns(own[running], last.rows(running), further, tube.HOME)
+            last.put(running, image.at)
+            ends = weights * np.moveaxis(image.path, 1, 0)
+            # One that fades, or fails, does not come back.
+            with np.errstate(invalid="ignore"):
+                lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[of_tube[running]])
+            ok[of_tube[running[lost]]] = False
+            for k in np.unique(of_tube[running]):
+                mine = of_tube[running] == k
+                back[running[mine]] = tubes[k].home(ends[:, mine], BACK_TO)
+            running = running[ok[of_tube[running]] & ~back[running]]
+        ok[of_tube[among & ~back]] = False
+    return np.flatnonzero(ok), last
+
+
+def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
+    """Whether motions, by their weighted states on the section in order, go about the same set again and again."""
+    if not np.all(np.isfinite(paths)):
+        return False
+    whole = paths.reshape(-1, paths.shape[-1])
+    means = smooth_mean(np.moveaxis(paths, 1, 0))
+    apart = np.linalg.norm(means - np.mean(means, axis=0), axis=1)
+    third = paths.shape[1] // 3
+    early = paths[:, :third].reshape(-1, paths.shape[-1])
+    late = paths[:, -third:]
+    steps = [np.median(_spacing(part)) for part in late]
+    missed = np.median(tree_of(early).query(late)[0], axis=1)
+    rounding = ROUNDING * tube.mean_size(whole)
+    return bool(
+        np.max(apart) <= SAME_MEAN * extent(whole) and np.all(missed <= NEAR_OTHERS * np.array(steps) + rounding)
+    )
+
+
+def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -> tuple[Int[np.ndarray, " m"], Section]:
+    """The starts on the edge of each of these tubes, with their groups."""
+    own, size = np.repeat(group, tube.STARTS), maps.structure.size
+    section, gaps = maps.section / maps.weights[size:], np.atleast_1d(maps.normal)
+    starts = np.concatenate([one.starts(section, gaps) for one in tubes])
+    return own, section_at(starts / maps.weights, maps.normal, maps.sliding[own])
+
+
+def section_at(
+    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
+) -> Section:
+    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
+    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
+    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))

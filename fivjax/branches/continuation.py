@@ -1,0 +1,258 @@
+r"""Branches of limit cycles over a parameter, by pseudo-arclength continuation, stable and unstable ones alike.
+
+A branch passes folds, where the parameter turns back, and changes of the contact modes: a guard grazes zero, and beyond there
+is one more phase of sticking or detachment, or one more impact. Each sequence of modes has a smooth curve of cycles
+(`multiple_shooting`). The point where this curve no longer is the real motion is computed as a root (`grazing`); the branch
+continues along the curve for the sequence of modes that the real motion has beyond.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..attractors.closing import closed_at
+from ..contact import Contact, Status
+from ..cycles.around import seen_around
+from ..cycles.cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
+from ..cycles.own_coordinates import cycle_in_own_coordinates, in_own_coordinates
+from ..cycles.saddle import saddle_cycle
+from ..cycles.search import NoLimitCycle, limit_cycle
+from ..foundation import arguments
+from ..foundation.digits import apart
+from ..foundation.kept_programs import kept
+from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported, stage
+from ..io.datasets import labelled
+from ..model.contact_coordinates import to_contact_coordinates
+from ..model.scene import Scene, refuse_several_contacts, scene_in_contact_coordinates
+from ..section.about_sliding import sliding_state
+from ..section.crossings import Point as SectionPoint
+from ..section.return_maps import ReturnMaps
+from ..simulation.start import snapped_to_belt
+from ..steppers.event_exact import EventExact
+from .branch_points import Point, seen
+from .following import follow_branch
+from .meeting_sliding import sliding_rates
+from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
+from .pseudo_arclength import Curve, Family
+from .special_derivatives import derivatives_of_special_points
+from .special_points import MEETS_SLIDING
+from .verification import crossings_of, on_section
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@reported("branch")
+@in_own_coordinates
+@in_double_precision
+def continue_cycle(
+    scene: Scene,
+    parameter: str,
+    bounds: tuple[float, float],
+    start=None,
+    *,
+    points: int = 400,
+    derivatives: bool = False,
+    progress: bool | None = None,
+) -> "xr.Dataset":
+    """The branch of limit cycles, stable and unstable, that contains a given one, over a parameter of the scene.
+
+        branch = fj.continue_cycle(scene, "mu", (0.02, 0.3))
+        unstable = fj.continue_cycle(scene, "mu", (0.02, 0.3), start=fj.saddle_cycle(scene))
+
+    The branch is followed both ways from the start, past folds, through stable and unstable cycles.
+
+    **Arguments:**
+
+    - `scene`; `parameter`, the name of one of its scalar parameters, such as "mu" or "belt_speed". The load is the final one.
+    - `bounds`: the lowest and the highest value of the parameter, in its unit; the scene's own value lies between them.
+    - `start`: as in `limit_cycle`; a `LimitCycle` may be unstable. Unless given, the scene's limit cycle, or its saddle cycle
+      if the limit cycle is a torus.
+    - `progress`: as in `limit_cycle`.
+    - `points`: the largest number of cycles computed in each direction.
+    - `derivatives`: whether to differentiate special points in all parameters.
+
+    **Returns:** a dataset over `point`, in the order along the branch:
+
+    - `parameter` (its value), `period` (s), `amplitude` (peak tangential speed, m/s), `stable`;
+    - `sliding_stable`, whether steady sliding is stable there;
+    - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
+    - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
+    - `special`: the kind of a special point, else empty: "fold", "period doubling", "Neimark–Sacker", or how the contact
+      modes change there ("grazing of slip: stick inserted"). Special points are computed to rounding;
+    - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
+      points, for the parameter itself, and where the change of modes is not a simple one.
+
+    The attributes `begins` and `ends` say in a sentence where each end is, and why.
+
+    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value, and for
+    anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
+
+    **Example:**
+
+        >>> branch = fj.continue_cycle(scene.replace(belt_speed=1.0), "mu", (0.2, 0.24))  # doctest: +SLOW
+        >>> bool(branch["stable"].any())
+        True
+    """
+    import xarray as xr
+
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
+    refuse_several_contacts(scene.structure, "`continue_cycle`")
+    final = under_final_load(scene)
+    known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
+    arguments.one_of("parameter", parameter, tuple(known))
+    low, high = _checked_bounds(bounds)
+    value = float(final.parameters[parameter])
+    if not low <= value <= high:
+        own, lower, upper = apart(value, low, high)
+        raise ValueError(
+            f"Argument `bounds` must hold the scene's own {parameter}, {own}, but is ({lower}, {upper}). "
+            f"Widen it, or start elsewhere with `scene.replace`."
+        )
+    arguments.whole_number("points", points, minimum=2)
+    arguments.truth("derivatives", derivatives)
+    cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
+    if cycle.kind != "periodic" and start is None:
+        # Past a fold, the branch of the saddle cycle leads to the unstable cycle inside the torus.
+        cycle = saddle_cycle(final, cycle)
+    if cycle.kind != "periodic":
+        raise NoLimitCycle(
+            f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
+            f"cycle is periodic, or give a `LimitCycle` as `start`."
+        )
+    stepper = EventExact()
+    around = seen_around(final, stepper, point_of(cycle), cycle.period)
+    phases = phases_around(around.segments)
+    assert phases is not None
+    family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, stepper)
+    curve = Curve(family, phases)
+    place = curve.at_parameter(curve.unknowns(phases, value), value)
+    if place is None:
+        raise NoLimitCycle(
+            "The cycle to start from lies at a special point, where its equations are singular. Start a little beside it."
+        )
+    first = seen(family, curve, place)
+    down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
+    along = [*reversed(down.points), first, *up.points]
+    if derivatives:
+        stage("differentiating special points")
+    slopes = derivatives_of_special_points(family, along) if derivatives else None
+    return labelled(_dataset(xr, family, along, slopes), final, parameter=parameter).assign_attrs(
+        parameter=parameter, begins=down.ending, ends=up.ending
+    )
+
+
+@in_double_precision
+def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
+    """The limit cycle at a point of a branch.
+
+    **Arguments:** `branch`, from `continue_cycle`; `i`, the index of the point.
+
+    **Returns:** a `LimitCycle`.
+
+    **Raises:** `TypeError` or `ValueError` for an object that is no branch, or an `i` that is not among its points;
+    `NoLimitCycle` if the motion does not cross the section, which happens at nearly zero amplitude.
+
+    **Example:**
+
+        >>> branch = fj.continue_cycle(scene.replace(belt_speed=1.0), "mu", (0.2, 0.24))  # doctest: +SLOW
+        >>> fj.cycle_at(branch, 0).kind
+        'periodic'
+    """
+    if isinstance(i, bool) or not isinstance(i, int | np.integer):
+        raise TypeError(f"Argument `i` must be the index of a point, a whole number, but is {arguments.describe(i)}.")
+    try:
+        name, row = branch.attrs["parameter"], branch.isel(point=i)
+        value = float(row["parameter"])
+    except (AttributeError, KeyError, IndexError, ValueError):
+        raise ValueError(
+            f"Argument `branch` must come from `fivjax.continue_cycle`, and `i` be the place of one of its points, "
+            f"but is {i!r}."
+        ) from None
+    given = Scene.from_dataset(branch).replace(**{name: value})
+    scene = scene_in_contact_coordinates(given)
+    state = np.asarray(row["state"])
+    if scene is not given:
+        state = np.asarray(snapped_to_belt(scene, jnp.asarray(to_contact_coordinates(given.structure, state))))
+    y = state - np.asarray(sliding_state(scene, scene.load.final))
+    contact = Contact(np.asarray(int(row["status"]), np.int32), np.asarray(float(row["direction"])))
+    point = SectionPoint(np.asarray(y), contact)
+    maps = ReturnMaps.of(scene)
+    crossings = crossings_of(maps, point)
+    if crossings is None:
+        raise NoLimitCycle(f"At point {i} of the branch the motion does not come back to the section.")
+    cycle = limit_cycle_of(maps, scene, closed_at(maps, point, crossings))
+    return cycle_in_own_coordinates(given, cycle)
+
+
+def _checked_bounds(bounds) -> tuple[float, float]:
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError(f"Argument `bounds` must be a pair of numbers, such as (0.02, 0.3), but is {bounds!r}.")
+    low, high = bounds
+    arguments.real_number("bounds[0]", low)
+    arguments.real_number("bounds[1]", high, above=float(low))
+    return float(low), float(high)
+
+
+def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
+    size = 2 * family.scene.structure.size
+    states, status, direction, amplitude, slides = [], [], [], [], []
+    for point in points:
+        scene = family.at(point.place.parameter)
+        slides.append(bool(sliding_rates(scene)[0].real < 0))
+        rest = np.asarray(_equilibrium(scene))
+        at = None if point.real is None else on_section(scene, point.real)
+        states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
+        status.append(-1 if at is None else int(at.contact.status))
+        direction.append(np.nan if at is None else float(at.contact.direction))
+        amplitude.append(np.nan if point.real is None else float(point.real.seen.amplitude))
+        if point.name == MEETS_SLIDING:
+            states[-1], amplitude[-1] = rest, 0.0
+    multipliers = np.stack([point.multipliers for point in points])
+    largest = np.abs(multipliers[:, 0])
+    names = list(family.scene.structure.coordinates)
+    dataset = xr.Dataset(
+        {
+            "parameter": ("point", [point.place.parameter for point in points]),
+            "period": ("point", [point.place.phases.period for point in points]),
+            "amplitude": ("point", amplitude),
+            "multipliers": (("point", "multiplier"), multipliers),
+            "stable": ("point", largest < 1 - MARGIN),
+            "sliding_stable": ("point", slides),
+            "word": ("point", [word_of(point.place.phases) for point in points]),
+            "special": ("point", [point.name for point in points]),
+            "state": (("point", "coordinate"), np.stack(states)),
+            "status": ("point", np.array(status, np.int8)),
+            "direction": ("point", direction),
+        },
+        coords={"coordinate": [*names, *(f"d{name}" for name in names)]},
+    )
+    if slopes is not None:
+        of, values = slopes
+        dataset = dataset.assign_coords(of=of).assign(d_special=(("point", "of"), values))
+    return dataset
+
+
+@kept
+def _equilibrium(scene: Scene):
+    return sliding_state(scene, scene.load.final)
+
+
+def word_of(phases: Phases) -> str:
+    """The contact modes of a cycle as text; sliding faster than the belt is "slide back"."""
+    longest = int(np.argmax(phases.h))
+    usual = next((mode.direction for mode in phases.modes if mode.status == Status.SLIDE), 1.0)
+    if phases.modes[longest].status == Status.SLIDE:
+        usual = phases.modes[longest].direction
+
+    def of(mode: Mode) -> str:
+        name = Status(mode.status).name.lower()
+        return f"{name} back" if mode.status == Status.SLIDE and mode.direction != usual else name
+
+    words = [of(mode) for mode in phases.modes]
+    turned = [words[k:] + words[:k] for k in range(len(words))]
+    # Rotated to a unique beginning, so that the same cycle has the same word at all points.
+    return " – ".join(max(turned))

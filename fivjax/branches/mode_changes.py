@@ -1,0 +1,147 @@
+"""Where the contact modes of a branch of cycles change: the special point there, and the cycles with other modes beyond it."""
+
+import numpy as np
+from jaxtyping import Float
+
+from .branch_points import Point, is_real, seen
+from .multiple_shooting import AT_SECTION, Phases
+from .pseudo_arclength import Curve, Family, Place
+from .special_points import Special, change_between, grazing_of, name_of, vanishing, without
+from .verification import on_section, real_motion
+
+# Halvings that bracket a change of modes before it is computed.
+HALVINGS = 14
+# Distances beyond a change of modes at which the next modes are determined, as shares of the step.
+BEYOND = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+
+
+def change_of_modes(family: Family, here: Point, tangent: Float[np.ndarray, " m"], step: float):
+    """The change of modes within a step: the special point, and the point, tangent and step with which to go on, if any."""
+    curve = here.curve
+    low, high, ahead = 0.0, step, curve.along(here.place, tangent, step)
+    valid = here.place
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        place = curve.along(here.place, tangent, middle)
+        if place is None:
+            high = middle
+            continue
+        if is_real(family, place):
+            low, valid = middle, place
+        else:
+            high, ahead = middle, place
+    if ahead is None:
+        return None
+    gone = [k for k in range(len(ahead.phases.h)) if ahead.phases.h[k] <= 0]
+    if gone:
+        return _removed(family, curve, valid, tangent, gone[0], step)
+    return _inserted(family, curve, valid, ahead, tangent, step) or _removed(
+        family, curve, valid, tangent, int(np.argmin(valid.phases.h)), step
+    )
+
+
+def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent, step: float):
+    """A change beyond which there are more phases."""
+    for share in BEYOND:
+        place = curve.along(ahead, tangent, share * step)
+        if place is None:
+            continue
+        real = real_motion(family.at(place.parameter), family.stepper, place.phases)
+        if real is None or real.phases is None or len(real.phases.modes) <= len(curve.modes):
+            continue
+        change = change_between(real.phases.modes, curve.modes)
+        longer = Curve(family, real.phases)
+        first = longer.corrected(longer.unknowns(real.phases, place.parameter))
+        if first is None or not is_real(family, first):
+            continue
+        special, grazing = None, grazing_of(curve, ahead)
+        if grazing is not None and _near(curve, grazing.place, ahead, step):
+            name = name_of(grazing, change, removed=False)
+            special = Special(name, curve, grazing.place, grazing.row, grazing)
+        elif change is not None and not change.merges:
+            special = vanishing(longer, first, change.phase)
+        if special is None:
+            special = Special("", curve, valid)
+        if not special.name:
+            special = special._replace(name=name_of(None, change, removed=False))
+        away = longer.tangent(first, None)
+        vanishes = change is not None and change.word != "impact"
+        index = len(longer.of_state) + change.phase if change is not None else 0
+        if vanishes and abs(away[index]) > 1e-6:
+            away = away * np.sign(away[index])
+        else:
+            away = _outward(family, longer, first, away, special.place)
+        return special, (seen(family, longer, first), away, max(share * step, 1e-3))
+    return None
+
+
+def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, step: float):
+    """A change beyond which there are fewer phases."""
+    shorter = _shorter(family, valid, phase)
+    if shorter is None:
+        return None
+    guess, change = shorter
+    fewer = Curve(family, guess)
+    first = fewer.corrected(fewer.unknowns(guess, valid.parameter))
+    if first is None:
+        return None
+    special, away = None, fewer.tangent(first, None)
+    grazing = grazing_of(fewer, first)
+    if grazing is not None and _near(fewer, grazing.place, first, 1e-3):
+        special = Special(name_of(grazing, change, removed=True), fewer, grazing.place, grazing.row, grazing)
+        away = fewer.tangent(grazing.place, None)
+        away = away * np.sign(grazing.row @ away)
+    else:
+        found = None if change.merges else vanishing(curve, valid, phase)
+        special = Special("", curve, valid) if found is None else found
+        special = special._replace(name=name_of(None, change, removed=True))
+        away = _outward(family, fewer, first, away, None)
+    begin = special.place if special.curve is fewer else first
+    for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
+        onward = fewer.along(begin, away, length)
+        if onward is not None and is_real(family, onward):
+            return special, (seen(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
+    return special, None
+
+
+def _shorter(family: Family, valid: Place, phase: int):
+    """The phases without the given one, as a guess of a cycle; and the change that leads to them."""
+    phases = valid.phases
+    count, modes = len(phases.modes), phases.modes
+    before, after = modes[phase - 1], modes[(phase + 1) % count]
+    if count == 2 and modes[phase][:2] != after[:2]:
+        # The remaining phase has no event: it starts and ends on the section.
+        kept = (after._replace(ending=AT_SECTION),)
+        change = change_between(modes, kept)
+        real = real_motion(family.at(valid.parameter), family.stepper, phases)
+        point = None if real is None else on_section(family.at(valid.parameter), real)
+        if change is None or point is None:
+            return None
+        return Phases(kept, np.asarray(point.y)[None], np.array([phases.period])), change
+    if count > 2 and before[:2] == after[:2]:
+        kept = tuple(mode for j, mode in enumerate(modes) if j not in (phase, (phase - 1) % count))
+    else:
+        kept = modes[:phase] + modes[phase + 1 :]
+    change = change_between(modes, kept)
+    if change is None:
+        return None
+    guess = without(phases, change._replace(phase=phase), kept)
+    return None if guess is None else (guess, change)
+
+
+def _near(curve: Curve, found: Place, guess: Place, step: float) -> bool:
+    return float(np.linalg.norm(found.u - guess.u)) < max(2 * step, 1e-3)
+
+
+def _outward(family: Family, curve: Curve, first: Place, tangent, special: Place | None):
+    """The direction along a curve in which its cycles are real motions."""
+    for length in (1e-6, 1e-5, 1e-4, 1e-3):
+        real = []
+        for sign in (1.0, -1.0):
+            place = curve.along(first, tangent, sign * length)
+            real.append(place is not None and is_real(family, place))
+        if real[0] != real[1]:
+            return tangent if real[0] else -tangent
+    if special is not None and special.parameter != first.parameter and abs(tangent[-1]) > 1e-12:
+        return tangent * np.sign(tangent[-1] * (first.parameter - special.parameter))
+    return tangent

@@ -1,0 +1,172 @@
+r"""A plane of the Poincaré section through the saddle on the boundary: verdicts, the stable manifold, and nearly critical
+kicks.
+
+The plane is spanned by the saddle's unstable direction and its slowest stable one, right eigenvectors $r$ of the return map's
+derivative. With the left eigenvectors $l$, a state $x$ of the section has the coordinates $l · (x - x_s)$, relative to the size
+of the saddle. The stable manifold meets the plane where verdicts change along the unstable direction; at the saddle this curve
+is tangent to the stable direction.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..cycles.own_coordinates import in_own_coordinates
+from ..foundation import arguments
+from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
+from ..io.datasets import labelled
+from ..maps.states import verdicts_from
+from ..model.load import Pulse
+from ..model.scene import Scene
+from ..section.about_sliding import sliding_state
+from ..steppers.event_exact import EventExact
+from ..verdicts.verdict import Verdict
+from .critical import critical_perturbation
+from .response import MOST_CROSSINGS, Crossings, directions_of, kicked
+from .stable_manifold import Saddle, critical_kick, saddle_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Relative distance of the two kicks shown from the critical one.
+BESIDE = 1e-7
+# A crossing is shown if the part of its distance from the saddle normal to the plane is less than this share.
+FLAT = 0.5
+# Rounds of narrowing down the manifold, and states inside a bracket in each.
+ROUNDS, INSIDE = 2, 15
+
+
+@reported("boundary section")
+@in_own_coordinates
+@in_double_precision
+def boundary_section(
+    scene: Scene,
+    *,
+    reach: float = 0.15,
+    points: int = 41,
+    p_range: tuple[float, float] = (1.0, 5.0),
+    progress: bool | None = None,
+) -> "xr.Dataset":
+    """The boundary between sliding and squeal in a plane of the Poincaré section through the saddle cycle.
+
+        fj.plot.boundary_section(fj.boundary_section(scene))
+
+    **Arguments:** `scene`, whose load is a `Pulse`; `reach`, half the width of the plane, relative to the size of the saddle;
+    `points`, the number of states on each axis; `p_range`, the range in which the critical kick is sought.
+
+    **Returns:** a dataset with
+
+    - `verdict` over `stable` and `unstable`, the coordinates in the plane, relative to the size of the saddle, which is at
+      zero;
+    - `manifold` over `stable`: the coordinate `unstable` at which verdicts change, NaN where they do not;
+    - `path` over `side` ("slides", "squeals"), `crossing` and `direction` ("unstable", "stable"): crossings of the section by
+      the motions after kicks just below and just above the critical one, projected onto the plane; NaN far from it;
+    - the attributes `p_crit` and `multiplier`, the saddle's unstable one.
+
+    **Raises:** `ValueError` if no critical kick lands on the stable manifold of a saddle cycle.
+
+    **Example:**
+
+        >>> plane = fj.boundary_section(scene.replace(belt_speed=1.0), points=9, p_range=(1.0, 1.3))  # doctest: +SLOW
+        >>> bool(abs(plane["manifold"].sel(stable=0.0)) < 0.05)  # doctest: +SLOW
+        True
+    """
+    import xarray as xr
+
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose critical p leads to the boundary")
+    arguments.real_number("reach", reach, above=0)
+    arguments.whole_number("points", points, minimum=3)
+    found = critical_perturbation(scene, p_range=p_range, progress=False).isel(belt_speed=0)
+    bracket = float(found["p_crit_low"]), float(found["p_crit_high"])
+    critical = critical_kick(scene, bracket, ()) if np.all(np.isfinite(bracket)) else None
+    weights = np.asarray(scene.structure.weights)
+    saddle = None if critical is None else saddle_of(critical.saddle, weights)
+    if critical is None or saddle is None:
+        raise ValueError(
+            "No critical kick in the range lands on the stable manifold of a saddle cycle. Change `p_range`, or the scene."
+        )
+    right, left = _directions(saddle, weights)
+    origin = weights * np.asarray(saddle.closed.point.y)
+    axis, size = np.linspace(-reach, reach, points), np.linalg.norm(origin)
+    rest = np.asarray(sliding_state(scene, scene.load.final))
+
+    def verdicts(stable: np.ndarray, unstable: np.ndarray) -> np.ndarray:
+        places = unstable.reshape(-1, 1) * right[0] + stable.reshape(-1, 1) * right[1]
+        return verdicts_from(scene, (origin + size * places) / weights + rest, "section").reshape(stable.shape)
+
+    stable, unstable = np.meshgrid(axis, axis, indexing="ij")
+    verdict = verdicts(stable, unstable)
+    along_p = directions_of(scene, ("p",))
+    sides = [
+        kicked(scene.replace(p=critical.p * (1 + by)), EventExact(), along_p, MOST_CROSSINGS)
+        for by in (-BESIDE, BESIDE)
+    ]
+    paths = [_path(side, weights, origin, left / size, right * size) for side in sides]
+    longest = max(map(len, paths))
+    padded = [np.pad(path, ((0, longest - len(path)), (0, 0)), constant_values=np.nan) for path in paths]
+    dataset = xr.Dataset(
+        {
+            "verdict": (("stable", "unstable"), verdict.astype(np.int8)),
+            "manifold": ("stable", _manifold(axis, verdict, verdicts)),
+            "path": (("side", "crossing", "direction"), np.stack(padded)),
+        },
+        coords={"stable": axis, "unstable": axis, "side": ["slides", "squeals"], "direction": ["unstable", "stable"]},
+    )
+    return labelled(dataset, scene).assign_attrs(p_crit=critical.p, multiplier=saddle.multiplier)
+
+
+def _directions(saddle: Saddle, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unstable and the slowest stable direction (rows), of length one, and the rows that give a state's coordinates."""
+    scaled = weights[:, None] * saddle.closed.jacobian / weights
+    values, right = np.linalg.eig(scaled)
+    order = np.argsort(-np.abs(values))[:2]
+    chosen = right[:, order]
+    # Of a complex pair the real part is enough, because the plane only serves for a picture.
+    basis = np.real(chosen / np.linalg.norm(chosen, axis=0))
+    basis = basis / np.linalg.norm(basis, axis=0)
+    unstable = saddle.left / (saddle.left @ basis[:, 0])
+    beside = basis[:, 1] - (unstable @ basis[:, 1]) * basis[:, 0]
+    beside = beside / np.linalg.norm(beside)
+    # The second row is orthogonal to the first direction.
+    second = beside - (beside @ basis[:, 0]) * unstable
+    return np.stack([basis[:, 0], beside]), np.stack([unstable, second / (second @ beside)])
+
+
+def _path(path: Crossings, weights: np.ndarray, origin: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The crossings in the plane's coordinates, in order; NaN while they are far from the plane."""
+    away = weights * path.y[: path.count] - origin
+    inside = away @ left.T
+    beside = np.linalg.norm(away - inside @ right, axis=-1)
+    return np.where((beside < FLAT * np.linalg.norm(away, axis=-1))[:, None], inside, np.nan)
+
+
+def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
+    """The coordinate at which each row of verdicts changes between sliding and a limit cycle, narrowed down; if there are
+    several changes, the one closest to zero.
+    """
+    low, high = np.full((2, len(axis)), np.nan)
+    for row, values in enumerate(verdict):
+        flips = np.flatnonzero(_changes(values))
+        if len(flips):
+            place = flips[np.argmin(np.abs(axis[flips] + axis[flips + 1]))]
+            low[row], high[row] = axis[place], axis[place + 1]
+    known = np.flatnonzero(np.isfinite(low))
+    for _ in range(ROUNDS if len(known) else 0):
+        inner = np.linspace(low[known], high[known], INSIDE + 2, axis=1)
+        found = verdicts(np.broadcast_to(axis[known, None], inner.shape), inner)
+        changes = _changes(found)
+        place, rows = np.argmax(changes, axis=1), np.arange(len(known))
+        at = changes[rows, place]
+        low[known] = np.where(at, inner[rows, place], low[known])
+        high[known] = np.where(at, inner[rows, place + 1], high[known])
+    return 0.5 * (low + high)
+
+
+def _changes(verdict: np.ndarray) -> np.ndarray:
+    """Between which neighbours on the last axis the verdict changes from sliding to a limit cycle, or back."""
+    pair = {int(Verdict.SLIDING), int(Verdict.LIMIT_CYCLE)}
+    decided = np.isin(verdict, list(pair))
+    return (verdict[..., 1:] != verdict[..., :-1]) & decided[..., 1:] & decided[..., :-1]

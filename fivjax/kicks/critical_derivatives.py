@@ -1,0 +1,65 @@
+"""Critical kicks to rounding, with kind and derivatives, and with trajectories on both sides that prove them."""
+
+import numpy as np
+
+from ..maps.crossing import Crossing
+from ..model.scene import Scene
+from ..verdicts.verdict import Verdict
+from .stable_manifold import Critical, critical_kick
+from .touching import GrazingKick, grazing_kick
+
+KINDS = ("none", "manifold", "grazing")
+# Relative distance of the two proving trajectories from a critical kick.
+BESIDE = 1e-9
+
+NO_CHANGE = "no change from sliding to a limit cycle lies in the range"
+NO_SADDLE = (
+    "the motion after the critical kick passes no saddle cycle that closes and touches no other contact mode, or the kind of "
+    "the border changes here"
+)
+NOT_PROVED = "the verdicts on either side contradict what Newton's method found: the kind of the border changes here"
+
+
+def differentiable(scene: Scene) -> tuple[str, ...]:
+    """Names of the parameters by which a critical kick is differentiated: all scalar ones but p itself."""
+    return tuple(name for name, value in scene.parameters.items() if np.ndim(value) == 0 and name != "p")
+
+
+def with_derivatives(
+    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: Crossing
+) -> tuple[Crossing, dict[str, np.ndarray]]:
+    """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
+
+    `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p.
+    """
+    names, rows = differentiable(scene), len(found.middle)
+    kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
+    slopes, trajectories = np.full((rows, len(names)), np.nan), np.zeros(rows, int)
+    middle, low, high = found.middle.copy(), found.low.copy(), found.high.copy()
+    left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
+    why[left] = NO_SADDLE
+    # A motion that passes no saddle, or one that is not on the boundary, may just touch another contact mode.
+    for name, method in ((KINDS[1], critical_kick), (KINDS[2], grazing_kick)):
+        critical: dict[int, Critical | GrazingKick] = {}
+        for row in left:
+            here = scene.replace(**{key: float(column[row]) for key, column in columns.items()})
+            answer = method(here, (found.low[row], found.high[row]), names)
+            if answer is not None:
+                critical[row] = answer
+        known = np.array(list(critical), int)
+        if not len(known):
+            continue
+        exact = np.array([critical[row].p for row in known])
+        beside = exact[:, None] * (1 + BESIDE * np.array([-1.0, 1.0]))
+        chosen = {key: column[known] for key, column in columns.items()}
+        proved = np.all(verdicts(chosen, beside, "both sides") == [Verdict.SLIDING, Verdict.LIMIT_CYCLE], axis=1)
+        why[known[~proved]] = NOT_PROVED
+        held = known[proved]
+        kind[held], why[held], middle[held] = name, "", exact[proved]
+        low[held], high[held] = beside[proved, 0], beside[proved, 1]
+        for row in held:
+            trajectories[row] = critical[row].trajectories
+            slopes[row] = [critical[row].d_p[key] for key in names]
+        left = np.setdiff1d(left, held)
+    answers = {"kind": kind, "d_p_crit": slopes, "why_none": why.astype(str), "newton_trajectories": trajectories}
+    return found._replace(middle=middle, low=low, high=high), answers

@@ -1,0 +1,274 @@
+r"""Perturbations of steady sliding whose smallest size is sought: initial states, and histories of the load.
+
+Both are vectors $u$ with a norm. While the contact slides under constant friction, both change the two quantities that end
+sliding (normal force and slip speed) linearly: the change at the time $t$ is $κ(t) · u$. So no $u$ with a norm below the margin
+over $\sup_t |κ(t)|_*$, in the dual norm, ever ends sliding. The supremum is bounded between instants, too.
+"""
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ..contact import Contact, Status
+from ..foundation.kept_programs import kept
+from ..linear.linearisation import LinearSliding, linear_sliding
+from ..model.scene import Scene
+from ..model.sliding import sliding_states
+from ..section.about_sliding import mechanics_about_sliding
+from ..section.crossings import MOST_SEGMENTS
+from ..steppers.core import follow
+from ..steppers.event_exact import EventExact, for_derivatives
+from ..verdicts.sliding_proof import SlidingModes, sliding_modes
+
+# Instants per period of the fastest mode, during a history and afterwards.
+FINE, COARSE = 1500, 128
+# Instants evaluated at a time, and histories followed at a time.
+CHUNK, SIDE_BY_SIDE = 4096, 64
+MOST_INSTANTS = 2_000_000
+
+Vectors = Float[np.ndarray, "k m"]
+
+
+class Certificate(NamedTuple):
+    """A norm below which every perturbation slides for ever, and the shapes (of norm one) that come closest to ending
+    sliding.
+    """
+
+    size: float
+    shapes: Vectors
+
+
+class StableSliding(NamedTuple):
+    """The sliding motion of one scene in modal coordinates."""
+
+    modes: SlidingModes
+    linear: LinearSliding
+    shift: Complex[np.ndarray, " k"]  # shift of the equilibrium by the load, in modal coordinates
+    signals: tuple[tuple[np.ndarray, float], ...]  # shares of the modes in slip and in pressing, and their margins
+
+
+class Perturbation(Protocol):
+    """A kind of perturbation, with the functions that a search for the smallest one needs."""
+
+    sliding: StableSliding
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]: ...
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """The vector of norm one with the largest scalar product with a gradient."""
+        ...
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        """Deviations from sliding at the end of the perturbation."""
+        ...
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        """The gradient by u, from the gradient by the state."""
+        ...
+
+    def certificate(self) -> Certificate: ...
+
+
+def stable_sliding(scene: Scene) -> StableSliding:
+    """Sliding in modal coordinates, without the leading axis of groups.
+
+    **Raises:** `ValueError` if steady sliding does not exist or is not stable.
+    """
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], _linear(scene))
+    modes = sliding_modes(batch)
+    if not bool(modes.stable[0]) or not bool(batch.exists[0]):
+        raise ValueError("Argument `scene` must slide steadily and stably, or no kick is needed to make it squeal.")
+    own: SlidingModes = jax.tree.map(lambda leaf: leaf[0], modes)
+    linear = own.linear
+    states = sliding_states(scene.structure.size, scene.structure.normal)
+    shift = np.asarray(own.to_modal) @ np.asarray(linear.equilibrium)[states].astype(complex)
+    signals = (own.slip, float(linear.slip_margin)), (own.pressing, float(linear.pressing_margin))
+    return StableSliding(own, linear, shift, signals)
+
+
+@kept
+def _linear(scene: Scene) -> LinearSliding:
+    return linear_sliding(scene)
+
+
+class InitialStates:
+    """Deviations from sliding of a contact that stays closed; the norm is the square root of their energy, in √J."""
+
+    def __init__(self, scene: Scene):
+        self.scene, n = scene, scene.structure.size
+        self.sliding = stable_sliding(scene)
+        self.places = sliding_states(n, scene.structure.normal)
+        free = self.places[: len(self.places) // 2]
+        energy = np.zeros((2 * len(free), 2 * len(free)))
+        energy[: len(free), : len(free)] = np.asarray(scene.structure.stiffness)[np.ix_(free, free)]
+        energy[len(free) :, len(free) :] = np.asarray(scene.structure.mass)[np.ix_(free, free)]
+        # The energy is half of z · energy z; `root` times a unit vector is a state with an energy of one joule.
+        self.energy = 0.5 * energy
+        self.root = np.linalg.inv(np.linalg.cholesky(self.energy)).T
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
+        return np.sqrt(np.einsum("ki,ij,kj->k", u, self.energy, u))
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        along = gradient @ self.root
+        return self.root @ along / np.linalg.norm(along)
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        full = np.zeros((len(u), 2 * self.scene.structure.size))
+        full[:, self.places] = u
+        return full
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        del u
+        return gradient[self.places]
+
+    def certificate(self) -> Certificate:
+        modes = self.sliding.modes
+        to_modal, rates = np.asarray(modes.to_modal) @ self.root, np.asarray(modes.eigenvalues)
+        # A bound on the growth rate of the energy for any state, and so on changes between two instants.
+        inner = np.linalg.solve(self.root, np.asarray(self.sliding.linear.matrix) @ self.root)
+        growth = max(float(np.max(np.linalg.eigvalsh(0.5 * (inner + inner.T)))), 0.0)
+        step = 2 * np.pi / (COARSE * np.max(np.abs(rates)))
+        size, shapes = np.inf, []
+        for shares, margin in self.sliding.signals:
+            rows = np.asarray(shares)[:, None] * to_modal
+            sizes, vectors = _later(rows, rates, step, 0.0, lambda rows: np.linalg.norm(rows, axis=-1))
+            size = min(size, margin / (float(np.max(sizes)) * np.exp(growth * step)))
+            chosen = vectors[_highest(sizes)]
+            shapes.append(-(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)) @ self.root.T)
+        return Certificate(size, np.concatenate(shapes))
+
+
+class Histories:
+    """Factors on the load, minus one, in equal pieces of a time; the norm is the largest absolute value."""
+
+    def __init__(self, scene: Scene, pieces: int, time: float):
+        self.scene, self.pieces, self.time = scene, pieces, time
+        self.sliding = stable_sliding(scene)
+
+    def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
+        return np.max(np.abs(u), axis=-1)
+
+    def steepest(self, gradient: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        return np.sign(gradient)
+
+    def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
+        found = []
+        for start in range(0, len(u), SIDE_BY_SIDE):
+            # Padded with copies, so that one size is compiled.
+            rows = np.minimum(np.arange(start, start + SIDE_BY_SIDE), len(u) - 1)
+            found.append(np.asarray(_after(self.scene, EventExact(), jnp.asarray(u[rows]), self.time)))
+        return np.concatenate(found)[: len(u)]
+
+    def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
+        return gradient @ np.asarray(_after_with_jacobian(self.scene, EventExact(), jnp.asarray(u), self.time))
+
+    def certificate(self) -> Certificate:
+        rates = np.asarray(self.sliding.modes.eigenvalues)
+        edges, fastest = np.linspace(0.0, self.time, self.pieces + 1), np.max(np.abs(rates))
+        count = int(np.ceil(FINE * fastest * self.time / (2 * np.pi * self.pieces)))
+        inside = np.linspace(0.0, self.time / self.pieces, count + 1)
+        size, shapes = np.inf, []
+        for row, (shares, margin) in enumerate(self.sliding.signals):
+            own = np.asarray(shares) * self.sliding.shift
+            steady = float(np.real(np.sum(own)))
+            # The direct effect of the load on the normal force, while it lasts.
+            direct = margin - steady if row == 1 else 0.0
+
+            def response(t, own=own, jump=direct + steady):
+                """The response to a load that is doubled at t = 0."""
+                return jump - np.real(np.exp(np.multiply.outer(t, rates)) @ own)
+
+            def bending(t, own=own):
+                return -np.real(np.exp(np.multiply.outer(t, rates)) @ (own * rates**2))
+
+            vectors, second = (
+                np.concatenate([self._of_pieces(of, piece, edges, inside) for piece in range(self.pieces)])
+                for of in (response, bending)
+            )
+            during = np.sum(np.abs(vectors), axis=-1)
+            crude = 2 * self.pieces * float(np.sum(np.abs(own) * np.abs(rates) ** 4))
+            peak = _peak(during, np.sum(np.abs(second), axis=-1), crude, inside[1] - inside[0])
+            rows = own[:, None] * (np.exp(np.outer(rates, -edges[1:])) - np.exp(np.outer(rates, -edges[:-1])))
+            step = 2 * np.pi / (COARSE * fastest)
+            sizes, later = _later(rows, rates, step, self.time, _sum_of_sizes)
+            bends, _ = _later(rows * rates[:, None] ** 2, rates, step, self.time, _sum_of_sizes)
+            ends = np.exp(rates.real * self.time)[:, None]
+            crude = float(np.sum(np.abs(rows) * ends * np.abs(rates[:, None]) ** 4))
+            size = min(size, margin / max(peak, _peak(sizes, bends, crude, step)))
+            for values, rows in ((during, vectors), (sizes, later)):
+                shapes.append(-np.sign(rows[_highest(values)]))
+        shapes = np.concatenate(shapes)
+        return Certificate(float(size), np.where(shapes == 0, 1.0, shapes))
+
+    def _of_pieces(self, of, piece: int, edges: np.ndarray, inside: np.ndarray) -> np.ndarray:
+        """The contribution of each piece of the history so far during one piece, from the response to a step."""
+        since = edges[piece] + inside[:, None] - edges[: piece + 1]
+        before = np.arange(piece + 1) < piece
+        ended = np.where(before, of(np.where(before, since - self.time / self.pieces, 0.0)), 0.0)
+        return np.pad(of(since) - ended, ((0, 0), (0, self.pieces - piece - 1)))
+
+
+def _peak(sizes: np.ndarray, bends: np.ndarray, crude: float, step: float) -> float:
+    """A bound between instants, too: the distance from the chord is bounded by the second derivative, whose values between
+    instants are bounded in the same way by a crude bound on the fourth.
+    """
+    chord = step**2 / 8
+    return float(np.max(sizes)) + chord * (float(np.max(bends)) + chord * crude)
+
+
+def _sum_of_sizes(rows: np.ndarray) -> np.ndarray:
+    return np.sum(np.abs(rows), axis=-1)
+
+
+def _later(rows: np.ndarray, rates: np.ndarray, step: float, begin: float, norm) -> tuple[np.ndarray, np.ndarray]:
+    """Responses and their norms at equally spaced instants from `begin` on, until later ones must be smaller than these."""
+    whole = float(np.sum(norm(np.abs(rows)) * np.exp(rates.real * begin)))
+    sizes, vectors, most, count = [], [], 0.0, 0
+    while not count or np.max(np.exp(rates.real * step * count)) * whole >= most:
+        if count > MOST_INSTANTS:
+            raise ValueError(
+                "Steady sliding decays too slowly here for a certified bound. Go further from the critical friction."
+            )
+        t = begin + step * np.arange(count, count + CHUNK)
+        found = np.real(np.exp(np.outer(t, rates)) @ rows)
+        vectors.append(found)
+        sizes.append(norm(found))
+        most, count = max(most, float(np.max(sizes[-1]))), count + CHUNK
+    return np.concatenate(sizes), np.concatenate(vectors)
+
+
+def _highest(sizes: np.ndarray) -> list[int]:
+    """The indices at which a norm is largest: in all, in the first half up to that index, and well after it."""
+    top = int(np.argmax(sizes))
+    parts = ((0, len(sizes)), (0, top // 2), (min(top + top // 2 + 1, len(sizes)), len(sizes)))
+    return [low + int(np.argmax(sizes[low:high])) for low, high in parts if high > low]
+
+
+@kept
+def _after(scene: Scene, stepper: EventExact, factors, time):
+    return jax.vmap(lambda one: _after_one(scene, stepper, one, time))(factors)
+
+
+@kept
+def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
+    return jax.jacfwd(lambda one: _after_one(scene, stepper, one, time))(factors)
+
+
+def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
+    """The state after a history of the load that began in steady sliding."""
+    mechanics, n = mechanics_about_sliding(scene), scene.structure.size
+    stepper = for_derivatives(stepper)
+
+    def piece(carry, factor):
+        y, contact = carry
+        # Loads are deviations from the final load.
+        more, part = factor * scene.load.final, time / len(factors)
+        after = follow(stepper, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
+        return (after.y, after.contact), None
+
+    sliding = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.sign(scene.belt_speed))
+    return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0]

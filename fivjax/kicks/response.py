@@ -1,0 +1,109 @@
+"""The motion after a kick: its crossings of the section, and their derivatives in the parameters of the scene."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .. import contact as physics
+from ..branches.multiple_shooting import parameter_direction
+from ..contact import Contact, Status
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.precision import known_to_numpy
+from ..model.load import Pulse
+from ..model.scene import Scene
+from ..section.about_sliding import longest_return, mechanics_about_sliding
+from ..section.crossings import How, Kick, Point, to_crossing
+from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.kernel_scope import has_kernel
+
+# The most crossings of the section that are kept.
+MOST_CROSSINGS = 1024
+
+
+class Crossings(NamedTuple):
+    """The crossings of the section after a kick, in order; rows beyond `count` are empty."""
+
+    y: Float[np.ndarray, "k state"]  # deviations from sliding
+    y_parameter: Float[np.ndarray, "d k state"]  # their derivatives along directions of the parameters
+    status: Int[np.ndarray, " k"]
+    direction: Float[np.ndarray, " k"]
+    events: Int[np.ndarray, " k"]  # contact events up to the crossing
+    count: int
+
+
+def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
+    """The scene's derivatives by several of its parameters, stacked along a first axis."""
+    each = [parameter_direction(scene, name) for name in names]
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
+
+
+def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
+    """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many."""
+    contact = Contact(np.int32(Status.SLIDE), np.sign(float(scene.belt_speed)))
+    return _followed(scene, stepper, directions, Point(np.zeros(2 * scene.structure.size), contact), None, crossings)
+
+
+def returned(scene: Scene, stepper: EventExact, directions: Scene, point: Point, crossings: int) -> Crossings:
+    """Crossings of the motion from a point of the section, without a kick."""
+    quiet = scene.replace(p=1.0, duration=0.0)
+    return _followed(quiet, stepper, directions, point, None, crossings)
+
+
+def started(
+    scene: Scene, stepper: EventExact, start: Point, directions: Float[np.ndarray, "d state"], crossings: int
+) -> Crossings:
+    """Crossings of the motion from any state, without a kick, with derivatives along directions of that state."""
+    quiet = scene.replace(p=1.0, duration=0.0)
+    fixed = jax.tree.map(lambda leaf: np.zeros((len(directions), *np.shape(leaf))), quiet)
+    return _followed(quiet, stepper, fixed, start, directions, crossings)
+
+
+def _followed(
+    scene: Scene, stepper: EventExact, directions: Scene, start: Point, of_start, crossings: int
+) -> Crossings:
+    by_kernel, wanted = has_kernel(scene, stepper), crossings
+    if not by_kernel:
+        # XLA compiles a program for each number of rows.
+        wanted = MOST_CROSSINGS
+    args = How(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
+    along = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
+    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), _count(directions))), args)
+    moving = still[0], along, still[2], still[3]
+    if of_start is not None:
+        moving = eqx.tree_at(lambda args: args[2].y, moving, of_start.T)
+    (end, rows), (_, slopes) = _motion_after_kick.derived(args, np.arange(1.0, wanted + 1), moving, by_kernel=by_kernel)
+    at, contact = rows.point, rows.point.contact
+    return Crossings(
+        at.y, np.moveaxis(slopes.point.y, -1, 0), contact.status, contact.direction, rows.events, int(end.crossed)
+    )
+
+
+def _count(directions) -> int:
+    return len(jax.tree.leaves(directions)[0])
+
+
+def _after_kick(args, numbers, adapted=lambda method: method):
+    how, scene, start, crossings = args
+    load = scene.load
+    assert isinstance(load, Pulse)
+    mechanics = mechanics_about_sliding(scene)
+    # Loads are deviations from the final load.
+    more = (load.p - 1.0) * load.force
+    contact = physics.status_from_forces(mechanics, more, start.y)
+    quiet = load.duration <= 0
+    contact = jax.tree.map(lambda own, other: jnp.where(quiet, own, other), start.contact, contact)
+    longest = longest_return(scene) * crossings
+    kick, start = Kick(more, load.duration), Point(start.y, contact)
+    return to_crossing(adapted(how.method), mechanics, start, crossings, longest, numbers, kick)
+
+
+def _derived_after_kick(args, numbers):
+    return _after_kick(args, numbers, for_derivatives)
+
+
+# Of (how, scene, start, crossings).
+_motion_after_kick = KernelFunction(_after_kick, _derived_after_kick)

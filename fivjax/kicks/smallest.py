@@ -1,0 +1,290 @@
+r"""The smallest kick found that leads to squeal, and a bound below which every kick is proved to slide.
+
+While the contact slides under constant friction the motion is linear. With $A$ its state matrix and $z_∞$ the shift of the
+equilibrium by the load itself, the deviation during a kick is $(p - 1)(1 - e^{At}) z_∞$, and after one of duration $d$ it is
+$(p - 1) e^{A(t - d)} (1 - e^{Ad}) z_∞$. No contact event happens while slip speed and normal force stay positive, and both
+are affine in the deviation. Let $P(d)$ be a bound on the change of one of them over the whole future after a kick with
+$p - 1 = 1$ (the bound that verdicts use, `envelope_peak`). Then every kick with $p - 1$ below the least ratio of margin to
+$P(d)$, over all durations, slides for ever. Between two durations $h$ apart, $P$ is at most the larger value plus $h L / 2$,
+with $L$ a bound on the derivative.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..cycles.own_coordinates import in_own_coordinates
+from ..foundation import arguments
+from ..foundation.digits import apart
+from ..foundation.kept_programs import kept
+from ..foundation.precision import in_double_precision
+from ..foundation.progress import reported
+from ..model.load import Pulse
+from ..model.scene import Scene, refuse_several_contacts
+from ..verdicts.sliding_proof import envelope_peak
+from .critical import critical_perturbation
+from .perturbations import stable_sliding
+from .smallest_perturbation import NoSquealingKick, SmallestPerturbation, smallest_history, smallest_state
+from .stable_manifold import Saddle, critical_kick, saddle_of
+
+# Number of durations at which the bound is evaluated, and of those tried as starts of the search.
+GRID, STARTS = 4096, 24
+# Number of searches, from the starts with the smallest p_crit.
+DESCENTS = 4
+# Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
+MOST_STEPS, LEVEL = 24, 1e-9
+OVER = ("p", "duration", "start", "state", "history")
+
+
+class SmallestKick(NamedTuple):
+    """The smallest kick found, and a bound below which every kick is proved to slide.
+
+    **Example:**
+
+        >>> kick = fj.SmallestKick(p=1.5, duration=0.1, certified=1.25, proved_low=1.49, proved_high=1.51)
+        >>> kick.ratio
+        0.5
+    """
+
+    p: float  # of the smallest kick found that leads to a limit cycle
+    duration: float  # of that kick, s
+    certified: float  # every kick with p between 1 and this slides for ever, for all durations within the bounds
+    proved_low: float  # a kick of the same duration with this p was proved to slide,
+    proved_high: float  # and one with this p to end on a limit cycle
+
+    @property
+    def ratio(self) -> float:
+        """The ratio of the certified p - 1 to that found; 1 if there were no gap."""
+        return (self.certified - 1.0) / (self.p - 1.0)
+
+    def __str__(self) -> str:
+        found, certified = apart(self.p, self.certified, digits=9)
+        return (
+            f"smallest kick found: p = {found} for {self.duration:.6g} s leads to a limit cycle\n"
+            f"certified: every kick with p below {certified} slides for ever\n"
+            f"gap: {self.p - self.certified:.3g}; the bound is {100 * self.ratio:.3g} % of what was found"
+        )
+
+    __repr__ = __str__
+
+
+@overload
+def smallest_kick(
+    scene: Scene,
+    over: Literal["state", "history"],
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+    progress: bool | None = None,
+) -> SmallestPerturbation: ...
+
+
+@overload
+def smallest_kick(
+    scene: Scene,
+    over: Sequence[str] = ("p", "duration"),
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+    progress: bool | None = None,
+) -> SmallestKick: ...
+
+
+@reported("smallest kick")
+@in_own_coordinates
+@in_double_precision
+def smallest_kick(
+    scene: Scene,
+    over: Sequence[str] = ("p", "duration"),
+    bounds: dict[str, tuple[float, float]] | None = None,
+    *,
+    p_step: float = 0.01,
+    pieces: int = 16,
+    progress: bool | None = None,
+) -> "SmallestKick | SmallestPerturbation":
+    """The smallest perturbation that leads to a limit cycle, and a certified bound below which none does.
+
+        print(fj.smallest_kick(scene))                  # the p of a kick, over its duration
+        print(fj.smallest_kick(scene, over="state"))    # the energy of an initial state
+        print(fj.smallest_kick(scene, over="history"))  # how far a load may leave its value
+
+    **Arguments:**
+
+    - `scene`, whose load is a `Pulse` and whose friction is constant.
+    - `over`: the free parameters of the kick: "p" always, "duration", and "start" (which has no effect, because steady sliding
+      does not change with time). Or "state": a deviation from steady sliding of a sliding contact, without a kick; its size is
+      the square root of its energy. Or "history": a load that is constant in each of `pieces` equal pieces of time, and has its
+      final value afterwards.
+    - `bounds`: by name; unless given, p from 1 to 5 and durations up to twice the scene's. A history lasts as long as the
+      longest duration in the bounds, unless given that of the scene.
+    - `p_step`: the distance of the scanned values of p, as in `critical_perturbation`. A narrower interval of kicks that squeal
+      is missed.
+    - `pieces`: the number of pieces of a history.
+
+    **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it shows the gap.
+
+    **Raises:** `ValueError` for a load without a pulse, friction that varies with slip speed, sliding that is not stable, and
+    invalid names or bounds; `NoSquealingKick` if nothing that was tried leads to a limit cycle.
+
+    **Example:**
+
+        >>> kick = fj.smallest_kick(scene)  # doctest: +SLOW
+        >>> bool(1 < kick.certified < kick.p)
+        True
+    """
+    arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
+    arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
+    refuse_several_contacts(scene.structure, "`smallest_kick`")
+    if not scene.friction.constant:
+        raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
+    if over in ("state", "history"):
+        return _other(scene, str(over), bounds or {}, pieces)
+    free = (over,) if isinstance(over, str) else tuple(over)
+    for name in free:
+        arguments.one_of("over", name, OVER)
+    if "p" not in free:
+        raise ValueError(f'Argument `over` must hold "p", whose smallest value is sought, but is {free!r}.')
+    own = float(scene.load.duration)
+    given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **(bounds or {})}
+    unknown = sorted(set(given) - set(OVER))
+    if unknown:
+        raise ValueError(
+            f"Argument `bounds` must name what of a kick is free ({', '.join(OVER)}), but has {unknown[0]!r}."
+        )
+    for name, pair in given.items():
+        arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
+        arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
+    shortest, longest = given["duration"] if "duration" in free else (own, own)
+    certified = 1.0 + certified_excess(scene, float(shortest), float(longest))
+    starts = _nominated(scene, float(shortest), float(longest)) if "duration" in free else np.array([own])
+    scanned = critical_perturbation(
+        scene, duration=starts, p_range=tuple(map(float, given["p"])), p_step=p_step, progress=False
+    )
+    if not np.any(np.isfinite(scanned["p_crit"])):
+        raise NoSquealingKick(
+            f"No kick with p up to {given['p'][1]:g} that was tried leads to a limit cycle. Raise `bounds`, or scan more "
+            f"finely."
+        )
+    best = int(np.nanargmin(scanned["p_crit"]))
+    row = scanned.isel(duration=best)
+    p, duration = float(row["p_crit"]), float(starts[best])
+    if "duration" in free:
+        order = np.argsort(np.where(np.isfinite(scanned["p_crit"]), scanned["p_crit"], np.inf))[:DESCENTS]
+        tried = [(float(scanned["p_crit"][k]), float(starts[k])) for k in order if np.isfinite(scanned["p_crit"][k])]
+        p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for one in tried)
+    at = critical_perturbation(
+        scene, duration=[duration], p_range=(p - 1e-4, p + 1e-4), p_step=1e-4, derivatives=True, progress=False
+    ).isel(duration=0)
+    if np.isfinite(at["p_crit"]):
+        row, p = at, float(at["p_crit"])
+    else:
+        duration, p = float(starts[best]), float(row["p_crit"])
+    return SmallestKick(p, duration, certified, float(row["p_crit_low"]), float(row["p_crit_high"]))
+
+
+def _other(scene: Scene, over: str, bounds: dict[str, tuple[float, float]], pieces: int) -> SmallestPerturbation:
+    """The smallest initial state or history of the load."""
+    arguments.whole_number("pieces", pieces, minimum=1)
+    allowed = ("duration",) if over == "history" else ()
+    unknown = sorted(set(bounds) - set(allowed))
+    if unknown:
+        what = "the duration alone" if allowed else "nothing"
+        raise ValueError(f"Argument `bounds` must name {what} where {over!r} is free, but has {unknown[0]!r}.")
+    if over == "state":
+        return smallest_state(scene)
+    time = bounds.get("duration", (0.0, float(scene.load.duration)))[1]
+    arguments.real_number("bounds['duration'][1]", time, above=0)
+    return smallest_history(scene, pieces, float(time))
+
+
+def _descended(scene: Scene, p: float, duration: float, shortest: float, longest: float) -> tuple[float, float]:
+    """From a critical kick to the duration at which p_crit has a local minimum, or to a bound of the durations."""
+    saddle: Saddle | None = None
+
+    def critical(d: float, near: float):
+        nonlocal saddle
+        found = critical_kick(scene.replace(duration=d), (near * (1 - 1e-4), near * (1 + 1e-4)), ("duration",), saddle)
+        if found is not None and saddle is None:
+            saddle = saddle_of(found.saddle, np.asarray(scene.structure.weights))
+        return found
+
+    here = critical(duration, p)
+    step = (longest - shortest) / (4 * STARTS)
+    for _ in range(MOST_STEPS):
+        if here is None or abs(here.d_p["duration"]) * duration < LEVEL * (here.p - 1):
+            break
+        slope = here.d_p["duration"]
+        d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6), longest))
+        following = critical(d, here.p + slope * (d - duration)) if d != duration else None
+        if following is None or following.p >= here.p:
+            step *= 0.25
+            if step < 1e-9 * longest:
+                break
+            continue
+        turned = following.d_p["duration"] * slope < 0
+        # Beyond the minimum: the slopes on both sides tell where it is.
+        share = abs(slope) / (abs(slope) + abs(following.d_p["duration"]))
+        step = abs(d - duration) * (1 - share if turned else 1.0)
+        duration, here = d, following
+    return (p, duration) if here is None else (here.p, duration)
+
+
+def _nominated(scene: Scene, shortest: float, longest: float) -> np.ndarray:
+    """Durations to start from: those after which linear sliding comes closest to its end, and as many evenly spaced ones."""
+    durations = np.linspace(shortest, longest, GRID)
+    reached = _excess_by_duration(scene, durations)
+    lowest = np.flatnonzero((reached[1:-1] <= reached[:-2]) & (reached[1:-1] < reached[2:])) + 1
+    lowest = lowest[np.argsort(reached[lowest])][: STARTS // 2]
+    even = np.linspace(shortest, longest, STARTS // 2 + 1)[1:]
+    return np.unique(np.concatenate([durations[lowest], even]))
+
+
+def _excess_by_duration(scene: Scene, durations: np.ndarray) -> np.ndarray:
+    """The p - 1 at which linear sliding ends after a kick, at these durations (without a bound between them)."""
+    sliding = stable_sliding(scene)
+    modes = sliding.modes
+    shapes = 1 - np.exp(np.outer(durations, modes.eigenvalues))
+    # A kick of zero duration causes no motion.
+    with np.errstate(divide="ignore"):
+        reached = [
+            margin / _peaks(shapes * (shares * sliding.shift), modes.envelope) for shares, margin in sliding.signals
+        ]
+    return np.min(reached, axis=0)
+
+
+@in_double_precision
+def certified_excess(scene: Scene, shortest: float, longest: float) -> float:
+    """A p - 1 below which no kick with a duration between these (s) has any contact event: it slides for ever."""
+    sliding = stable_sliding(scene)
+    rates, modal, envelope = sliding.modes.eigenvalues, sliding.shift, sliding.modes.envelope
+    least = np.inf
+    for row, (shares, margin) in enumerate(sliding.signals):
+        steady = float(np.real(np.sum(shares * modal)))
+        # The direct effect of the load on the normal force: in the static limit, the force is proportional to the load.
+        direct = margin - steady if row == 1 else 0.0
+        slope = float(_peaks(shares * rates * modal, envelope)[0])
+        during = np.linspace(0.0, longest, GRID)
+        response = direct + steady - np.real(np.exp(np.outer(during, rates)) @ (shares * modal))
+        # For p above 1 only a decrease ends sliding.
+        peak = np.max(-response) + 0.5 * slope * (during[1] - during[0])
+        after = np.linspace(shortest, longest, GRID if longest > shortest else 1)
+        kicked = (1 - np.exp(np.outer(after, rates))) * (shares * modal)
+        gap = after[1] - after[0] if len(after) > 1 else 0.0
+        peak = max(peak, float(np.max(_peaks(kicked, envelope))) + 0.5 * slope * gap)
+        least = min(least, margin / peak)
+    return float(least)
+
+
+@kept
+def _compiled_peaks(shares, envelope):
+    return jax.vmap(lambda one: envelope_peak(one, envelope))(shares)
+
+
+def _peaks(shares, envelope) -> np.ndarray:
+    return np.asarray(_compiled_peaks(jnp.atleast_2d(jnp.asarray(shares)), jax.tree.map(jnp.asarray, envelope)))

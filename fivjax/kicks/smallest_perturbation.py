@@ -1,0 +1,160 @@
+r"""The smallest perturbation of a kind found that leads to a limit cycle, and a certified bound below it.
+
+Along a ray of perturbations, verdicts tell the smallest size that squeals. There the motion lands on the saddle's stable
+manifold. The normal of the manifold, transformed back to the perturbation, gives the shape in whose direction the manifold is
+closest, in the norm. The search goes in this direction as long as the size falls, from the best of the shapes that linear
+sliding suggests.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..attractors.known import Attractors
+from ..maps.crossing import Crossing, first_crossings, with_ends
+from ..maps.states import verdicts_from
+from ..model.scene import Scene
+from .perturbations import Histories, InitialStates, Perturbation, Vectors
+from .stable_manifold import Saddle, manifold_normal
+
+# The largest size scanned along a ray at first, relative to the certified bound, and the number of sizes; later the number of
+# sizes around the last crossing; and the number inside a bracket.
+FARTHEST, SCANNED, AROUND, INSIDE = 4.0, 60, 16, 15
+# Relative widths of brackets during the search, and at its end.
+ROUGH, EXACT = 1e-5, 1e-8
+SHARES = np.array([1.0, 0.5, 0.25, 0.1, 0.04, 0.015])
+MOST_STEPS, GAINED = 12, 1e-6
+
+
+class SmallestPerturbation(NamedTuple):
+    """The smallest initial state, or load history, found that leads to a limit cycle, and a certified bound below it.
+
+    Sizes are norms: for an initial state the square root of the energy of its deviation from steady sliding (√J), for a history
+    the largest deviation of the load from its final value, as a share of it.
+
+    **Example:**
+
+        >>> found = fj.smallest_kick(scene.replace(belt_speed=1.0), over="state")  # doctest: +SLOW
+        >>> bool(0.5 < found.ratio < 1.0)  # doctest: +SLOW
+        True
+    """
+
+    over: str  # "state" or "history"
+    size: float  # of the smallest one found that leads to a limit cycle
+    certified: float  # every one smaller than this slides for ever
+    proved_low: float  # the same shape with this size was proved to slide,
+    proved_high: float  # and with this size to end on a limit cycle
+    values: np.ndarray  # displacements (m) and velocities (m/s), the `y0` of `simulate`; or the factor p of each piece
+    trajectories: int  # the number that the search took
+
+    @property
+    def ratio(self) -> float:
+        """The ratio of the certified size to that found; 1 if there were no gap."""
+        return self.certified / self.size
+
+    def __str__(self) -> str:
+        if self.over == "state":
+            found = f"smallest initial state found: {self.size**2:.6g} J about steady sliding lead to a limit cycle"
+            bound = f"certified: every state in contact with less than {self.certified**2:.6g} J slides for ever"
+        else:
+            found = f"smallest history found: a load within {100 * self.size:.6g} % of its own leads to a limit cycle"
+            bound = f"certified: every history within {100 * self.certified:.6g} % slides for ever"
+        return f"{found}\n{bound}\ngap: the bound is {100 * self.ratio:.3g} % of what was found, as a norm"
+
+    __repr__ = __str__
+
+
+class NoSquealingKick(ValueError):
+    """No kick, state or history that was tried within the bounds leads to a limit cycle.
+
+    **Example:**
+
+        >>> try:
+        ...     fj.smallest_kick(scene, over="p", bounds={"p": (1.0, 1.02)})  # doctest: +SLOW
+        ... except fj.NoSquealingKick:
+        ...     print("none up to 1.02")
+        none up to 1.02
+    """
+
+
+def smallest_state(scene: Scene) -> SmallestPerturbation:
+    """The initial state of least energy, on the belt and sliding, that leads to a limit cycle."""
+    kind = InitialStates(scene)
+    return _smallest(scene, "state", kind, np.inf)
+
+
+def smallest_history(scene: Scene, pieces: int, time: float) -> SmallestPerturbation:
+    """The history of the load, in equal pieces of a time (s), with the least deviation from the final load that leads to a
+    limit cycle.
+    """
+    return _smallest(scene, "history", Histories(scene, pieces, time), 1.0)
+
+
+class _Rays:
+    """The smallest sizes along rays of perturbations that squeal."""
+
+    def __init__(self, scene: Scene, kind: Perturbation):
+        self.scene, self.kind = scene, kind
+        self.rest = np.asarray(kind.sliding.linear.equilibrium)
+        self.attractors: dict[bytes, Attractors] = {}
+        self.trajectories = 0
+
+    def verdicts(self, u: Vectors) -> np.ndarray:
+        self.trajectories += len(u)
+        return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
+
+    def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> Crossing:
+        """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to the relative width `width`."""
+        found = first_crossings(sizes, self._along(shapes, sizes))
+        while True:
+            wide = np.flatnonzero(found.high - found.low > width * found.high)
+            if not len(wide):
+                return found
+            inner = np.linspace(found.low[wide], found.high[wide], INSIDE + 2, axis=1)
+            now = first_crossings(inner, with_ends(self._along(shapes[wide], inner[:, 1:-1])))
+            stuck = now.high - now.low >= 0.9 * (found.high[wide] - found.low[wide])
+            for whole, part in zip(found, now, strict=True):
+                whole[wide] = part
+            # Undecided trajectories prevent further narrowing.
+            found.low[wide[stuck]] = np.nan
+
+    def _along(self, shapes: Vectors, sizes: np.ndarray) -> np.ndarray:
+        return self.verdicts((shapes[:, None] * sizes[..., None]).reshape(-1, shapes.shape[1])).reshape(sizes.shape)
+
+
+def _smallest(scene: Scene, over: str, kind: Perturbation, most: float) -> SmallestPerturbation:
+    certificate, rays = kind.certificate(), _Rays(scene, kind)
+    shapes = certificate.shapes
+    largest = min(FARTHEST * certificate.size, most)
+    sizes = np.tile(np.linspace(0.99 * certificate.size, largest, SCANNED), (len(shapes), 1))
+    found = rays.first(shapes, sizes, ROUGH)
+    if not np.any(np.isfinite(found.low)):
+        raise NoSquealingKick(
+            f"None of the {len(shapes)} shapes that were tried leads to a limit cycle at up to "
+            f"{largest / certificate.size:.3g} times the certified bound. Look with `fivjax.basins`, or kick harder."
+        )
+    best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
+    shape, low, high = shapes[best], float(found.low[best]), float(found.high[best])
+    saddle: Saddle | None = None
+    for _ in range(MOST_STEPS):
+        u = low * shape
+        normal = manifold_normal(scene, kind.states(u[None])[0], saddle)
+        if normal is None:
+            break
+        gradient, saddle = kind.pulled_back(u, normal[0]), normal[1]
+        steepest = kind.steepest(gradient * np.sign(gradient @ shape))
+        tried = shape + SHARES[:, None] * (steepest - shape)
+        tried = tried / kind.norm(tried)[:, None]
+        around = np.tile(np.linspace(max(0.9 * low, 0.99 * certificate.size), 1.001 * high, AROUND), (len(tried), 1))
+        found = rays.first(tried, around, ROUGH)
+        if not np.any(np.isfinite(found.low)):
+            break
+        best = int(np.nanargmin(np.where(np.isfinite(found.low), found.high, np.nan)))
+        if found.high[best] >= high * (1 - GAINED):
+            break
+        shape, low, high = tried[best], float(found.low[best]), float(found.high[best])
+    ends = rays.first(shape[None], np.array([[low, high]]), EXACT)
+    if np.isfinite(ends.low[0]):
+        low, high = float(ends.low[0]), float(ends.high[0])
+    values = rays.rest + kind.states(high * shape[None])[0] if over == "state" else 1.0 + high * shape
+    return SmallestPerturbation(over, high, certificate.size, low, high, values, rays.trajectories)

@@ -1,0 +1,216 @@
+r"""Critical kicks of kind "grazing": the motion just touches another contact mode. And their derivatives.
+
+Where static friction exceeds kinetic friction, a contact that only just comes to rest on the belt sticks, and the friction
+force jumps when it slips again. So two motions of which only one touches sticking separate at once. The boundary between such
+kicks is not the stable manifold of a saddle, but the kick for which a guard $g$ (slip speed, normal force, gap, margin of the
+friction cone) just touches zero,
+
+$$ g(p, t) = 0, \qquad \frac{∂g}{∂t}(p, t) = 0, $$
+
+after a given number of events. The motion in one contact mode can be continued smoothly where its guard is negative, so this is
+a simple root, and because $∂g/∂t$ is zero there, $dp/dθ = -g_θ / g_p$.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics
+from ..foundation.compiling import compiled
+from ..foundation.precision import in_double_precision
+from ..model.load import Pulse
+from ..model.scene import Scene
+from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
+from ..section.crossings import MOST_SEGMENTS
+from ..steppers.core import Segment, follow
+from ..steppers.event_exact import EventExact, for_derivatives
+from .response import directions_of
+
+# The most events that are compared; and the longest time in which two motions separate, in slowest periods.
+MOST_EVENTS, MOST_TIME = 1024, 20.0
+# Events of two motions are the same if their times differ by no more than this share of the slowest period.
+TOGETHER = 1e-2
+MOST_ITERATIONS = 20
+# Newton's method has converged if its steps are below these, relative to p and to the slowest period.
+EXACT_P, EXACT_T = 1e-13, 1e-8
+# The most touches that are tried; and how far below one the next is sought, relative to p.
+MOST_TOUCHES, JUST_BELOW = 8, 1e-11
+
+
+class GrazingKick(NamedTuple):
+    """A critical kick of kind "grazing"."""
+
+    p: float
+    d_p: dict[str, float]  # by parameter
+    trajectories: int  # number that Newton's method took
+    time: float  # of the touch, s after the kick began
+    events: int  # number of contact events before the touch
+
+
+class _Events(NamedTuple):
+    time: Float[Array, " k"]  # s after the kick began
+    status: Int[Array, " k"]  # before the event
+    guard: Int[Array, " k"]  # that ran out
+    count: Int[Array, ""]
+
+
+@in_double_precision
+def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, ...]) -> GrazingKick | None:
+    """The kick inside a bracket for which a guard touches zero, if this separates the motions at both ends; else None.
+
+    **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters.
+    """
+    stepper, (low, high) = EventExact(), bracket
+    period = float(slowest_period(scene.structure))
+    # Padded to a fixed number of directions, so that one program is compiled.
+    directions = directions_of(scene, ("p", *names) + ("p",) * (-(len(names) + 1) % 16))
+
+    def events(p: float) -> _Events:
+        return _Events(*map(np.asarray, _events(scene.replace(p=p), stepper)))
+
+    below, above, found = events(low), events(high), None
+    for _ in range(MOST_TOUCHES):
+        parting = _parting(below, above, TOGETHER * period)
+        if parting is None:
+            return found
+        found = _touched(scene, stepper, directions, names, (low, high), parting, period)
+        if found is None:
+            return None
+        # Another oscillation may come closer and touch already at a smaller kick.
+        high = found.p * (1 - JUST_BELOW)
+        above = events(high)
+    return None
+
+
+def _touched(
+    scene: Scene,
+    stepper: EventExact,
+    directions: Scene,
+    names: tuple[str, ...],
+    bracket: tuple[float, float],
+    parting: tuple[int, float, int],
+    period: float,
+) -> GrazingKick | None:
+    """Newton's method in the kick and the time of the touch."""
+    (place, time, guard), (low, high) = parting, bracket
+    p, apart, width = high, 1e-4 * period, high - low
+    for taken in range(1, MOST_ITERATIONS + 1):
+        at = scene.replace(p=p)
+        value, slope, of_parameters = _guard(at, stepper, directions, time, place, guard)
+        before, after = (_guard(at, stepper, directions, time + side * apart, place, guard)[1] for side in (-1, 1))
+        bend = (after - before) / (2 * apart)
+        if not (np.isfinite([value, slope, bend, of_parameters[0]]).all() and bend > 0 and of_parameters[0] != 0):
+            return None
+        shift = -slope / bend
+        step = -(value + 0.5 * slope * shift) / of_parameters[0]
+        if not low - width <= p + step <= high + width or abs(shift) > 0.1 * period:
+            return None
+        if abs(step) <= EXACT_P * p and abs(shift) <= EXACT_T * period:
+            slopes = {name: float(-of_parameters[k + 1] / of_parameters[0]) for k, name in enumerate(names)}
+            return GrazingKick(float(p), slopes, taken, time, place)
+        p, time = p + step, time + shift
+    return None
+
+
+def _parting(a: _Events, b: _Events, together: float) -> tuple[int, float, int] | None:
+    """The first event that only one of two motions has: the number of events before it, its time and its guard."""
+    for k in range(min(MOST_EVENTS, max(int(a.count), int(b.count)))):
+        in_a, in_b = k < a.count, k < b.count
+        if in_a and in_b and abs(a.time[k] - b.time[k]) <= together:
+            if (a.status[k], a.guard[k]) != (b.status[k], b.guard[k]):
+                return None
+            continue
+        first = a if in_a and not (in_b and b.time[k] < a.time[k]) else b
+        return k, float(first.time[k]), int(first.guard[k])
+    return None
+
+
+def _begun(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], Float[Array, " state"]]:
+    load = scene.load
+    assert isinstance(load, Pulse)
+    mechanics = mechanics_about_sliding(scene)
+    # Loads are deviations from the final one.
+    more = (load.p - 1.0) * load.force
+    y = jnp.zeros(2 * scene.structure.size)
+    return mechanics, physics.status_from_forces(mechanics, more, y), more, y
+
+
+@compiled
+def _events(scene: Scene, stepper: EventExact) -> _Events:
+    mechanics, contact, more, y = _begun(scene)
+
+    def observe(total: tuple, segment: Segment):
+        found, since = total
+        ended = segment.after.ended.reshape(-1)
+        happened = jnp.any(ended)
+        place = jnp.where(happened, found.count, MOST_EVENTS)
+        found = _Events(
+            found.time.at[place].set(since + segment.t + segment.after.h, mode="drop"),
+            found.status.at[place].set(segment.contact.status, mode="drop"),
+            found.guard.at[place].set(jnp.argmax(ended).astype(jnp.int32), mode="drop"),
+            found.count + happened,
+        )
+        return found, since
+
+    none, zero = jnp.zeros(MOST_EVENTS, jnp.int32), jnp.zeros((), y.dtype)
+    total = (_Events(jnp.full(MOST_EVENTS, jnp.inf), none, none, jnp.zeros((), jnp.int32)), zero)
+    common = {
+        "observe": observe,
+        "until": lambda total: total[0].count >= MOST_EVENTS,
+        "most": 64 * MOST_SEGMENTS,
+        "kind": "lax",
+    }
+    during = follow(stepper, mechanics, contact, more, y, scene.load.duration, total=total, **common)
+    total = (during.total[0], jnp.asarray(scene.load.duration, y.dtype))
+    longest = MOST_TIME * longest_return(scene)
+    return follow(
+        stepper, mechanics, during.contact, jnp.zeros_like(more), during.y, longest, total=total, **common
+    ).total[0]
+
+
+def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, events: int, guard: int):
+    """A guard at a time after `events` events, its time derivative, and the derivatives of both along directions of the
+    parameters.
+    """
+    found = _guard_with_derivatives(
+        scene, stepper, directions, jnp.asarray(time), jnp.asarray(events, jnp.int32), jnp.asarray(guard, jnp.int32)
+    )
+    value, slope, of_parameters = map(np.asarray, found)
+    return float(value), float(slope), of_parameters
+
+
+@compiled
+def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene, time, events, guard):
+    def of(scene: Scene, time: Float[Array, ""]) -> Float[Array, ""]:
+        mechanics, contact, more, y = _begun(scene)
+        short = for_derivatives(stepper)
+        duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
+        in_kick = jnp.minimum(time, duration)
+        none = jnp.zeros_like(more)
+        for h, load in ((in_kick, more), (time - in_kick, none)):
+            after = follow(
+                short,
+                mechanics,
+                contact,
+                load,
+                y,
+                h,
+                total=happened,
+                observe=lambda total, segment: total + jnp.any(segment.after.ended),
+                until=lambda total: total >= events,
+                most=64 * MOST_SEGMENTS,
+                kind="lax",
+            )
+            # After the last event the motion goes on in this mode, regardless of its guards.
+            y = short.in_one_mode(mechanics, after.contact, after.y, after.left, load)
+            contact, happened = after.contact, after.total
+        guards = physics.guards(mechanics, contact, jnp.where(time < duration, more, none), y)
+        return guards.reshape(-1)[guard]
+
+    value, slope = jax.jvp(lambda time: of(scene, time), (time,), (jnp.ones_like(time),))
+    along = jax.vmap(lambda direction: jax.jvp(lambda scene: of(scene, time), (scene,), (direction,))[1])
+    return value, slope, along(directions)

@@ -1,0 +1,152 @@
+"""The data that trajectories of one structure share, worked out once for all of them.
+
+Trajectories that differ only in their kick or their initial state make a *group*: they have the same mechanics, the same
+matrices of their stepper, the same proofs and the same attractors.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..contact import Mechanics
+from ..foundation.flattened import Flattened, flatten
+from ..foundation.kept_programs import kept
+from ..foundation.warp_library import is_installed
+from ..linear.linearisation import linear_sliding
+from ..model.friction import Coulomb
+from ..model.scene import Scene
+from ..section.about_sliding import longest_return, mechanics_about_sliding
+from ..steppers.base import AbstractStepper
+from ..steppers.event_exact import EventExact
+from ..steppers.kernel_advance import MOST_COORDINATES
+from ..steppers.kernel_scope import has_kernel
+from ..steppers.propagation import MATRIX_ROWS, Propagation
+from ..verdicts.sliding_proof import SlidingModes, sliding_modes
+from ..verdicts.sticking_proof import StickingDrift, sticking_drift
+
+# Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
+HISTORY = ("p", "duration", "start")
+# Number of groups worked out at a time, so that one size is compiled.
+GROUPS_AT_A_TIME = 64
+# States kept of a torus, mostly.
+OF_TORUS = 512
+
+
+class Shared(eqx.Module):
+    """The data that the trajectories of a group have in common."""
+
+    values: Float[Array, " k"]  # the parameters that are not those of the kick
+    mechanics: Mechanics
+    prepared: Any  # see `AbstractStepper.prepare`
+    modes: SlidingModes
+    drift: StickingDrift | None  # None with several contacts
+    weights: Float[Array, " state"]  # see `Structure.weights`
+    longest_return: Float[Array, ""]  # of the section's return map, s
+
+
+class Batch(NamedTuple):
+    """The data that all trajectories of a run have in common, and how they are computed."""
+
+    scene: Scene
+    method: AbstractStepper | Propagation
+    names: tuple[str, ...]  # parameters that differ between groups
+    history: tuple[str, ...]  # parameters of the kick
+    states: tuple[int, ...]  # indices of the initial state for which trajectories have values of their own
+    energy: bool
+    width: int  # trajectories of a group in a row of a block
+    many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
+    pool: ThreadPoolExecutor
+
+    @property
+    def by_kernel(self) -> bool:
+        """Whether kernels follow the trajectories by matrices prepared for each group."""
+        return isinstance(self.method, Propagation)
+
+    @property
+    def by_series(self) -> bool:
+        """Whether kernels follow the trajectories by Taylor series, as `simulate` does."""
+        return isinstance(self.method, EventExact) and has_kernel(self.scene, self.method)
+
+
+def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagation:
+    """The stepper that gives the same motion of many trajectories in less time, if there is one."""
+    one = len(scene.structure.contacts) == 1
+    if method != EventExact() or not scene.friction.constant or not one:
+        return method
+    small = scene.structure.size <= MOST_COORDINATES
+    # Only of a law that is known can it be said that a kernel can be made of it.
+    if small and isinstance(scene.friction, Coulomb) and is_installed():
+        return Propagation()
+    return method
+
+
+def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
+    """The version of Warp, where its kernels follow the trajectories of such a run."""
+    by = method if energy else in_bulk(method, scene)
+    by_kernel = isinstance(by, Propagation) or has_kernel(scene, by)
+    return {"warp": metadata.version("warp-lang")} if by_kernel else {}
+
+
+def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
+    """Memory for one trajectory, in bytes, if `sharing` of them make a group; with its part of intermediate results."""
+    n = scene.structure.size
+    m = 2 * (n - 1)
+    own = 8 * (3 * 2 * n + 60)
+    modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
+    prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
+    attractor = 8 * OF_TORUS * 2 * n
+    return int(own + 3 * (modes + prepared + attractor) / sharing)
+
+
+def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
+    own = [column for name, column in values.items() if name not in HISTORY and name not in states]
+    if not own:
+        count = len(next(iter(values.values())))
+        return np.zeros((1, 0)), np.zeros(count, int)
+    distinct, group = np.unique(np.stack(own, axis=-1), axis=0, return_inverse=True)
+    return distinct, group.ravel()
+
+
+def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
+    """`Shared` of each row of `distinct`, as one array."""
+    size, parts = GROUPS_AT_A_TIME, []
+    for start in range(0, len(distinct), size):
+        # Padded with copies, so that one size is compiled.
+        rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
+        part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
+        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
+    numbers = form = None
+    for start in range(0, len(distinct), size):
+        # Written into the result one by one, because they are large and should not be in memory twice.
+        mechanics, prepared, _, drifts, weights, longest = parts.pop(0)
+        rows = slice(start, min(start + size, len(distinct)))
+        own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
+        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, weights, longest))
+        numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
+        numbers[rows], form = part.numbers, part.form
+    return Flattened(numbers, form)
+
+
+@kept
+def _prepared(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
+    def one(row):
+        own = with_values(scene, names, row)
+        mechanics = mechanics_about_sliding(own)
+        drift = None if mechanics.several else sticking_drift(own)
+        weights = own.structure.weights
+        return mechanics, method.prepare(mechanics), linear_sliding(own), drift, weights, longest_return(own)
+
+    return jax.vmap(one)(values)
+
+
+def with_values(scene: Scene, names: tuple[str, ...], row) -> Scene:
+    """The scene with a row of values for these parameters."""
+    return scene.replace(**{name: row[i] for i, name in enumerate(names)})

@@ -1,0 +1,168 @@
+"""One trajectory on its way to a verdict: its beginning, and one step.
+
+Everything here is written for one trajectory; `rounds` follows many. States are deviations from the sliding equilibrium under
+the final load, so that rounding errors are relative to the deviation and not to the total displacement.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .. import contact as physics
+from ..contact import Contact, Mechanics, State
+from ..model.load import AbstractLoad
+from ..model.scene import Scene, steady_sliding
+from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
+from ..steppers.base import AbstractStepper, Advance
+from ..steppers.core import Segment
+from ..steppers.propagation import Propagation
+from ..verdicts.sliding_proof import SlidingModes
+from ..verdicts.verdict import Verdict
+from .groups import Shared
+
+# The longest advance with an energy ledger, s.
+LONGEST_ENTRY = 1.0
+
+
+class Progress(eqx.Module):
+    """One trajectory on its way to a verdict."""
+
+    t: Float[Array, ""]
+    skipped: Float[Array, ""]  # the part of it that was skipped because sliding was certain, s
+    y: State  # deviation from the sliding equilibrium under the final load, see `mechanics_about_sliding`
+    contact: Contact
+    crossing: State  # the last crossing of the section under the final load; NaN before the first
+    events: Int[Array, ""]  # status changes so far
+    last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
+    verdict: Int[Array, ""]
+    energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
+    steps: "LoadSteps | None" = None  # for a kernel
+
+
+class Setting(eqx.Module):
+    """The data with which a trajectory is followed."""
+
+    scene: Scene
+    method: AbstractStepper | Propagation
+    shared: Shared
+
+
+class EnergyRecord(eqx.Module):
+    """The energy ledger of one trajectory, and the energy of the vibration after the kick."""
+
+    ledger: Ledger
+    vibration: Float[Array, ""]  # energy of the vibration just after the last jump of the load, J; NaN before
+
+
+class LoadSteps(eqx.Module):
+    """The load of one trajectory as numbers."""
+
+    jumps: Float[Array, " k"]  # s
+    loads: Float[Array, " k+1"]  # before, between and after them, as deviations from the final load, N
+
+    def __init__(self, load: AbstractLoad):
+        self.jumps = load.jumps
+        ends = jnp.concatenate([self.jumps[:1] - 1.0, self.jumps, self.jumps[-1:] + 1.0])
+        between = 0.5 * (ends[:-1] + ends[1:]) if self.jumps.shape[0] else jnp.zeros(1)
+        self.loads = jax.vmap(load)(between) - load.final
+
+
+def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool, for_kernel: bool) -> Progress:
+    """A trajectory at the sliding equilibrium of its scene, before the kick."""
+    q, _ = steady_sliding(scene, scene.load.force)
+    equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
+    # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
+    y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
+    verdict = jnp.where(
+        ~modes.linear.solvable,
+        Verdict.PAINLEVE,
+        jnp.where(modes.linear.exists, Verdict.UNDECIDED, Verdict.NO_EQUILIBRIUM),
+    )
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
+    return Progress(
+        t=jnp.zeros((), y.dtype),
+        skipped=jnp.zeros((), y.dtype),
+        y=y,
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
+        crossing=jnp.full_like(y, jnp.nan),
+        events=jnp.zeros((), jnp.int32),
+        last_event=jnp.full((), jnp.nan, y.dtype),
+        verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
+        energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
+        steps=LoadSteps(scene.load) if for_kernel else None,
+    )
+
+
+def placed(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...], values) -> Progress:
+    """The trajectory with total values (not deviations) at these indices of its initial state; NaN leaves an entry as it is."""
+    if not places:
+        return now
+    equilibrium, at = shared.modes.linear.equilibrium, jnp.array(places)
+    y = now.y.at[at].set(jnp.where(jnp.isnan(values), now.y[at], values - equilibrium[at]))
+    contact = physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y)
+    energy = None if now.energy is None else EnergyRecord(open_ledger(EnergyData(scene), y), now.energy.vibration)
+    return eqx.tree_at(
+        lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
+    )
+
+
+def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array, ""]) -> Progress:
+    """The trajectory released from rest under `load` times its final load, at a time after all kicks; if `load` is NaN, the
+    trajectory as it is.
+    """
+    q, _ = steady_sliding(scene, load * scene.load.final)
+    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
+    after = deviation, jnp.max(scene.load.jumps, initial=0.0)
+    chosen = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(load), old, new), after, (now.y, now.t))
+    return eqx.tree_at(lambda now: (now.y, now.t), now, chosen)
+
+
+def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
+    """The end of a step from `t` (s): at most `dt` (s) later, never beyond a jump of the load, and exactly at a jump that is
+    reached.
+    """
+    ahead = load.jumps > t
+    jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
+    # Equal steps up to the jump. The 1e-6 keeps rounding from adding another step of vanishing length.
+    steps = jnp.ceil((jump - t) / dt - 1e-6)
+    return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
+
+
+def step(setting: Setting, now: Progress) -> Progress:
+    """The trajectory after one more step, which ends at the next event at the latest."""
+    scene, method = setting.scene, setting.method
+    # At rest an exact stepper would take an infinite step, over which work cannot be integrated.
+    longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
+    t = next_step_end(scene.load, now.t, longest)
+    load = scene.load(0.5 * (now.t + t)) - scene.load.final
+    assert not isinstance(method, Propagation)
+    after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section=True)
+    y, contact, h, rise = after.y, after.contact, after.h, after.rise
+    t = jnp.where(h >= t - now.t, t, now.t + h)
+    changed = contact.status != now.contact.status
+    changed = jnp.any(changed) if setting.shared.mechanics.several else changed
+    # Crossings during the kick do not count for the motion after it.
+    crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
+    return Progress(
+        t=t,
+        skipped=now.skipped,
+        y=y,
+        contact=contact,
+        crossing=jnp.where(crossed, rise.at, now.crossing),
+        events=now.events + changed,
+        last_event=jnp.where(changed, t, now.last_event),
+        verdict=now.verdict,
+        energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
+        steps=now.steps,
+    )
+
+
+def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
+    scene = setting.scene
+    segment = Segment(before.t, load, before.contact, before.y, after)
+    ledger = enter(EnergyData(scene), setting.method, setting.shared.mechanics, energy.ledger, segment)
+    kick_ends = jnp.max(scene.load.jumps, initial=0.0)
+    just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
+    vibration = mechanical_energy(scene.structure, after.y)
+    return EnergyRecord(ledger, jnp.where(just_kicked, vibration, energy.vibration))

@@ -1,0 +1,78 @@
+"""Return maps by kernels that step by Taylor series: any friction, several contacts."""
+
+from concurrent.futures import Executor
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..contact import Contact
+from ..foundation.kernel_text import Form
+from ..steppers.event_exact import EventExact
+from .crossings import Arrival, How, Point, motion_to_section
+
+# Rows of numbers for a kernel are put together for so many bytes at a time.
+AT_A_TIME = 2**26
+
+
+class SectionKernels:
+    """The return maps of groups: of (mechanics, longest return in s), or of scenes, each with a leading axis over groups."""
+
+    def __init__(self, whose, pool: Executor | None):
+        self.whose, self.pool = whose, pool
+        self.table = numbers_in_rows(whose)
+        self.form: Form | None = None
+
+    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
+        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
+        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
+        """
+        form, given = self._rows(group, y, status, direction, crossings, peaks)
+        numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
+        parts = [
+            motion_to_section.of_many(form, given[rows], numbers[rows], self.pool)
+            for rows in in_parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
+        ]
+        end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts)
+        (y, status, direction), (at, _, arrived, peak) = _on_section(end), end
+        peak = np.where(arrived, peak, np.nan)
+        return y, status, direction, at.events.astype(np.int32), at.time, path.point.y, peak
+
+    def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
+        """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
+        form, given = self._rows(group, y, status, direction, crossings, False)
+        # The state comes after what is the group's.
+        state = len(jax.tree.leaves(self.whose))
+        wide = tuple(place == state for place in range(len(form.arrays)))
+        last = np.broadcast_to(np.asarray(crossings, float), len(y))[:, None]
+        found = motion_to_section.derived_of_many(form, given, last, wide, np.eye(y.shape[1]), self.pool)
+        (end, _), (slopes, _) = found
+        return (*_on_section(end), end.at.time), slopes.at.point.y
+
+    def _rows(self, group, y, status, direction, crossings, peaks: bool):
+        crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))
+        contact = Contact(np.asarray(status, np.int32), np.asarray(direction, float))
+        rows = Point(np.asarray(y), contact), crossings, np.full(len(y), np.inf), np.full(len(y), peaks)
+        if self.form is None:
+            first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.whose, *rows))
+            self.form, _ = Form.of((How(EventExact()), *first))
+        return self.form, np.concatenate([self.table[group], numbers_in_rows(rows)], axis=1)
+
+
+def _on_section(end: Arrival):
+    """State, status and direction on the section; the state is NaN where the section was not reached."""
+    point = end.at.point
+    y = np.where(end.arrived[:, None], point.y, np.nan)
+    return y, point.contact.status.astype(np.int32), point.contact.direction
+
+
+def numbers_in_rows(tree) -> Float[np.ndarray, "g k"]:
+    """All numbers of a tree whose arrays have a leading axis, in a row for each of its entries."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return np.concatenate([leaf.reshape(len(leaf), -1).astype(float) for leaf in leaves], axis=1)
+
+
+def in_parts(count: int, each: int) -> list[slice]:
+    """So many rows in parts that take `AT_A_TIME` bytes, if a row takes `each`."""
+    size = max(1, AT_A_TIME // each)
+    return [slice(start, start + size) for start in range(0, count, size)]

@@ -1,0 +1,340 @@
+"""The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
+
+A group is one scene, or what the trajectories of a map have in common that differ in their kicks only. Kernels compute the map
+where there are some; derivatives, which those by matrices do not have, are then central differences. Without kernels, XLA does
+in blocks of one size.
+"""
+
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..contact import Contact, Mechanics, Status, status_from_forces
+from ..foundation.blocks import BLOCK_OF_SEVERAL, in_blocks, workers
+from ..foundation.compiling import compiled
+from ..foundation.flattened import Flattened, flatten
+from ..foundation.numpy_evaluation import by_numpy
+from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
+from ..model.structure import Structure
+from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.kernel_scope import has_kernel
+from ..steppers.section import FADED, section_weights
+from .about_sliding import longest_return, mechanics_about_sliding
+from .by_kernel import SectionKernels
+from .crossings import Point, to_crossing
+from .free_directions import directions_of_several, free_coordinates
+
+# Number of states in a block: small, because often there are few states.
+BLOCK = 32
+DERIVED_BLOCK = 16
+# Number of states on the section that XLA keeps of a motion, the last ones.
+KEPT = 16
+# Steps of central differences, relative to a state's size: about the cube root of the rounding unit; smaller ones where motions
+# have other events that far away. And the most crossings over which a difference is taken.
+STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
+
+# Relative errors of trajectories' crossings, at most: kernels and `EventExact` compute them to rounding, others interpolate.
+ROUNDED, INTERPOLATED = 1e-6, 1e-2
+
+
+class Section(NamedTuple):
+    """States on the section, or on the way to it, in rows: deviations from the sliding equilibrium, with contact modes."""
+
+    y: Float[np.ndarray, "m 2n"]
+    status: Int[np.ndarray, "m *contacts"]
+    direction: Float[np.ndarray, "m *contacts"]
+
+    @classmethod
+    def of(cls, *points: Point) -> "Section":
+        """These points in rows."""
+        y, status, direction = (
+            np.array([np.asarray(part) for part in parts])
+            for parts in zip(*((one.y, one.contact.status, one.contact.direction) for one in points), strict=True)
+        )
+        return cls(y.astype(float), status.astype(np.int32), direction.astype(float))
+
+    def point(self, row: int) -> Point:
+        """One of them."""
+        return Point(self.y[row], Contact(self.status[row], self.direction[row]))
+
+    def rows(self, chosen) -> "Section":
+        return Section(*(part[chosen] for part in self))
+
+    def put(self, chosen, rows: "Section") -> None:
+        """Write these rows at the chosen indices."""
+        for whole, part in zip(self, rows, strict=True):
+            whole[chosen] = part
+
+    def flattened(self, *more: np.ndarray) -> Flattened:
+        """As one array, with what else there is of each row."""
+        status, direction = np.asarray(self.status, np.int32), np.asarray(self.direction, float)
+        return flatten((np.asarray(self.y), status, direction, *more))
+
+
+class Images(NamedTuple):
+    """The images of several states under the return map; NaN where the section is not reached."""
+
+    at: Section
+    events: Int[np.ndarray, " m"]  # contact events on the way
+    time: Float[np.ndarray, " m"]  # s
+    path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN if there were fewer
+    peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
+
+
+class Kernels(Protocol):
+    """Kernels that compute return maps, as `by_kernel.SectionKernels` does, perhaps without derivatives."""
+
+    def returns(self, group, y, status, direction, crossings, peaks: bool, kept: int): ...
+
+
+class ReturnMaps:
+    """The return maps of all groups.
+
+    `mechanics` (about sliding) and `longest_return` (s) have a leading axis over groups. `known_to` says how well latest
+    crossings of trajectories are known, relative to their size: they tell which to ask for attractors.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        mechanics,
+        longest_return: Float[np.ndarray, " g"],
+        kernels: Kernels | None,
+        pool: Executor,
+        known_to: float = ROUNDED,
+    ):
+        longest = np.asarray(longest_return)
+        self.kernels, self.pool, self.known_to = kernels, pool, known_to
+        self.of_groups = mechanics, longest
+        self.structure = structure
+        self.weights = np.asarray(structure.weights)
+        # The direction of friction if the contact slides on the section, where the belt is faster.
+        self.sliding = np.sign(np.asarray(mechanics.belt_speed))
+        self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
+        # With several contacts, arrays of indices.
+        self.tangential, self.normal = contact_coordinates(self.structure)
+        # The weighted size below which a motion of a group has faded.
+        weights = np.atleast_1d(self.weights[self.structure.size + self.tangential])
+        belts = np.abs(np.asarray(mechanics.belt_speed)).reshape(len(longest), -1)
+        self.faded = FADED * np.max(weights * belts, axis=1)
+
+    @classmethod
+    def of(cls, scene: Scene) -> "ReturnMaps":
+        """The return map of one scene under its final load, as the only group."""
+        parts = known_mechanics(scene), _longest(scene), scene
+        mechanics, longest, alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], parts)
+        pool = ThreadPoolExecutor(workers())
+        kernels = SectionKernels(alone, pool) if has_kernel(scene, EventExact()) else None
+        return cls(scene.structure, mechanics, longest, kernels, pool)
+
+    @cached_property
+    def mechanics(self) -> Flattened:
+        return flatten(self.of_groups)
+
+    def in_contact(self, group, y: Float[np.ndarray, "m 2n"]) -> Section:
+        """These deviations from sliding with the contact modes that their forces demand."""
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[group], self.of_groups[0])
+        contact = _contacts_demanded(own, np.asarray(y, float))
+        return Section(np.array(y, float), np.asarray(contact.status), np.asarray(contact.direction))
+
+    def moves(self, group, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
+        """Which of these deviations from sliding are of a motion that has not faded."""
+        return np.linalg.norm(self.weights * y, axis=1) > self.faded[group]
+
+    @property
+    def section(self) -> Float[np.ndarray, " n"]:
+        """The weights of the velocities whose sum is zero on the section."""
+        row = np.zeros(self.structure.size)
+        row[np.atleast_1d(self.tangential)] = section_weights(len(self.structure.contacts))
+        return row
+
+    def free_directions(self, status: int | Int[np.ndarray, " c"]) -> Float[np.ndarray, "2n f"]:
+        """The weighted directions that the section and a contact mode leave free, as columns."""
+        if np.ndim(status):
+            places = np.asarray(self.tangential), np.asarray(self.normal)
+            return directions_of_several(self.weights, self.section, *places, status)
+        return np.eye(len(self.weights))[:, self.free[int(status)]]
+
+    @cached_property
+    def free(self) -> Bool[np.ndarray, "modes 2n"]:
+        """With one contact: which coordinates of a state on the section each contact mode leaves free."""
+        size = len(self.weights)
+        found = np.zeros((len(Status), size), bool)
+        for status in Status:
+            found[status, free_coordinates(size // 2, self.tangential, self.normal, status)] = True
+        return found
+
+    def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:
+        """The `crossings`-th crossing from each row, with the last `kept` states on the section, and with the largest speed if
+        `peaks` are asked for. More than `KEPT` states are kept only if they are all of them.
+        """
+        if not len(group):
+            # Blocks are never empty.
+            nothing = np.zeros(0)
+            return Images(at, nothing.astype(np.int32), nothing, np.zeros((0, kept, at.y.shape[1])), nothing)
+        if self.kernels is not None or kept <= KEPT:
+            return self._returns(group, at, crossings, kept, peaks)
+        parts: list[Images] = []
+        for start in range(0, kept, KEPT):
+            part = min(KEPT, kept - start)
+            parts.append(self._returns(group, parts[-1].at if parts else at, part, part, peaks))
+        _, events, time, paths, peak = zip(*parts, strict=True)
+        return Images(
+            parts[-1].at,
+            np.sum(events, axis=0),
+            np.sum(time, axis=0),
+            np.concatenate(paths, axis=1),
+            np.max(peak, axis=0),
+        )
+
+    def path(self, group, at: Section, count: int) -> tuple[Section, Float[np.ndarray, "m count 2n"]]:
+        """The next `count` states on the section from each row: the last one with its contact mode; and all of them."""
+        images = self.returns(group, at, count, count)
+        return images.at, images.path
+
+    def _returns(self, group, at: Section, crossings, kept: int, peaks: bool) -> Images:
+        if self.kernels is not None:
+            return _images(self.kernels.returns(group, *at, crossings, peaks, kept))
+        # Most need no peaks, so these are of another program.
+        peak = self.peaks(group, at, crossings) if peaks else np.zeros(len(at.y))
+        images = _images((*self._exactly(_returned, self.block, group, at, crossings), peak))
+        return images._replace(path=images.path[:, KEPT - kept :])
+
+    def derived(
+        self, group, at: Section, crossings
+    ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
+        """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
+        if self.kernels is not None and not isinstance(self.kernels, SectionKernels):
+            return self._differences(group, at, crossings)
+        if self.kernels is not None:
+            (*section, time), derivatives = self.kernels.derived(group, *at, crossings)
+        else:
+            (*section, time), derivatives = self._exactly(_derived, DERIVED_BLOCK, group, at, crossings)
+        return Section(*section), time, derivatives
+
+    def peaks(self, group, at: Section, crossings) -> Float[np.ndarray, " m"]:
+        """The largest tangential speed (m/s) on the way to the `crossings`-th crossing from each row."""
+        if self.kernels is not None:
+            return self.returns(group, at, crossings, peaks=True).peak
+        return self._exactly(_peaks, DERIVED_BLOCK, group, at, crossings)
+
+    def _differences(self, group, at: Section, crossings):
+        """The derivative over many crossings, as a product over a few at a time: over a long time differences do not stay
+        small.
+        """
+        left, here = np.broadcast_to(crossings, len(group)).copy(), Section(*(np.array(part) for part in at))
+        time = np.zeros(len(group))
+        derivatives = np.zeros((*at.y.shape, at.y.shape[1]))
+        derivatives[:] = np.eye(at.y.shape[1])
+        while len(rows := np.flatnonzero(left > 0)):
+            part = np.minimum(left[rows], DIFFERENCED)
+            base, taken, slopes = self._differences_of_few(group[rows], here.rows(rows), part)
+            here.put(rows, base)
+            time[rows] += taken
+            derivatives[rows] = slopes @ derivatives[rows]
+            left[rows] -= part
+        return here, time, derivatives
+
+    def _differences_of_few(self, group, at: Section, crossings):
+        """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
+        count, size = at.y.shape
+        lengths = np.linalg.norm(self.weights * at.y, axis=1)
+        row, place = np.nonzero(self.free[at.status])
+        base = self.returns(group, at, crossings)
+        derivatives = np.zeros((count, size, size))
+        for step in STEPS:
+            lengthwise = step * lengths[row] / self.weights[place]
+            away = np.zeros((len(row), size))
+            away[np.arange(len(row)), place] = lengthwise
+            starts = np.concatenate([at.y[row] + away, at.y[row] - away])
+            rows = np.tile(row, 2)
+            image = self.returns(group[rows], Section(starts, at.status[rows], at.direction[rows]), crossings[rows])
+            ahead, behind = image.at.rows(slice(None, len(row))), image.at.rows(slice(len(row), None))
+            alike = (ahead.status == behind.status) & (ahead.status == base.at.status[row])
+            slopes = (ahead.y - behind.y) / (2 * lengthwise[:, None])
+            derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
+            # Next to the onset of an event a step may lead to motions that have it.
+            events = base.events[row]
+            other = (image.events[: len(row)] != events) | (image.events[len(row) :] != events)
+            row, place = row[other], place[other]
+            if not len(row):
+                break
+        return base.at, base.time, derivatives
+
+    def _exactly(self, program, size: int, group, at: Section, crossings):
+        return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree
+
+
+def _rows(at: Section, crossings) -> Flattened:
+    return at.flattened(np.broadcast_to(np.asarray(crossings, np.int32), len(at.y)).copy())
+
+
+def _images(found) -> Images:
+    y, status, direction, *rest = found
+    return Images(Section(y, status, direction), *rest)
+
+
+def of_block(one, shared: Flattened, rows: Flattened) -> Flattened:
+    """A function of what a group shares and of one row's own, for all rows of a block."""
+    own = rows.tree
+    of_group = jax.vmap(one, in_axes=(None, *[0] * len(own)))
+    return flatten(jax.vmap(of_group)(shared.tree, *own), row_axes=2)
+
+
+@by_numpy
+def _contacts_demanded(mechanics: Mechanics, y: Float[np.ndarray, "m 2n"]) -> Contact:
+    return jax.vmap(lambda mechanics, y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(mechanics, y)
+
+
+known_mechanics, _longest = by_numpy(mechanics_about_sliding), by_numpy(longest_return)
+
+
+def _to_crossing(shared, row, rows: int, careful: bool = False, peaks: bool = False):
+    (mechanics, longest), (y, status, direction, crossings) = shared, row
+    start, method = Point(y, Contact(status, direction)), EventExact()
+    method = for_derivatives(method) if careful else method
+    numbers = crossings - jnp.arange(rows, dtype=y.dtype)[::-1]
+    end, path = to_crossing(method, mechanics, start, crossings, longest * crossings, numbers, peaks=peaks)
+    found = end.at.point
+    y = jnp.where(end.arrived, found.y, jnp.nan)
+    return (y, found.contact.status, found.contact.direction), end, path.point.y
+
+
+@compiled
+def _returned(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared, *row):
+        section, end, path = _to_crossing(shared, row, KEPT)
+        return *section, end.at.events, end.at.time, path
+
+    return of_block(one, shared, rows)
+
+
+@compiled
+def _derived(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared, y, *row):
+        def along(direction):
+            def state(y):
+                section, end, _ = _to_crossing(shared, (y, *row), 1, careful=True)
+                return section[0], (*section, end.at.time)
+
+            _, tangent, found = jax.jvp(state, (y,), (direction,), has_aux=True)
+            return found, tangent
+
+        return jax.vmap(along, out_axes=(None, 1))(jnp.eye(y.shape[0], dtype=y.dtype))
+
+    return of_block(one, shared, rows)
+
+
+@compiled
+def _peaks(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared, *row):
+        _, end, _ = _to_crossing(shared, row, 1, peaks=True)
+        return jnp.where(end.arrived, end.peak, jnp.nan)
+
+    return of_block(one, shared, rows)
