@@ -14,9 +14,9 @@ MOST_ITERATIONS, HALVINGS = 30, 5
 CLOSED = 1e-10
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
-# Next to the onset of an event, or to a change of the mode in which the section is met, a step may lead astray: `HALVINGS` times
-# in a row it is halved, or the search goes on from the image. Of many guesses of which few are near a cycle, each has so many
-# iterations, and may miss so often.
+# Next to the onset of an event, or to a change of the mode in which the section is met, a step may lead astray: `HALVINGS`
+# times in a row it is halved, or the search goes on from the image. Of many guesses of which few are near a cycle, each has so
+# many iterations, and may miss so often.
 FEW_ITERATIONS, MISSES = 14, 3
 
 

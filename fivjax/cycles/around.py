@@ -17,6 +17,7 @@ from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
 from ..section.crossings import MOST_SEGMENTS, How, Point, motion_to_section
 from ..section.peak_speed import higher_peak
+from ..section.return_maps import known_for_section
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 
@@ -161,7 +162,8 @@ def _flow_with_jacobian(
 ) -> tuple[Point, Float[np.ndarray, "state state"]]:
     """The state after a given time (s), and its derivative by the start."""
     start = jax.tree.map(known_to_numpy, start)
-    args, last = (How(stepper), scene, start, NEVER, float(time), np.False_), np.array([float(NEVER)])
+    whose, last = known_for_section(scene), np.array([float(NEVER)])
+    args = How(stepper), whose, start, NEVER, float(time), np.False_
     by_kernel = has_kernel(scene, stepper)
     (end, _), (slopes, _) = motion_to_section.derived_by(args, last, start.y, np.eye(len(start.y)), by_kernel=by_kernel)
     return end.at.point, slopes.at.point.y

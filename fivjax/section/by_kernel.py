@@ -16,7 +16,7 @@ AT_A_TIME = 2**26
 
 
 class SectionKernels:
-    """The return maps of groups: of (mechanics, longest return in s), or of scenes, each with a leading axis over groups."""
+    """The return maps of groups, by their mechanics and longest returns (s), whose arrays have a leading axis over groups."""
 
     def __init__(self, whose, pool: Executor | None):
         self.whose, self.pool = whose, pool

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact, Mechanics, Status, status_from_forces
 from ..foundation.blocks import BLOCK_OF_SEVERAL, in_blocks, workers
@@ -127,10 +127,9 @@ class ReturnMaps:
     @classmethod
     def of(cls, scene: Scene) -> "ReturnMaps":
         """The return map of one scene under its final load, as the only group."""
-        parts = known_mechanics(scene), _longest(scene), scene
-        mechanics, longest, alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], parts)
+        mechanics, longest = jax.tree.map(lambda leaf: np.asarray(leaf)[None], known_for_section(scene))
         pool = ThreadPoolExecutor(workers())
-        kernels = SectionKernels(alone, pool) if has_kernel(scene, EventExact()) else None
+        kernels = SectionKernels((mechanics, longest), pool) if has_kernel(scene, EventExact()) else None
         return cls(scene.structure, mechanics, longest, kernels, pool)
 
     @cached_property
@@ -292,7 +291,10 @@ def _contacts_demanded(mechanics: Mechanics, y: Float[np.ndarray, "m 2n"]) -> Co
     return jax.vmap(lambda mechanics, y: status_from_forces(mechanics, jnp.zeros((), y.dtype), y))(mechanics, y)
 
 
-known_mechanics, _longest = by_numpy(mechanics_about_sliding), by_numpy(longest_return)
+@by_numpy
+def known_for_section(scene: Scene) -> tuple[Mechanics, Float[Array, ""]]:
+    """What a motion to the section needs of a scene: mechanics about sliding, and the longest return (s)."""
+    return mechanics_about_sliding(scene), longest_return(scene)
 
 
 def _to_crossing(shared, row, rows: int, careful: bool = False, peaks: bool = False):
