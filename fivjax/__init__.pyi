@@ -72,6 +72,7 @@ from .steppers.base import AbstractStepper as AbstractStepper
 from .steppers.base import vector_field as vector_field
 from .steppers.event_exact import EventExact as EventExact
 from .steppers.where_switched import WhereSwitched as WhereSwitched
+from .verdicts.verdict import Proof as Proof
 from .verdicts.verdict import Verdict as Verdict
 
 __version__: str

@@ -140,7 +140,7 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
 
     verdicts, none = not_run(1, energy=False), np.full(1, np.nan)
     with pytest.raises(KeyboardInterrupt):
-        record(verdicts, np.array([0]), Unreadable(), Ended(np.array([1]), np.array([0]), none, none, none))
+        record(verdicts, np.array([0]), Unreadable(), Ended(np.array([1]), np.array([0]), *[none] * 5))
     assert verdicts.verdict[0] == fj.Verdict.NOT_RUN
 
 

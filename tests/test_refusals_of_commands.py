@@ -148,7 +148,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
         (["simulate", "--k1", "0", "--k2", "0"], ["singular"]),
         (["simulate", "--t1", "1e9", "--dt-save", "1e-9"], ["`dt_save`", "rows"]),
         (["map", "--force", "nan"], ["`force`", "finite"]),
-        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "46,000,000,000,000 bytes"]),
+        (["map", "--x", "mu=0:1:1000000", "--y", "p=0:1:1000000"], ["trajectories", "70,000,000,000,000 bytes"]),
         (["map", "--x", "mu=0:1:100000000"], ["`mu`", "800,000,000 bytes"]),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else None,

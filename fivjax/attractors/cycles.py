@@ -18,6 +18,8 @@ NEARLY = 0.1
 # The same for many crossings: after so many of them any motion on a torus comes back nearly.
 MORE_NEARLY = 0.02
 CROSSINGS, MORE_CROSSINGS = 8, 40
+# Crossings of cycles on which neighbours close in.
+MOST_CROSSINGS = 512
 # The same for a motion whose time is over: it has settled on a cycle, or never will.
 SETTLED = 1e-3
 # A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
@@ -39,6 +41,17 @@ class Cycle(NamedTuple):
     multiplier: float  # the size of the largest, but the one of the cycle's own direction
     amplitude: float  # m/s
     neighbourhood: Neighbourhood
+
+    @property
+    def reach(self) -> float:
+        """The neighbourhood's radius, relative to the cycle's size in the same norm."""
+        about = self.neighbourhood
+        return float(about.radius / np.linalg.norm(about.norm @ about.centre))
+
+    @property
+    def contraction(self) -> float:
+        """The largest factor by which distances in the neighbourhood change in one period."""
+        return self.neighbourhood.contraction
 
 
 def stable_cycles(

@@ -11,14 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
-from .cycles import MORE_CROSSINGS, Cycle, distinct
+from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Cycle, distinct
 from .known import Attractors, add_cycles, add_tori, come_to
 from .parting import followed_on
 from .tori import AT_A_TIME, TUBES, Torus, is_drifting
 from .tube import HOME
 
-# Crossings of cycles on which neighbours close in.
-MOST_CROSSINGS = 512
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
 TIMES, ONWARD = 4, 8192
 

@@ -70,15 +70,14 @@ def followed_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> 
 
 
 def parting_rates(maps: ReturnMaps, group, at: Section):
-    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; the mean
-    time of a return (s); where the motions are in the end; and their weighted states on the section.
+    """How fast neighbours part from motions that start here: the logarithm of the growth of their distance per return; where
+    the motions are in the end; and their weighted states on the section.
     """
-    beside, growth, time, paths = _beside(at), np.full(len(group), np.nan), np.zeros(len(group)), []
+    beside, growth, paths = _beside(at), np.full(len(group), np.nan), []
     for _ in range(2):
-        growth, taken, _, at, beside, path = _parted(maps, group, at, beside)
-        time = time + taken
+        growth, _, _, at, beside, path = _parted(maps, group, at, beside)
         paths.append(path)
-    return growth, time / (2 * PARTING_OVER), at, np.concatenate(paths, axis=1)
+    return growth, at, np.concatenate(paths, axis=1)
 
 
 def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:

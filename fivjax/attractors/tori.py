@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from ..contact import Status
 from ..section.return_maps import ReturnMaps, Section
 from . import tube
-from .cycles import CROSSINGS, MORE_CROSSINGS, NOMINATED, Cycle, stable_cycles
+from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, NOMINATED, Cycle, stable_cycles
 from .parting import parting_rates
 from .tube import Tube, thinned, tree_of
 
@@ -45,6 +45,8 @@ SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
 SETTLED, SETTLED_WITHIN = 7.5e-4, 24576
 # Returns that starts about a torus take from the edge of the tube to the torus, once they are back.
 COME_NEARER = 128
+# The same from there to a cycle of many crossings on the torus, on which neighbours close in.
+CLOSE_IN = 2048
 
 
 class Traced(NamedTuple):
@@ -52,6 +54,7 @@ class Traced(NamedTuple):
 
     states: Float[np.ndarray, "k 2n"]  # weighted deviations, in order
     amplitude: float  # m/s
+    period: float  # mean time between crossings, s
 
 
 class Torus(NamedTuple):
@@ -60,6 +63,16 @@ class Torus(NamedTuple):
     tube: Tube  # about weighted deviations; all comes back from its edge, and half of it captures
     amplitude: float  # m/s
     period: float  # mean time between crossings, s
+
+    @property
+    def reach(self) -> float:
+        """How far what it captures may be, relative to its size."""
+        return self.tube.radius / 2
+
+    @property
+    def contraction(self) -> float:
+        """The share of the tube to which everything came back that started on its edge."""
+        return BACK_TO
 
 
 def tori_from(
@@ -88,7 +101,7 @@ def tori_from(
             if not tried:
                 continue
             new, of_locked = _attracting(maps, group, tried, cycles, report)
-            found |= {row: Torus(one, traced[row].amplitude, period) for row, (one, period) in new.items()}
+            found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
                 del traced[row]
@@ -127,7 +140,8 @@ def _traced(
     maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, tori: list[list[Torus]], count: int
 ) -> dict[int, Traced]:
     """At least so many states of those motions, by row, that may be on a torus that is none of the known ones."""
-    running, paths, peaks = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1])), np.zeros((len(group), 0))
+    running, paths = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1]))
+    peaks, times = np.zeros((2, len(group), 0))
     traced: dict[int, Traced] = {}
     for length in range(AT_A_TIME, SETTLED_WITHIN + 1, AT_A_TIME):
         if not len(running):
@@ -136,8 +150,11 @@ def _traced(
             # Most are left out after this, and peaks take as long as the motion.
             at, more = maps.path(group[running], at, AT_A_TIME)
         else:
-            at, _, _, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
-            peaks = np.concatenate([peaks, highest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
+            at, _, taken, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
+            peaks, times = (
+                np.concatenate([earlier, latest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
+                for earlier, latest in ((peaks, highest), (times, taken))
+            )
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGEST:]
         ends = np.moveaxis(more, 1, 0)
@@ -151,14 +168,16 @@ def _traced(
             for k in np.flatnonzero(left):
                 amplitude = _settled(peaks[k])
                 if amplitude is not None and not drifting[k]:
-                    traced[int(running[k])] = Traced(paths[k, -LONGER:].copy(), amplitude)
+                    traced[int(running[k])] = Traced(
+                        paths[k, -LONGER:].copy(), amplitude, float(np.mean(times[k])) / AT_A_TIME
+                    )
                     left[k] = False
                 left[k] &= length < LONGER or (not drifting[k] if amplitude is None else length < LONGEST)
         if length == LONGER and np.any(left):
             # What never settles is chaos, mostly.
             growth, *_ = parting_rates(maps, group[running[left]], at.rows(left))
             left[left] = growth < PARTING
-        running, at, paths, peaks = running[left], at.rows(left), paths[left], peaks[left]
+        running, at, paths, peaks, times = running[left], at.rows(left), paths[left], peaks[left], times[left]
     return traced
 
 
@@ -240,10 +259,8 @@ def _attracting(
     tubes: list[tuple[int, Tube]],
     known: list[list[Cycle]],
     report,
-) -> tuple[dict[int, tuple[Tube, float]], list[tuple[int, Cycle]]]:
-    """Which of these tubes, each with its row, are about tori, with the mean time between crossings (s); and the cycles of tori
-    that are locked.
-    """
+) -> tuple[dict[int, Tube], list[tuple[int, Cycle]]]:
+    """Which of these tubes, each with its row, are about tori; and the cycles of tori that are locked."""
     own = np.array([groups[row] for row, _ in tubes])
     back, last = _back(maps, own, [one for _, one in tubes], report)
     if not len(back):
@@ -251,31 +268,31 @@ def _attracting(
     chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
     group = own[chosen // tube.STARTS]
     at = maps.returns(group, last.rows(chosen), COME_NEARER).at
-    growth, period, later, path = parting_rates(maps, group, at)
-    growth, period = (np.mean(part.reshape(-1, FURTHER), axis=1) for part in (growth, period))
+    growth, later, path = parting_rates(maps, group, at)
+    growth = np.mean(growth.reshape(-1, FURTHER), axis=1)
     lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
     closing_in = np.flatnonzero(growth < LOCKED)
     cycles: list[tuple[int, Cycle]] = []
     locked: list[int] = []
     of_group = {int(groups[row]): known[row] for row, _ in tubes}
-    # One motion of each after the other, because most lead to the same cycle. What is no torus for sure has no better
-    # attractor than a cycle with a narrow neighbourhood.
-    for nominee, settled in (*((k, False) for k in range(0, FURTHER, FURTHER // NOMINATED)), (0, True)):
+    # One motion of each after the other, because most lead to the same cycle. Only then a cycle of many crossings, or with a
+    # narrow neighbourhood.
+    nominees = ((k, MORE_CROSSINGS, False) for k in range(0, FURTHER, FURTHER // NOMINATED))
+    for nominee, crossings, settled in (*nominees, (0, MOST_CROSSINGS, True)):
         left = closing_in[~np.isin(closing_in, locked)]
-        asks = FURTHER * (left[~lasting[left]] if settled else left) + nominee
+        asks = FURTHER * left + nominee
         if not len(asks):
             continue
-        for _, rows, cycle in stable_cycles(maps, group[asks], later.rows(asks), of_group, MORE_CROSSINGS, settled):
+        at = later.rows(asks)
+        if settled:
+            at = maps.returns(group[asks], at, CLOSE_IN).at
+        for _, rows, cycle in stable_cycles(maps, group[asks], at, of_group, crossings, settled):
             of_torus = asks[rows] // FURTHER
             cycles.append((tubes[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
         kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
-    tori = {}
-    for k in kept[np.isfinite(period[kept])]:
-        row, one = tubes[back[k]]
-        tori[row] = one, float(period[k])
-    return tori, cycles
+    return dict(tubes[back[k]] for k in kept), cycles
 
 
 def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[Cycle]) -> bool:

@@ -40,6 +40,8 @@ class LimitCycle(eqx.Module):
       steady sliding: `deviation`, this state, and `points`, all states on the section. `crossings`: their number in one period.
     - `amplitude`, the peak tangential speed, in m/s; `harmonics`, Fourier coefficients of the velocities in m/s, by order and
       coordinate; `energy`, per period and by line of the ledger, in J.
+    - `reach` and `contraction` of the neighbourhood that draws motions in, of a cycle that was searched for: its size relative
+      to the cycle's, and the factor by which distances in it fall in one period (of a torus: the share to which all came back).
     - `residual`, how far the return is from the start, relative to the cycle's size (of a torus, of its points from the curve
       through the others); `return_jacobian`, the derivative of the return map over one period; `rotation_number` of a torus, in
       turns per return.
@@ -68,9 +70,10 @@ class LimitCycle(eqx.Module):
     points: Float[np.ndarray, "k state"]  # on the section, of one period or the torus, as deviations from sliding
     return_jacobian: Float[np.ndarray, "state state"]  # of the section's return map over one period
     rotation_number: float | None = None  # of a torus, in turns per return
-    reach: float | None = (
-        None  # of the neighbourhood that was seen to be drawn in, relative to its size; None if not asked for
-    )
+    # Of the neighbourhood that was seen to be drawn in: how far it reaches, relative to the cycle's size; and the factor by
+    # which distances in it fall in one period (to which share of it everything comes back, of a torus). None if not asked for.
+    reach: float | None = None
+    contraction: float | None = None
 
     @property
     def frequency(self) -> float:
@@ -151,16 +154,27 @@ class LimitCycle(eqx.Module):
         head = f"limit cycle ({self.kind}, {stability}): {size}"
         if self.kind == "torus":
             exponents = ", ".join(f"{np.log(abs(value)):.2g}" for value in self.multipliers[:4])
+            curve = (
+                "" if self.rotation_number is None else f"; its points lie on one up to {self.residual:.1e} of its size"
+            )
+            back = ""
+            if self.reach is not None and self.contraction is not None:
+                back = f", from {200 * self.reach:.2g} % of its size to {100 * self.contraction:.2g} % of that"
             rests_on = (
-                f"  stable, because starts in a tube about it come back into half of the tube\n"
-                f"  Lyapunov exponents per return: {exponents} (the first is zero on a torus, up to the error of the mean)\n"
-                f"  its points lie on one closed curve up to {self.residual:.1e} of its size"
+                f"  stable, because all starts on a tube about it came back{back}\n"
+                f"  Lyapunov exponents per return: {exponents} (the first is zero on a closed curve{curve})"
             )
             return f"{head}\n  word, from a point of the section: {modes}\n{rests_on}"
         largest = ", ".join(f"{abs(value):.6g}" for value in self.multipliers[:4])
+        captures = ""
+        if self.reach is not None and self.contraction is not None:
+            captures = (
+                f"; captures what comes within {100 * self.reach:.2g} % of that, where distances fall at least by the factor "
+                f"{self.contraction:.3g} a period"
+            )
         return (
             f"{head}\n  word: {modes}\n  sizes of the multipliers: {largest}\n"
-            f"  closes to {self.residual:.1e} of its size"
+            f"  closes to {self.residual:.1e} of its size{captures}"
         )
 
     __repr__ = __str__

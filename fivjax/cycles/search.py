@@ -208,7 +208,7 @@ def _described(maps: ReturnMaps, scene: Scene, cycle: Cycle) -> LimitCycle:
     about = cycle.neighbourhood
     point = Point(np.asarray(cycle.points[0]), Contact(np.asarray(about.status), np.asarray(about.direction)))
     found = limit_cycle_of(maps, scene, closed_at(maps, point, len(cycle.points)))
-    return dataclasses.replace(found, reach=about.radius / float(np.linalg.norm(maps.weights * about.centre)))
+    return dataclasses.replace(found, reach=cycle.reach, contraction=cycle.contraction)
 
 
 def _check(scene: Scene) -> None:

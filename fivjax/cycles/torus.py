@@ -58,7 +58,8 @@ def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitC
         points=points,
         return_jacobian=np.diag(np.pad(largest.real, (0, len(weights) - len(largest)))),
         rotation_number=rotation,
-        reach=torus.tube.radius / 2,
+        reach=torus.reach,
+        contraction=torus.contraction,
     )
 
 

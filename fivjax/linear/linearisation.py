@@ -34,7 +34,7 @@ class LinearSliding(eqx.Module):
     slip: Float[Array, "*contacts m"]  # derivative by z of the slip speed
     slip_margin: Float[Array, "*contacts"]  # its size at equilibrium, m/s
     remainder: Float[Array, "*contacts m"]  # direction in which the remainder of the friction law acts
-    remainder_slope: Float[Array, "*contacts"]  # bounds on that remainder, see `decays_nonlinearly`
+    remainder_slope: Float[Array, "*contacts"]  # bounds on that remainder, see `verdicts.sliding_proof`
     remainder_curvature: Float[Array, "*contacts"]
     reach: Float[Array, ""]  # the share of all margins up to which these bounds hold, and no contact lifts off
     direction: Float[Array, "*contacts"]  # of the friction force
@@ -105,7 +105,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
     $N_0(z) = -A_0^{-1} a_n(z)$ under $D_0$, the forces are $N = (I + X (D - D_0))^{-1} N_0$ with $X = A_0^{-1} G_{nt}$.
     Friction that differs from that at equilibrium adds the accelerations $M^{-1} P (D - D_0) N$, $P = W_t - (W_t D_0 + W_n) X$.
     `remainder` has the columns of $M^{-1} P$. The remainder of the linearisation in column i is at most `remainder_slope` plus
-    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`decays_nonlinearly`). The
+    half `remainder_curvature`, times the square of the largest deviation relative to its margin (`verdicts.sliding_proof`). The
     other contacts' friction changes a contact's force through $X$, too: `reach` says up to which deviation none can lift off.
     """
     n, load, law = scene.structure.size, scene.load.final, mechanics.friction

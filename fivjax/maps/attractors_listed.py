@@ -50,6 +50,8 @@ def attractor_table(
         "attractor_period": verdicts.attractor_period[chosen],
         "attractor_kind": KINDS[verdicts.attractor_kind[chosen]],
         "attractor_multiplier": verdicts.attractor_multiplier[chosen],
+        "attractor_reach": verdicts.attractor_reach[chosen],
+        "attractor_contraction": verdicts.attractor_contraction[chosen],
     }
 
 

@@ -12,7 +12,7 @@ from ..foundation.blocks import in_blocks
 from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..section.return_maps import BLOCK, Section, of_block
-from ..verdicts.sliding_proof import SlidingModes, slides_forever
+from ..verdicts.sliding_proof import SlidingModes, used_up
 from ..verdicts.slow_growth import slid_on
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
@@ -52,6 +52,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
     if setting.shared.drift is not None:
         jammed = sticks_forever(setting.shared.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
     quiet_load = jnp.all(scene.load.jumps <= now.t)
+    bound = used_up(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
         Verdict.NOT_FINITE,
@@ -59,30 +60,32 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             now.t <= began,
             Verdict.TOO_MANY_EVENTS,
             jnp.where(
-                slides_forever(mechanics, modes, now.contact, now.y, quiet_load),
+                bound < 1,
                 Verdict.SLIDING,
                 jnp.where(quiet_load & (jammed | grown), Verdict.UNBOUNDED, Verdict.UNDECIDED),
             ),
         ),
     )
-    now = eqx.tree_at(lambda now: now.verdict, now, verdict.astype(jnp.int8))
+    now = eqx.tree_at(lambda now: (now.verdict, now.bound), now, (verdict.astype(jnp.int8), bound))
     return _slid_on(setting, now, quiet_load) if _may_slide_on(setting, now) else now
 
 
-def slide_forever(
+def bounds(
     shared: Flattened, group: Int[np.ndarray, " m"], at: Section, pool: ThreadPoolExecutor
-) -> Bool[np.ndarray, " m"]:
-    """Which motions from these states, under their final loads, are certain to slide for ever."""
+) -> Float[np.ndarray, " m"]:
+    """Bounds on the shares of their margins that motions from these states can use up under their final loads: those below 1
+    slide for ever.
+    """
     tree = shared.tree
     own = flatten((tree.mechanics, tree.modes))
-    return in_blocks(_slide_forever, own, group, at.flattened(), 1, pool, size=BLOCK).tree.astype(bool)
+    return in_blocks(_bounds, own, group, at.flattened(), 1, pool, size=BLOCK).tree
 
 
 @compiled
-def _slide_forever(shared: Flattened, rows: Flattened) -> Flattened:
+def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
         mechanics, modes = shared
-        return slides_forever(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
+        return used_up(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
 
     return of_block(one, shared, rows)
 

@@ -10,7 +10,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
 from ..verdicts.sliding_proof import why_withheld
-from ..verdicts.verdict import FAILURES, MEANING, Verdict
+from ..verdicts.verdict import FAILURES, MEANING, RESTS_ON, Proof, Verdict
 from .attractors_listed import attractor_table
 from .crossing import first_crossings
 from .groups import kernels_by
@@ -22,6 +22,16 @@ from .trajectories import Grid
 def time_limit(t_max: float | None) -> dict[str, float]:
     """The attribute for a time limit, if one was given."""
     return {} if t_max is None else {"t_max": t_max}
+
+
+def _proofs(verdicts: Verdicts) -> np.ndarray:
+    """What each verdict rests on."""
+    verdict, captured = verdicts.verdict, np.where(verdicts.attractor_kind == 1, Proof.TUBE, Proof.ELLIPSOID)
+    proofs = {Verdict.SLIDING: Proof.BOUND, Verdict.LIMIT_CYCLE: captured, Verdict.UNBOUNDED: Proof.GROWTH}
+    chosen = [verdict == one for one in proofs]
+    return np.select(chosen, [np.broadcast_to(one, verdict.shape) for one in proofs.values()], Proof.NONE).astype(
+        np.int8
+    )
 
 
 def map_dataset(
@@ -49,6 +59,8 @@ def map_dataset(
             "verdict": over_axes(verdicts.verdict),
             "amplitude": over_axes(verdicts.amplitude),
             "decided_at": over_axes(verdicts.decided_at),
+            "proof": over_axes(_proofs(verdicts)),
+            "bound": over_axes(verdicts.bound),
             "contact_events": over_axes(verdicts.events),
             "last_event": over_axes(verdicts.last_event),
             "attractor": over_axes(place),
@@ -80,6 +92,11 @@ def map_dataset(
         flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
         flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
         meaning=json.dumps({verdict.value: sentence for verdict, sentence in meaning.items()}),
+    )
+    dataset["proof"].attrs.update(
+        flag_values=np.array(list(RESTS_ON), np.int8),
+        flag_meanings=" ".join(proof.name.lower() for proof in RESTS_ON),
+        meaning=json.dumps({proof.value: sentence for proof, sentence in RESTS_ON.items()}),
     )
     dataset.attrs.update(linear)
     every = dataset["verdict"].values

@@ -36,6 +36,9 @@ class Progress(eqx.Module):
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
     verdict: Int[Array, ""]
+    bound: Float[
+        Array, ""
+    ]  # on the share of its margins that it can still use up, once it slides for ever; else infinite
     energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
     steps: "LoadSteps | None" = None  # for a kernel
 
@@ -89,6 +92,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool,
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
+        bound=jnp.full((), jnp.inf, y.dtype),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
         steps=LoadSteps(scene.load) if for_kernel else None,
     )
@@ -153,6 +157,7 @@ def step(setting: Setting, now: Progress) -> Progress:
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
         verdict=now.verdict,
+        bound=now.bound,
         energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
         steps=now.steps,
     )

@@ -34,6 +34,9 @@ class Verdicts(NamedTuple):
     attractor_kind: np.ndarray  # of the attractor: 0 periodic, 1 torus; else `NO_ATTRACTOR` or `CHAOTIC`
     attractor_period: np.ndarray  # s
     attractor_multiplier: np.ndarray  # size of the largest
+    attractor_reach: np.ndarray  # of the neighbourhood that it draws in, relative to its size
+    attractor_contraction: np.ndarray  # the factor by which that shrinks
+    bound: np.ndarray  # on the share of the margins of sliding that can still be used up; NaN but for those that slide
     decided_at: np.ndarray  # s
     events: np.ndarray
     last_event: np.ndarray  # s
@@ -52,6 +55,9 @@ def not_run(total: int, energy: bool) -> Verdicts:
         attractor_kind=np.full(total, NO_ATTRACTOR, np.int8),
         attractor_period=np.full(total, np.nan),
         attractor_multiplier=np.full(total, np.nan),
+        attractor_reach=np.full(total, np.nan),
+        attractor_contraction=np.full(total, np.nan),
+        bound=np.full(total, np.nan),
         decided_at=np.full(total, np.nan),
         events=np.zeros(total, np.int32),
         last_event=np.full(total, np.nan),
@@ -73,6 +79,8 @@ class Ended(NamedTuple):
     amplitude: np.ndarray
     period: np.ndarray
     multiplier: np.ndarray
+    reach: np.ndarray
+    contraction: np.ndarray
 
 
 def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -> None:
@@ -82,6 +90,9 @@ def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -
     verdicts.attractor_kind[index] = ended.kind
     verdicts.attractor_period[index] = ended.period
     verdicts.attractor_multiplier[index] = ended.multiplier
+    verdicts.attractor_reach[index] = ended.reach
+    verdicts.attractor_contraction[index] = ended.contraction
+    verdicts.bound[index] = np.where(verdict == Verdict.SLIDING, now.bound, np.nan)
     verdicts.decided_at[index] = np.where(verdict >= 0, now.t, np.nan)
     verdicts.events[index] = now.events
     verdicts.last_event[index] = now.last_event

@@ -21,7 +21,7 @@ from ..foundation.flattened import Flattened
 from ..section.return_maps import INTERPOLATED, ROUNDED, ReturnMaps, Section
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
-from .conclusion import slide_forever
+from .conclusion import bounds
 from .following import begun, compile_conclusions, follow
 from .groups import Batch, grouped, shared_by
 from .halfway import Halfway, Log, NoLog
@@ -174,14 +174,19 @@ def _later(now: Progress, rows: Int[np.ndarray, " r"], time: Float[np.ndarray, "
 
 
 def _described(count: int, attractor: dict[int, Cycle | Torus], chaotic: np.ndarray):
-    """Kind, amplitude, period and multiplier of the attractor of each of so many trajectories."""
+    """Kind, amplitude, period, multiplier, reach and contraction of the attractor of each of so many trajectories."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
-    amplitude, period, multiplier = np.full((3, count), np.nan)
+    amplitude, period, multiplier, reach, contraction = np.full((5, count), np.nan)
     for row, one in attractor.items():
         kind[row] = isinstance(one, Torus)
-        amplitude[row], period[row] = one.amplitude, one.period
+        amplitude[row], period[row], reach[row], contraction[row] = (
+            one.amplitude,
+            one.period,
+            one.reach,
+            one.contraction,
+        )
         multiplier[row] = one.multiplier if isinstance(one, Cycle) else np.nan
-    return kind, amplitude, period, multiplier
+    return kind, amplitude, period, multiplier, reach, contraction
 
 
 class Basins:
@@ -296,8 +301,9 @@ class Basins:
         chaotic[asks] = found.chaotic
         sliding = np.flatnonzero(found.without_events)
         if len(sliding):
-            certain = slide_forever(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
-            sliding = sliding[certain]
+            bound = bounds(self.shared, group[sliding], found.at.rows(sliding), self.batch.pool)
+            now.bound[asks[sliding]] = bound
+            sliding = sliding[bound < 1]
         decided = np.array([*found.attractor, *sliding], int)
         now = _later(now, asks[decided], found.time[decided], found.events[decided])
         return chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding], now

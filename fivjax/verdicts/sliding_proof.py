@@ -7,7 +7,7 @@ future. A quiet interval proves nothing: close to the stability limit two modes 
 kick grows for a second before it decays.
 
 - Constant friction: a bound on the sum that includes the slow beat of the modes (`envelope_peak`).
-- Speed-dependent friction: the linear motion with a bound on the remainder (`decays_nonlinearly`).
+- Speed-dependent friction: the linear motion with a bound on the remainder (`_used_nonlinearly`).
 """
 
 import equinox as eqx
@@ -140,9 +140,21 @@ def slides_forever(
     deviation: State,
     under_final_load: Bool[Array, ""] | bool,
 ) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now never stops sliding.
+    """Whether a bound shows that a contact which slides now never stops sliding, see `used_up`."""
+    return used_up(mechanics, modes, contact, deviation, under_final_load) < 1
 
-    `deviation` is that of the state from the equilibrium; without `under_final_load` nothing is proved. With several contacts:
+
+def used_up(
+    mechanics: Mechanics,
+    modes: SlidingModes,
+    contact: Contact,
+    deviation: State,
+    under_final_load: Bool[Array, ""] | bool,
+) -> Float[Array, ""]:
+    """The largest share of a margin, to the contact's opening or to its sticking, that a motion which slides now can ever use
+    up: below 1 it slides for ever. Infinite where there is no such bound.
+
+    `deviation` is that of the state from the equilibrium; without `under_final_load` nothing is known. With several contacts:
     all of them slide now, and none ever stops.
     """
     linear = modes.linear
@@ -152,8 +164,8 @@ def slides_forever(
     sliding = (jnp.all(slides) if mechanics.several else slides) & under_final_load
     sliding = sliding & modes.stable & linear.exists
     if not mechanics.friction.constant:
-        decays = decays_nonlinearly_together if mechanics.several else decays_nonlinearly
-        return sliding & decays(modes, modal)
+        of_all = _used_nonlinearly_together if mechanics.several else _used_nonlinearly
+        return _where_known(sliding, of_all(modes, modal))
     members = modes.envelope.members
     parts = _parts(modes.pressing, modal, linear.pressing_margin) + _parts(modes.slip, modal, linear.slip_margin)
     # The bound is costly. As the body of a loop it is computed for a batch only if some trajectory needs it: one for which
@@ -161,17 +173,20 @@ def slides_forever(
     for shares, margin in parts:
         sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
 
-    def prove(carry):
+    def bound(carry):
         _, _, signals = carry
-        peaks = [envelope_peak(shares, modes.envelope) for shares in signals]
-        proved = jnp.asarray(True)
-        for peak, (_, margin) in zip(peaks, parts, strict=True):
-            proved = proved & (peak < margin)
+        used = [envelope_peak(part, modes.envelope) / margin for part, (_, margin) in zip(signals, parts, strict=True)]
         # The loop changes `signals`, because XLA would move work on loop constants out of the loop and always compute it.
-        return jnp.zeros_like(sliding), proved, [jnp.zeros_like(shares) for shares in signals]
+        return jnp.zeros_like(sliding), jnp.max(jnp.stack(used)), [jnp.zeros_like(shares) for shares in signals]
 
-    begin = sliding, jnp.zeros_like(sliding), [shares for shares, _ in parts]
-    return jax.lax.while_loop(lambda carry: carry[0], prove, begin)[1]
+    begin = sliding, jnp.full_like(linear.slip_margin.ravel()[0], jnp.inf), [shares for shares, _ in parts]
+    found = jax.lax.while_loop(lambda carry: carry[0], bound, begin)[1]
+    return _where_known(sliding, found)
+
+
+def _where_known(known: Bool[Array, ""], used: Float[Array, ""]) -> Float[Array, ""]:
+    """No number, or a margin that is none, is no bound."""
+    return jnp.where(known & (used >= 0), used, jnp.inf)
 
 
 def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], margin: Float[Array, "*contacts"]):
@@ -253,8 +268,8 @@ def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Arr
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
-def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
-    r"""Whether a bound shows that the motion decays, for friction that depends on slip speed.
+def _used_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Float[Array, ""]:
+    r"""The share of what keeps it decaying that a motion uses up, for friction that depends on slip speed.
 
     The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
     pressing acceleration by $E/κ$. The remainder of the linearisation is then at most $C E^2$, so
@@ -267,10 +282,10 @@ def decays_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool
     drive = jnp.sum(weights * jnp.abs(modes.remainder))
     bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
     rate = -jnp.max(modes.eigenvalues.real)
-    return (drive * bend * size < rate) & (size < linear.reach * linear.slip_margin)
+    return jnp.maximum(drive * bend * size / rate, size / (linear.reach * linear.slip_margin))
 
 
-def decays_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Bool[Array, ""]:
+def _used_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Float[Array, ""]:
     r"""The same for several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any normal force or slip
     speed, relative to its margin. No slip speed then changes by more than $E$ times its margin, nor does a normal force under
     constant friction. Up to $E$ = `LinearSliding.reach` no normal force reaches zero either, the remainders are at most
@@ -282,7 +297,7 @@ def decays_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]
     drive = jnp.einsum("ck,k->c", jnp.abs(modes.remainder), weights)
     bend = linear.remainder_slope + 0.5 * linear.remainder_curvature
     rate = -jnp.max(modes.eigenvalues.real)
-    return (jnp.sum(drive * bend) * size < rate) & (size < linear.reach)
+    return jnp.maximum(jnp.sum(drive * bend) * size / rate, size / linear.reach)
 
 
 def _largest(shares: Complex[Array, "contacts k"], margin: Float[Array, " contacts"]) -> Float[Array, " k"]:

@@ -47,3 +47,31 @@ MEANING = {
 
 # Verdicts of trajectories that could not be followed, as opposed to those that were followed without a proof.
 FAILURES = frozenset(Verdict) - {Verdict.SLIDING, Verdict.LIMIT_CYCLE, Verdict.UNDECIDED, Verdict.NOT_RUN}
+
+
+class Proof(enum.IntEnum):
+    """What a verdict of a map rests on; the attribute `meaning` of the variable `proof` has a sentence for each.
+
+    **Example:**
+
+        >>> fj.Proof(2).name
+        'ELLIPSOID'
+    """
+
+    NONE = 0
+    BOUND = 1
+    ELLIPSOID = 2
+    TUBE = 3
+    GROWTH = 4
+
+
+RESTS_ON = {
+    Proof.NONE: "nothing is proved",
+    Proof.BOUND: "a bound on all that is to come: no more than the share `bound` of the margins to lift-off and to sticking "
+    "can be used up",
+    Proof.ELLIPSOID: "an ellipsoid about a stable cycle, of the size `attractor_reach`, which the return map was checked to "
+    "contract into itself by the factor `attractor_contraction`",
+    Proof.TUBE: "a tube about a torus: all starts on its edge came back to the share `attractor_contraction` of it, and half "
+    "of it, `attractor_reach`, captures",
+    Proof.GROWTH: "it sticks and is pressed on ever harder, or has grown a billionfold",
+}
