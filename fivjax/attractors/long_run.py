@@ -5,12 +5,14 @@ each is asked, and from where it is thousands of returns later: cycles count how
 their neighbourhood is, and tori however narrow the tube from which everything comes back to them. The proof is the same.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
+from .creeping import crept
 from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Cycle, distinct
 from .known import Attractors, add_cycles, add_tori, come_to
 from .parting import followed_on
@@ -35,10 +37,15 @@ class Fates(NamedTuple):
 
 
 def fates(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, of_group: dict[int, Attractors], report
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    at: Section,
+    of_group: dict[int, Attractors],
+    report,
+    slides: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]] | None = None,
 ) -> Fates:
     """What becomes of motions from these states; their loads are final. `of_group` are the attractors known of each group, and
-    gets those that are found.
+    gets those that are found. `slides` tells, by groups and states, which motions are certain to slide for ever.
     """
     at, events, time, *_ = maps.returns(group, at, 1)
     attractor: dict[int, Cycle | Torus] = {}
@@ -52,7 +59,7 @@ def fates(
         attractor |= {int(rows[row]): one for row, one in captured.items()}
         rows = np.delete(rows, list(captured))
         if len(rows):
-            found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report)
+            found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report, slides)
             chaotic[rows], quiet[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
             time[rows] += found.time
@@ -72,6 +79,7 @@ def _followed(
     onward: Bool[np.ndarray, " m"],
     of_group: dict[int, Attractors],
     report,
+    slides,
 ) -> Fates:
     """The same of motions each of which is followed for thousands of returns, and those to be followed `onward`, if they drift,
     for tens of thousands.
@@ -92,7 +100,8 @@ def _followed(
         if len(picked):
             _search(maps, group, now, followed.closing_in, picked, of_group, report)
         asks[picked] = False
-        drifting = _drifted(maps, group, now, time, events, left & onward)
+        creeping = _crept(maps, group, now, time, events, left & onward, of_group, slides)
+        drifting = creeping | _drifted(maps, group, now, time, events, left & onward & ~creeping)
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
@@ -101,6 +110,31 @@ def _followed(
     if len(rows):
         chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
     return Fates(chaotic, attractor, quiet, now, time, events)
+
+
+def _crept(
+    maps: ReturnMaps, group, now: Section, time, events, asked: Bool[np.ndarray, " m"], of_group, slides
+) -> Bool[np.ndarray, " m"]:
+    """Which of these motions creep along a line of states: `now` they are further, after that much more `time` and `events`,
+    where an attractor captures them, where they are certain to slide for ever, or where they creep no more.
+    """
+    asked_rows = np.flatnonzero(asked)
+
+    def arrived(rows, at: Section) -> Bool[np.ndarray, " r"]:
+        own = group[asked_rows[rows]]
+        done = ~maps.moves(own, at.y)
+        done[list(come_to(maps, own, at, at.y, ~done, of_group))] = True
+        return done if slides is None else done | slides(own, at)
+
+    creeping = np.zeros(len(asked), bool)
+    if len(asked_rows):
+        creeps, at, later, more = crept(maps, group[asked_rows], now.rows(asked_rows), arrived)
+        rows = asked_rows[creeps]
+        creeping[rows] = True
+        now.put(rows, at.rows(creeps))
+        time[rows] += later[creeps]
+        events[rows] += more[creeps]
+    return creeping
 
 
 def _drifted(

@@ -92,8 +92,8 @@ def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -
     verdicts.attractor_multiplier[index] = ended.multiplier
     verdicts.attractor_reach[index] = ended.reach
     verdicts.attractor_contraction[index] = ended.contraction
-    verdicts.bound[index] = np.where(verdict == Verdict.SLIDING, now.bound, np.nan)
     verdicts.decided_at[index] = np.where(verdict >= 0, now.t, np.nan)
+    verdicts.bound[index] = np.where(verdict == Verdict.SLIDING, now.bound, np.nan)
     verdicts.events[index] = now.events
     verdicts.last_event[index] = now.last_event
     if now.energy is not None:

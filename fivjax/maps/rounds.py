@@ -297,7 +297,11 @@ class Basins:
         for g in np.unique(group).tolist():
             if g not in self.known_at_last:
                 self.known_at_last[g] = self.known[g].copy()
-        found = fates(self.maps, group, at, self.known_at_last, report)
+
+        def slides(own, at: Section) -> Bool[np.ndarray, " r"]:
+            return bounds(self.shared, own, at, self.batch.pool) < 1
+
+        found = fates(self.maps, group, at, self.known_at_last, report, slides)
         chaotic[asks] = found.chaotic
         sliding = np.flatnonzero(found.without_events)
         if len(sliding):
