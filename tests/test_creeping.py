@@ -1,0 +1,90 @@
+"""Motions that creep along a line of states: no cycle is leapt over, and what is found is what a long run shows."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import fivjax as fj
+from fivjax.attractors.creeping import crept
+from fivjax.section.return_maps import Images, Section
+
+
+class Line(SimpleNamespace):
+    """The return map of a state (x, z): x drifts by `drift(x)` a return, and z decays to a curve, like other deviations do."""
+
+    weights = np.ones(2)
+
+    def returns(self, group, at, crossings):
+        y, crossings = at.y.copy(), np.broadcast_to(crossings, len(at.y))
+        for count in range(int(np.max(crossings))):
+            moving = crossings > count
+            x, z = y[moving].T
+            y[moving] = np.stack(
+                [x + self.drift(x) + self.coupling * (z - 0.1 * x**2), 0.98 * z + 0.002 * x**2], axis=1
+            )
+        return Images(
+            at._replace(y=y), np.zeros(len(y), int), 1.0 * crossings, np.zeros((len(y), 1, 2)), np.zeros(len(y))
+        )
+
+
+def on_line(drift, starts, arrived, most=3.0, coupling=0.01):
+    """Where motions from these x creep to, and after how many returns."""
+    y = np.stack([starts, 0.1 * starts**2], axis=1)
+    at = Section(y, np.ones(len(y), np.int32), np.ones(len(y)))
+
+    def done(rows, at):
+        del rows
+        return arrived(at.y[:, 0]) | (at.y[:, 0] > most)
+
+    creeps, last, time, _ = crept(Line(drift=drift, coupling=coupling), np.zeros(len(y), int), at, done)
+    return creeps, last.y[:, 0], time
+
+
+@pytest.mark.parametrize("apart", [0.03, 0.01, 1e-3])
+@pytest.mark.parametrize("at", np.linspace(1.0, 1.06, 7))
+def test_a_pair_of_cycles_is_not_leapt_over(at, apart):
+    """Two cycles, born in a fold, lie closer to each other than a leap is long: what comes from below stays at the lower one."""
+    starts = np.linspace(0.5, 0.9, 5)
+    creeps, x, _ = on_line(lambda x: 1e-5 * ((x - at) ** 2 - apart**2), starts, lambda x: np.zeros(len(x), bool))
+    assert np.all(creeps) and np.all(x < at)
+    assert np.all(at - apart - x < 0.5 * (at - starts))
+
+
+def test_what_the_fold_has_left_behind_is_passed():
+    """Just past the fold the motion is slow, and goes on."""
+    creeps, x, _ = on_line(lambda x: 1e-5 * ((x - 1.0) ** 2 + 0.05**2), np.array([0.5, 0.8]), lambda x: x > 1.5)
+    assert np.all(creeps) and np.all(x > 1.5)
+
+
+@pytest.mark.parametrize("rate", [1e-5, -1e-5])
+def test_how_long_a_slow_growth_takes(rate):
+    """A deviation that grows or decays by the same factor in each return, to the tenfold or a tenth: ln 10 / |rate| returns."""
+    creeps, x, time = on_line(lambda x: rate * x, np.ones(1), lambda x: np.abs(np.log(x)) >= np.log(10.0), np.inf, 0.0)
+    assert creeps[0] and time[0] == pytest.approx(np.abs(np.log(x[0])) / abs(rate), rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def near_hopf():
+    """A scene on a belt at a given share more than the speed at which sliding becomes stable under falling friction."""
+    structure, law = fj.belt_oscillator(), fj.ExponentialDecay(0.15, 0.1, 1.5)
+
+    def scene(v):
+        return fj.Scene(structure, law, float(v), load=fj.Pulse(100.0, 1.2))
+
+    hopf = brentq(lambda v: float(np.max(np.real(fj.cea.eigenvalues(scene(v))))), 0.2, 3.0, xtol=1e-13)
+    return lambda share: scene((1 + share) * hopf)
+
+
+@pytest.mark.parametrize("share", [-1e-3, 3e-3])
+def test_near_a_hopf_point_verdicts_are_those_of_long_runs(near_hopf, share):
+    """Multipliers there are 1 ± 5e-5: a thousand seconds, which kernels follow step by step if they are told to."""
+    scene, p = near_hopf(share), [0.97, 1.01, 1.2, 1.6]
+    found = fj.bistability_map(scene, p=p, progress=False)
+    followed = fj.bistability_map(scene, p=p, progress=False, t_max=1e5, max_steps=10**9)
+    assert not np.any(found["verdict"] == fj.Verdict.UNDECIDED)
+    np.testing.assert_array_equal(found["verdict"], followed["verdict"])
+    late = followed["decided_at"].values > 500.0
+    assert np.any(late)
+    np.testing.assert_allclose(found["decided_at"].values[late], followed["decided_at"].values[late], rtol=0.3)
