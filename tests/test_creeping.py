@@ -62,7 +62,7 @@ def test_what_the_fold_has_left_behind_is_passed():
 def test_how_long_a_slow_growth_takes(rate):
     """A deviation that grows or decays by the same factor in each return, to the tenfold or a tenth: ln 10 / |rate| returns."""
     creeps, x, time = on_line(lambda x: rate * x, np.ones(1), lambda x: np.abs(np.log(x)) >= np.log(10.0), np.inf, 0.0)
-    assert creeps[0] and time[0] == pytest.approx(np.abs(np.log(x[0])) / abs(rate), rel=0.01)
+    assert creeps[0] and time[0] == pytest.approx(np.abs(np.log(x[0])) / abs(rate), rel=0.03)
 
 
 @pytest.fixture(scope="module")
