@@ -28,6 +28,8 @@ DRIFT, SHRINKS = 5e-3, 0.05
 # they have come to it, after so many returns. Its states are in clusters: distances between neighbours are mostly smaller than
 # this share of those on a curve.
 REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
+# Locked more strongly, it comes back this close, in the end, within `MOST_CROSSINGS`: hardly any motion on a torus does.
+NEARLY_REPEATS = 1e-4
 # Crossings in which starts on the tube's edge have to be back in this share of it, which is less than what captures: next to a
 # slow fade there is a direction in which they come back hardly at all. The first few starts tell most sets that do not attract.
 BACK_WITHIN, BACK_TO, FIRST = 1536, 0.25, 4
@@ -88,9 +90,11 @@ def tori_from(
     `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
     """
     traced = _traced(maps, group, at, tori, max(TRACED, tubes[-1][1]))
-    around = _traced_around(maps, group, traced)
     found: dict[int, Torus] = {}
-    locked: list[tuple[int, Cycle]] = []
+    locked = _repeating(maps, group, traced, cycles)
+    for row, _ in locked:
+        del traced[row]
+    around = _traced_around(maps, group, traced)
     # A tube that is wider says more, where everything in it comes back.
     for radius, count in tubes:
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
@@ -107,6 +111,24 @@ def tori_from(
                 del traced[row]
                 around.pop(row, None)
     return found, locked
+
+
+def _repeating(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], cycles: list[list[Cycle]]
+) -> list[tuple[int, Cycle]]:
+    """The cycles of motions that have nearly come to one of many crossings by the end of what they trace, with their rows."""
+    rows = []
+    for row, one in traced.items():
+        back = np.linalg.norm(one.states[-1 - MOST_CROSSINGS : -1] - one.states[-1], axis=1)
+        if np.min(back) <= NEARLY_REPEATS * extent(one.states):
+            rows.append(row)
+    if not rows:
+        return []
+    own, last = group[rows], np.array([traced[row].states[-1] for row in rows]) / maps.weights
+    at = section_at(last, maps.normal, maps.sliding[own])
+    known = {int(group[row]): cycles[row] for row in rows}
+    near = stable_cycles(maps, own, at, known, MOST_CROSSINGS, settled=True)
+    return [(rows[k], cycle) for _, which, cycle in near for k in which]
 
 
 def reached(

@@ -14,7 +14,8 @@ from .results import Verdicts, not_run
 from .shares import wilson
 from .trajectories import Places
 
-# If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors.
+# If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A torus
+# and the cycle that it locks to next door do not.
 JUMP = 1.1
 
 # A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
@@ -123,11 +124,10 @@ def audit_note(audit: Audit) -> dict[str, float | int]:
 
 def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:
     """Which cells have corners that differ."""
-    verdict, kind = verdicts.verdict[corners], verdicts.attractor_kind[corners]
+    verdict = verdicts.verdict[corners]
     size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
     low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
-    different = [_over_corners(np.minimum, part) != _over_corners(np.maximum, part) for part in (verdict, kind)]
-    return different[0] | different[1] | (high > JUMP * low)
+    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > JUMP * low)
 
 
 def _over_corners(combine, values: np.ndarray) -> np.ndarray:

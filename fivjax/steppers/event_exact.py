@@ -34,6 +34,8 @@ Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
 # How much larger a step's relative error may be in a derivative than in the motion.
 LOOSER = 10
+# The share of a step behind a fall of the tangential velocity through zero at which it ends, if there is a rise behind it.
+FALLEN = 1e-3
 
 
 class EventExact(AbstractStepper):
@@ -122,9 +124,10 @@ class EventExact(AbstractStepper):
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
         if at_section:
-            # One more row for the rise through zero of the tangential velocity, no event of the contact.
-            rising = -jax.vmap(lambda state: section_speed(mechanics, state))(states)
-            guards = jnp.concatenate([guards, rising[:, None]], axis=1)
+            # One more row for the rise through zero of the tangential velocity, no event of the contact; or for its fall.
+            before = before_section(mechanics, y)
+            speed = jax.vmap(lambda state: section_speed(mechanics, state))(states)
+            guards = jnp.concatenate([guards, jnp.where(before, -speed, speed)[:, None]], axis=1)
             # With several contacts, a small distance from the section is no rounding error.
             rounding = jnp.pad(rounding, ((0, 0), (0, 1)))
             exact = jnp.append(exact, mechanics.several)
@@ -132,10 +135,16 @@ class EventExact(AbstractStepper):
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
+        if at_section:
+            # A fall is looked for only where the velocity has risen again by the end.
+            watched = before | (jnp.sum(scaled[:, count]) >= 0)
+            scaled = jnp.where(watched | (jnp.arange(count + 1) < count), scaled, 0.0)
         safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact)
         if at_section:
-            watching = jnp.arange(count + 1) < count + before_section(mechanics, y)
-            safe, fires = jnp.where(watching, safe, 1.0), fires & watching
+            # A fall is no event; a step ends a little after it, so that the next one sees the rise.
+            fell, row = fires[count] & ~before, jnp.arange(count + 1) == count
+            safe = jnp.where(row & fell, jnp.minimum(safe + FALLEN, 1.0), safe)
+            fires = fires & (before | ~row)
         first = jnp.min(safe)
         # Guards whose roots differ by rounding only run out together.
         at_once = safe <= first * (1 + 4 * jnp.finfo(y.dtype).eps)
