@@ -11,6 +11,7 @@ import fivjax as fj
 from fivjax.attractors.tori import section_at
 from fivjax.maps.groups import Batch, shared_by
 from fivjax.maps.matrix_kernels import Kernels
+from fivjax.section.about_sliding import sliding_state
 from fivjax.section.return_maps import ReturnMaps, Section
 from fivjax.steppers.propagation import Propagation
 
@@ -87,3 +88,24 @@ def test_differences_are_the_derivative_through_events(maps, exactly, starts):
     free = np.array([0, 1, 4])
     difference = (scale * (ours - theirs))[:, :, free]
     assert np.max(np.abs(difference)) < 1e-6 * np.max(np.abs((scale * theirs)[:, :, free]))
+
+
+def test_each_rise_of_the_velocity_is_a_crossing():
+    """A light mass in flight vibrates so fast that the velocity falls and rises again within a step: that counts, too."""
+    parts = dict(m1=0.45, m2=0.0092, c1=1.65, c2=0.483, k1=32851.0, k2=48414.0, theta=0.19)
+    scene = fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(0.3076), belt_speed=32.26, load=fj.Pulse(100.0, 6.0, 0.1))
+    run = fj.simulate(scene, 3.0, 1e-5)
+    after = run.t >= 0.1
+    speed = run.velocity[after, scene.structure.tangential]
+    expected = int(np.sum((speed[:-1] < 0) & (speed[1:] >= 0)))
+    start = np.concatenate([run.displacement[after][0], run.velocity[after][0]])
+    maps, only = ReturnMaps.of(scene), np.zeros(1, int)
+    at = maps.in_contact(only, (start - np.asarray(sliding_state(scene, scene.load.final)))[None])
+    count, time = 0, 0.0
+    while True:
+        image = maps.returns(only, at, 1)
+        time, at = time + float(image.time[0]), image.at
+        if time > run.t[-1] - 0.1:
+            break
+        count += 1
+    assert count == expected and count > 100

@@ -258,7 +258,7 @@ def enter(
         stick_time=ledger.stick_time + jnp.where(_all(mechanics, sticks), after.h, 0.0),
         detach_time=ledger.detach_time + jnp.where(_all(mechanics, detached), after.h, 0.0),
         events=ledger.events + (jnp.sum(happened, dtype=jnp.int32) if mechanics.several else happened),
-        crossings=ledger.crossings + rise_between(mechanics, y, after.y).happened,
+        crossings=ledger.crossings + rise_between(mechanics, y, after.end, after.y).happened,
         beyond_rest=ledger.beyond_rest + beyond_rest,
         start=ledger.start,
         worst=ledger.worst,

@@ -174,7 +174,8 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
     h = until - t
     # Equal parts, if steps are limited. The 1e-6 keeps rounding from adding another part of vanishing length.
     parts = jnp.where(jnp.isfinite(h), jnp.maximum(jnp.ceil(h / method.dt - 1e-6), 1.0), 1.0)
-    after, states, unit = method.with_series(mechanics, contact, load, y, h / parts)
+    # The ledger counts crossings of the section.
+    after, states, unit = method.with_series(mechanics, contact, load, y, h / parts, accounts_of is not None)
     arrived = (parts == 1) & (after.h >= h)
     ledger = None
     if accounts_of is not None:

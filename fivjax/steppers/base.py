@@ -76,7 +76,7 @@ def advance_between(
     mechanics: Mechanics,
 ) -> Advance:
     """An advance whose rise of the tangential velocity, if any, is found from its first and last state alone."""
-    return Advance(y, contact, h, rise_between(mechanics, before, y), end, ended)
+    return Advance(y, contact, h, rise_between(mechanics, before, end, y), end, ended)
 
 
 class Within(NamedTuple):

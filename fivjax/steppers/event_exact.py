@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from diffrax import AbstractLocalInterpolation
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State, Status
@@ -36,6 +36,8 @@ Stepper = TypeVar("Stepper", bound=AbstractStepper)
 LOOSER = 10
 # The share of a step behind a fall of the tangential velocity through zero at which it ends, if there is a rise behind it.
 FALLEN = 1e-3
+# Samples behind the fall that tell.
+SAMPLES = 16
 
 
 class EventExact(AbstractStepper):
@@ -135,15 +137,16 @@ class EventExact(AbstractStepper):
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
-        if at_section:
-            # A fall is looked for only where the velocity has risen again by the end.
-            watched = before | (jnp.sum(scaled[:, count]) >= 0)
-            scaled = jnp.where(watched | (jnp.arange(count + 1) < count), scaled, 0.0)
         safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact)
         if at_section:
-            # A fall is no event; a step ends a little after it, so that the next one sees the rise.
+            # A fall is no event; but where there is a rise behind it, the step ends a little after it, so that the next one
+            # sees the rise.
             fell, row = fires[count] & ~before, jnp.arange(count + 1) == count
-            safe = jnp.where(row & fell, jnp.minimum(safe + FALLEN, 1.0), safe)
+            fall, end = safe[count], jnp.min(safe[:count])
+            again = jax.lax.cond(
+                fell & (fall < end), lambda: _rises(jax.lax.stop_gradient(scaled[:, count]), fall, end), lambda: False
+            )
+            safe = jnp.where(row & fell, jnp.where(again, jnp.minimum(fall + FALLEN, 1.0), 1.0), safe)
             fires = fires & (before | ~row)
         first = jnp.min(safe)
         # Guards whose roots differ by rounding only run out together.
@@ -240,6 +243,12 @@ class EventExact(AbstractStepper):
             lambda: agreeing(law, contact, series.friction, series.slip, reach, self.tolerance),
             lambda: jnp.ones_like(reach),
         )
+
+
+def _rises(speed: Float[Array, " k"], fall: Float[Array, ""], end: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a velocity that falls through zero has risen through it again before the end of a step, by its samples."""
+    values, _ = value_and_slope(speed, fall + (end - fall) * np.arange(1, SAMPLES + 1) / SAMPLES)
+    return jnp.any(values >= 0)
 
 
 def for_derivatives(stepper: Stepper) -> Stepper:

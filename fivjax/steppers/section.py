@@ -56,9 +56,12 @@ def before_section(mechanics: Mechanics, y: State) -> Bool[Array, ""]:
     return speed < jax.lax.stop_gradient(-ON_SECTION[y.dtype.name] * size)
 
 
-def rise_between(mechanics: Mechanics, before: State, after: State) -> Rise:
-    """The rise between two states close to each other, by linear interpolation."""
+def rise_between(mechanics: Mechanics, before: State, end: State, after: State) -> Rise:
+    """The rise between two states close to each other, by linear interpolation; or at the `end` of the motion between them,
+    where an impact makes the velocity jump over zero.
+    """
+    begins, ends = before_section(mechanics, before), before_section(mechanics, end)
     speed = section_speed(mechanics, before), section_speed(mechanics, after)
-    rose = before_section(mechanics, before) & ~before_section(mechanics, after) & jnp.isfinite(speed[1])
-    share = speed[0] / jnp.where(rose, speed[0] - speed[1], 1.0)
-    return Rise(rose, before + jnp.where(rose, share, 0.0) * (after - before))
+    rose = ~before_section(mechanics, after) & jnp.isfinite(speed[1])
+    share = jnp.where(begins, speed[0] / jnp.where(begins & rose, speed[0] - speed[1], 1.0), 1.0)
+    return Rise(rose & (begins | ends), before + jnp.where(rose, share, 0.0) * (after - before))
