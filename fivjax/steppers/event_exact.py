@@ -125,9 +125,9 @@ class EventExact(AbstractStepper):
         guards, rounding = (rows.reshape(len(rows), -1) for rows in (series.guards, rounding))
         exact = physics.exactly_zero(contact).T.ravel()
         n, count = y.shape[0] // 2, 2 * len(mechanics.places)
+        before = before_section(mechanics, y)
         if at_section:
             # One more row for the rise through zero of the tangential velocity, no event of the contact; or for its fall.
-            before = before_section(mechanics, y)
             speed = jax.vmap(lambda state: section_speed(mechanics, state))(states)
             guards = jnp.concatenate([guards, jnp.where(before, -speed, speed)[:, None]], axis=1)
             # With several contacts, a small distance from the section is no rounding error.
