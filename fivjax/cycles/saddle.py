@@ -120,11 +120,10 @@ class _Fates:
 
     def _seen(self, at: Section) -> tuple[np.ndarray, Section]:
         """The same after some returns, -1 where it is not known yet; and where motions are then."""
-        only, half = np.zeros(len(at.y), int), POINTS // 2
-        middle = self.maps.returns(only, at, half).at
-        last = self.maps.returns(only, middle, half, 4)
-        before, now = (np.linalg.norm(self.weights * one.y, axis=-1) for one in (middle, last.at))
-        apart = np.min(np.linalg.norm(self.weights * last.path[:, :, None] - self.target, axis=-1), axis=(1, 2))
+        last = self.maps.returns(np.zeros(len(at.y), int), at, POINTS, POINTS // 2)
+        before, now = (np.linalg.norm(self.weights * y, axis=-1) for y in (last.path[:, 0], last.at.y))
+        ends = self.weights * last.path[:, -4:]
+        apart = np.min(np.linalg.norm(ends[:, :, None] - self.target, axis=-1), axis=(1, 2))
         with np.errstate(invalid="ignore"):
             slid = ((last.events == 0) & (now < 0.7 * before)) | (now < FADED * self.size)
             fate = np.where(slid, 0, np.where(apart < CAPTURED * self.size, 1, -1))
