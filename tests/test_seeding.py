@@ -1,4 +1,4 @@
-"""Attractors continued from group to group: which groups seed which, and that what is found is what ensembles find."""
+"""Attractors continued from group to group: which groups seed which, and that what is found is what releases find."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 """Stable cycles of many groups, computed side by side from where trajectories nominate them, and who is captured by them.
 
 The return map is evaluated for many points of many groups in one batch: for Newton's method with its derivative, for
-neighbourhoods (`verdicts.capture`) and for crossings of trajectories without. Everything else is small linear algebra.
+neighbourhoods (`neighbourhood`) and for crossings of trajectories without. Everything else is small linear algebra.
 """
 
 from typing import NamedTuple
@@ -171,7 +171,7 @@ def _trial(maps: ReturnMaps, closed: Closed, row: int, crossings: int, many: boo
 
 
 def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
-    """The return maps of cycles, each over so many crossings and in its own contact mode (`capture.ReturnMap`)."""
+    """The return maps of cycles, each over so many crossings and in its own contact mode (`neighbourhood.ReturnMap`)."""
 
     def returned(chosen, y):
         each = np.repeat(chosen, y.shape[1])

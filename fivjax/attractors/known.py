@@ -1,6 +1,6 @@
 """The attractors of groups: what is known of each, attractors added from where motions are, and who has come to which.
 
-Cycles are computed (`captures`); what motions trace that no cycle captures is tried as a torus (`tori`).
+Cycles are computed (`cycles`); what motions trace that no cycle captures is tried as a torus (`tori`).
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ def add_cycles(
     settled: bool = False,
     nearly: float = NEARLY,
 ) -> Bool[np.ndarray, " m"]:
-    """Adds the stable cycles that motions from these states are near to (`captures.stable_cycles`) to those known of their
+    """Adds the stable cycles that motions from these states are near to (`cycles.stable_cycles`) to those known of their
     groups; and which of the motions are near to one, new or known.
     """
     near, known = np.zeros(len(group), bool), {g: one.cycles for g, one in of_group.items()}
@@ -108,7 +108,7 @@ def come_to(
     of_group: dict[int, Attractors],
 ) -> dict[int, Cycle | Torus]:
     """The known attractors of their groups by which trajectories have been captured, by row. Only those that are `asked` count;
-    `latest` are their last crossings, see `captures.captured`.
+    `latest` are their last crossings, see `cycles.captured`.
     """
     rows = np.flatnonzero(asked)
     if not len(rows):

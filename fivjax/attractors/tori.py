@@ -139,7 +139,7 @@ def reached(
     known: list[tuple[Int[np.ndarray, " r"], Torus]],
 ) -> dict[int, Torus]:
     """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
-    `captures.captured`, `latest` tells which to ask, and their next crossings decide.
+    `cycles.captured`, `latest` tells which to ask, and their next crossings decide.
     """
     near = []
     for rows, torus in known:
