@@ -301,3 +301,14 @@ def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, 
     sticking = (fj.Status.SLIDE,) * (contacts - 1) + (fj.Status.STICK,)
     assert found[1].status == (sticking if contacts > 1 else fj.Status.STICK)
     assert found[0].status == ((fj.Status.SLIDE,) * contacts if contacts > 1 else fj.Status.SLIDE)
+
+
+def test_a_coordinate_that_no_spring_holds_may_be_beside_a_cycle():
+    """A block on a spring, pressed on by the load alone, under friction that falls: it sticks and slips, at the reference's speed."""
+    structure = fj.Structure(
+        np.diag([0.538, 0.538]), np.diag([5.946, 0.0]), np.diag([6957.0, 0.0]), [0.02, -1.0], tangential=0, normal=1
+    )
+    scene = fj.Scene(structure, fj.ExponentialDecay(6.0, 2.0, 10.0), belt_speed=0.1, load=fj.ConstantLoad(1.0))
+    cycle = fj.limit_cycle(scene)
+    assert cycle.stable and cycle.period == pytest.approx(0.0577091504, rel=1e-7)
+    assert {phase.status.name for phase in cycle.word} == {"STICK", "SLIDE"}

@@ -113,7 +113,9 @@ class ReturnMaps:
         self.kernels, self.pool, self.known_to = kernels, pool, known_to
         self.of_groups = mechanics, longest
         self.structure = structure
-        self.weights = np.asarray(structure.weights)
+        weights = np.asarray(structure.weights)
+        # A coordinate that no spring holds has no weight of its own.
+        self.weights = np.where(weights > 0, weights, np.min(weights[weights > 0]))
         # The direction of friction if the contact slides on the section, where the belt is faster.
         self.sliding = np.sign(np.asarray(mechanics.belt_speed))
         self.block = BLOCK if len(self.structure.contacts) == 1 else BLOCK_OF_SEVERAL
