@@ -312,3 +312,17 @@ def test_a_coordinate_that_no_spring_holds_may_be_beside_a_cycle():
     cycle = fj.limit_cycle(scene)
     assert cycle.stable and cycle.period == pytest.approx(0.0577091504, rel=1e-7)
     assert {phase.status.name for phase in cycle.word} == {"STICK", "SLIDE"}
+
+
+def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
+    """It repeats after thirteen crossings, by the independent solver to rounding."""
+    parts = dict(m1=0.3325985968, m2=0.0447402462, c1=0.5867675516, c2=1.9590233554, k1=100434.07558, k2=105775.09184)
+    structure = fj.belt_oscillator(**parts, theta=0.028758738967)
+    scene = fj.Scene(structure, fj.Coulomb(0.2779970970), 1.9522014875, load=fj.Pulse(100.0, 2.3516, 0.1))
+    cycle = fj.limit_cycle(scene)
+    assert cycle.kind == "periodic" and cycle.crossings == 13
+    y = cycle.points[0]
+    start = {**reference.of_scene(scene), "p": 1.0, "deviation": (y[:3], y[3:])}
+    later = reference.trajectory(start, 1.01 * cycle.period, times=[cycle.period])
+    back = np.concatenate([later.q[0] - later.q_eq, later.v[0]])
+    np.testing.assert_allclose(back, y, atol=1e-9 * np.max(np.abs(y)))
