@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import reference
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
