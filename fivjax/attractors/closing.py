@@ -37,9 +37,8 @@ class Closed(NamedTuple):
     crossings: Int[np.ndarray, " m"]  # of the section, in one period
     period: Float[np.ndarray, " m"]  # s
     jacobian: Float[np.ndarray, "m 2n 2n"]  # of the return map there
-    residual: Float[
-        np.ndarray, " m"
-    ]  # distance of the return from the start, relative to the cycle's size; infinite if none
+    # Distance of the return from the start, relative to the cycle's size; infinite if there is none.
+    residual: Float[np.ndarray, " m"]
 
     @property
     def found(self) -> Bool[np.ndarray, " m"]:

@@ -11,6 +11,7 @@ if the drift at its end has the same direction, nearly the same speed, and the s
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,6 +33,25 @@ ALIGNED, ALIKE = 0.95, 1.5
 ROUNDING = 1e-11
 
 
+class _Drift(NamedTuple):
+    """How motions drift over `OVER` returns."""
+
+    at: Section  # where they are at the end
+    way: Float[np.ndarray, "m 2n"]  # weighted
+    time: Float[np.ndarray, " m"]  # that it took, s
+    events: Int[np.ndarray, " m"]  # contact events on it
+    steady: Bool[np.ndarray, " m"]  # whether it was the same over as many returns before
+
+    def rows(self, chosen) -> "_Drift":
+        return _Drift(self.at.rows(chosen), *(part[chosen] for part in self[1:]))
+
+    def put(self, chosen, rows: "_Drift") -> None:
+        """Write these rows at the chosen indices."""
+        self.at.put(chosen, rows.at)
+        for whole, part in zip(self[1:], rows[1:], strict=True):
+            whole[chosen] = part
+
+
 def crept(
     maps: ReturnMaps,
     group: Int[np.ndarray, " m"],
@@ -44,13 +64,11 @@ def crept(
     last = Section(*(np.array(part) for part in at))
     time, events, creeps = np.zeros(len(group)), np.zeros(len(group), int), np.zeros(len(group), bool)
     share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), SETTLES), np.zeros(len(group), int)
-    rows, begun = np.arange(len(group)), _measured(maps, group, at)
+    rows, here = np.arange(len(group)), _measured(maps, group, at)
     for _ in range(MOST):
-        here, drift, taken, met, steady = begun
-        length, size = np.linalg.norm(drift, axis=1), np.linalg.norm(maps.weights * here.y, axis=1)
-        going = steady & (length > ROUNDING * size) & (plainly[rows] < MOST_PLAIN)
-        rows, here, drift, taken, met = rows[going], here.rows(going), drift[going], taken[going], met[going]
-        length, size = length[going], size[going]
+        length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
+        going = here.steady & (length > ROUNDING * size) & (plainly[rows] < MOST_PLAIN)
+        rows, here, length, size = rows[going], here.rows(going), length[going], size[going]
         if not len(rows):
             break
         # The first leap is a short one, but worthwhile.
@@ -59,41 +77,39 @@ def crept(
         times = share[rows] * size / length
         plain = times < LEAST
         times[plain] = 0.0
-        leapt = here._replace(y=here.y + times[:, None] * drift / maps.weights)
+        leapt = here.at._replace(y=here.at.y + times[:, None] * here.way / maps.weights)
         settled = maps.returns(group[rows], leapt, np.where(plain, PLAIN, settles[rows]))
         there = _measured(maps, group[rows], settled.at)
         with np.errstate(divide="ignore", invalid="ignore"):
-            faster = np.linalg.norm(there[1], axis=1) / length
+            faster = np.linalg.norm(there.way, axis=1) / length
             longer = np.fmin(np.minimum(2 * share[rows], SHARE), TRUSTED * share[rows] / np.abs(np.log(faster)))
             # As long as the mean of what both drifts say.
             skipped = 0.5 * times * (1 + 1 / faster)
-        kept = plain | (there[4] & _alike(drift, there[1]) & (there[3] == met))
+        kept = plain | (there.steady & _alike(here.way, there.way) & (there.events == here.events))
         share[rows] = np.where(plain, np.nan, np.where(kept, longer, 0.5 * share[rows]))
         settles[rows] = np.where(kept, settles[rows], np.minimum(2 * settles[rows], LONGEST))
         plainly[rows] += plain
         done = rows[kept]
         creeps[done] = True
-        last.put(done, there[0].rows(kept))
-        time[done] += (np.where(plain, 0.0, skipped * taken) + settled.time + there[2])[kept]
-        events[done] += (times * met).astype(int)[kept] + settled.events[kept] + there[3][kept]
+        last.put(done, there.at.rows(kept))
+        time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.time)[kept]
+        events[done] += (times * here.events).astype(int)[kept] + settled.events[kept] + there.events[kept]
         # From where they have got to; the others try a shorter leap.
-        begun = _joined(there, (here, drift, taken, met, np.ones(len(rows), bool)), kept)
+        there.put(~kept, here.rows(~kept))
         left = ~kept
         if len(done):
             left[kept] = ~arrived(done, last.rows(done))
-        rows, begun = rows[left], (begun[0].rows(left), *(part[left] for part in begun[1:]))
+        rows, here = rows[left], there.rows(left)
     return creeps, last, time, events
 
 
-def _measured(maps: ReturnMaps, group, at: Section):
-    """Where motions are after `2 * OVER` returns, their weighted drift in the latter `OVER`, how long that took (s), its
-    contact events, and whether the drift is steady.
-    """
+def _measured(maps: ReturnMaps, group, at: Section) -> _Drift:
+    """How motions drift in the latter half of `2 * OVER` returns."""
     middle = maps.returns(group, at, OVER)
     end = maps.returns(group, middle.at, OVER)
-    before, drift = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
-    steady = _alike(before, drift) & (middle.events == end.events)
-    return end.at, drift, end.time, end.events, steady
+    before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
+    steady = _alike(before, way) & (middle.events == end.events)
+    return _Drift(end.at, way, end.time, end.events, steady)
 
 
 def _alike(one: Float[np.ndarray, "m 2n"], other: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
@@ -101,13 +117,3 @@ def _alike(one: Float[np.ndarray, "m 2n"], other: Float[np.ndarray, "m 2n"]) -> 
     a, b = np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return (np.sum(one * other, axis=1) >= ALIGNED * a * b) & (np.maximum(a / b, b / a) <= ALIKE)
-
-
-def _joined(one, other, chosen: Bool[np.ndarray, " m"]):
-    """The chosen rows of one measurement, and the rest of the other."""
-    at = Section(*(np.where(_over(chosen, a), a, b) for a, b in zip(one[0], other[0], strict=True)))
-    return at, *(np.where(_over(chosen, a), a, b) for a, b in zip(one[1:], other[1:], strict=True))
-
-
-def _over(chosen: Bool[np.ndarray, " m"], like: np.ndarray) -> np.ndarray:
-    return chosen.reshape(-1, *[1] * (np.ndim(like) - 1))
