@@ -18,10 +18,9 @@ from ..attractors.parting import followed_on
 from ..attractors.search import TOGETHER, search_groups
 from ..attractors.tori import TUBES, Torus
 from ..foundation.flattened import Flattened
-from ..section.by_kernel import SectionKernels
+from ..section.by_kernel import section_kernels
 from ..section.return_maps import INTERPOLATED, ROUNDED, ReturnMaps, Section
 from ..steppers.event_exact import EventExact
-from ..steppers.kernel_scope import has_kernel
 from ..verdicts.verdict import Verdict
 from .conclusion import bounds
 from .following import begun, compile_conclusions, follow
@@ -219,8 +218,8 @@ class Basins:
         structure = self.batch.scene.structure
         kernels = self.kernels.of_section if isinstance(self.kernels, SeriesKernels) else self.kernels
         # Return maps are exact whatever follows the trajectories.
-        if kernels is None and has_kernel(self.batch.scene, EventExact()):
-            kernels = SectionKernels((tree.mechanics, tree.longest_return), self.batch.pool)
+        if kernels is None:
+            kernels = section_kernels(self.batch.scene, tree.mechanics, tree.longest_return, self.batch.pool)
         return ReturnMaps(structure, tree.mechanics, tree.longest_return, kernels, self.batch.pool, known_to)
 
     def halfway(self, done: int, own_from: int, verdicts: Verdicts, pending, numbers, known) -> Halfway:

@@ -8,7 +8,9 @@ from jaxtyping import Float, Int
 
 from ..contact import Contact
 from ..foundation.kernel_text import Form
+from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
+from ..steppers.kernel_scope import has_kernel
 from .crossings import Arrival, How, Point, motion_to_section
 
 # Rows of numbers for a kernel are put together for so many bytes at a time.
@@ -57,6 +59,11 @@ class SectionKernels:
             first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.whose, *rows))
             self.form, _ = Form.of((How(EventExact()), *first))
         return self.form, np.concatenate([self.table[group], numbers_in_rows(rows)], axis=1)
+
+
+def section_kernels(scene: Scene, mechanics, longest_return, pool: Executor | None) -> SectionKernels | None:
+    """The kernels of groups of scenes like this one; None where there are none."""
+    return SectionKernels((mechanics, longest_return), pool) if has_kernel(scene, EventExact()) else None
 
 
 def _on_section(end: Arrival):

@@ -23,10 +23,9 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.event_exact import EventExact, for_derivatives
-from ..steppers.kernel_scope import has_kernel
 from ..steppers.section import FADED, section_weights
 from .about_sliding import longest_return, mechanics_about_sliding
-from .by_kernel import SectionKernels
+from .by_kernel import SectionKernels, section_kernels
 from .crossings import Point, to_crossing
 from .free_directions import directions_of_several, free_coordinates
 
@@ -131,8 +130,7 @@ class ReturnMaps:
         """The return map of one scene under its final load, as the only group."""
         mechanics, longest = jax.tree.map(lambda leaf: np.asarray(leaf)[None], known_for_section(scene))
         pool = ThreadPoolExecutor(workers())
-        kernels = SectionKernels((mechanics, longest), pool) if has_kernel(scene, EventExact()) else None
-        return cls(scene.structure, mechanics, longest, kernels, pool)
+        return cls(scene.structure, mechanics, longest, section_kernels(scene, mechanics, longest, pool), pool)
 
     @cached_property
     def mechanics(self) -> Flattened:
