@@ -8,7 +8,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from .cpp_arrays import Value, View
 from .cpp_numbers import WIDE, kind_of, text_of
 from .cpp_writer import Writer
-from .taylor import solution, within
+from .jaxprs import of_scan, solution, within
 
 
 def _while(writer: Writer, equation, operands) -> list[Value]:
@@ -27,7 +27,8 @@ def _while(writer: Writer, equation, operands) -> list[Value]:
 
 
 def _scan(writer: Writer, equation, operands) -> list[Value]:
-    shapes = [variable.aval.shape for variable in equation.outvars[equation.params["num_carry"] :]]
+    _, carried = of_scan(equation.params)
+    shapes = [variable.aval.shape for variable in equation.outvars[carried:]]
     return scan(writer, equation, operands, str(equation.params["length"]), lambda k, kind: writer.new(shapes[k], kind))
 
 
@@ -36,7 +37,8 @@ def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int
     number and type.
     """
     params, body = equation.params, equation.params["jaxpr"]
-    fixed, begin = operands[: params["num_consts"]], operands[params["num_consts"] :][: params["num_carry"]]
+    shared, carried = of_scan(params)
+    fixed, begin = operands[:shared], operands[shared:][:carried]
     along = operands[len(fixed) + len(begin) :]
     kinds, wide = _types_carried(writer, body.jaxpr, fixed, begin, along, equation.outvars[: len(begin)])
     along = [
@@ -127,7 +129,7 @@ def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
             begin = flags[asked + fixed :]
             found, _ = _carried(params["body_jaxpr"].jaxpr, flags[asked:][:fixed], begin, [])
         elif name == "scan":
-            fixed, carried = params["num_consts"], params["num_carry"]
+            fixed, carried = of_scan(params)
             begin, after = _carried(
                 params["jaxpr"].jaxpr, flags[:fixed], flags[fixed:][:carried], flags[fixed + carried :]
             )

@@ -31,7 +31,7 @@ from .cpp_numbers import (
     text_of,
     without_repeats,
 )
-from .taylor import within
+from .jaxprs import within
 
 # Arrays with more numbers are gone through by loops.
 FEW = 40

@@ -15,6 +15,7 @@ from .cpp_code import writer
 from .cpp_loops import scan
 from .cpp_numbers import WIDE, kind_of
 from .cpp_writer import Writer
+from .jaxprs import of_scan
 from .plain_trees import from_text, structure_to_text
 
 
@@ -222,7 +223,7 @@ class _WriterOfKernel:
             else:
                 found = writer.applied(equation, operands)
             known.update(zip(equation.outvars, found, strict=True))
-        along = {variable for loop in loops for variable in loop.outvars[loop.params["num_carry"] :]}
+        along = {variable for loop in loops for variable in loop.outvars[of_scan(loop.params)[1] :]}
         for variable in (*self.rows, *self.row_dots):
             # Tangents that do not depend on what is perturbed are zero, as their array is from the start.
             if variable not in along and not (is_known(read(variable)) and not np.any(read(variable))):
@@ -237,7 +238,7 @@ class _WriterOfKernel:
 
     def _rows_of(self, loop, k: int, kind: str) -> View:
         """Where the loop's rows of results with this number are written."""
-        variable = loop.outvars[loop.params["num_carry"] + k]
+        variable = loop.outvars[of_scan(loop.params)[1] + k]
         for name, variables in (("rows", self.rows), ("row_dots", self.row_dots)):
             sizes = [count_of(own.aval.shape[1:]) for own in variables]
             # One result may be asked for twice, but is written once.

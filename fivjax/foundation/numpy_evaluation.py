@@ -13,9 +13,9 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
 from .compiling import compiled, transformed
+from .jaxprs import of_scan, solution, within
 from .kernel_text import Form
 from .numpy_primitives import applied
-from .taylor import solution, within
 
 # Calls after which it is compiled, and results that are kept in case they are asked for again.
 REPAID, LATEST = 100, 16
@@ -110,7 +110,8 @@ def _while(params, operands: list) -> list:
 
 def _scan(params, operands: list) -> list:
     body, length = params["jaxpr"], params["length"]
-    fixed, carry = operands[: params["num_consts"]], operands[params["num_consts"] :][: params["num_carry"]]
+    shared, carried = of_scan(params)
+    fixed, carry = operands[:shared], operands[shared:][:carried]
     along, rows = operands[len(fixed) + len(carry) :], []
     for k in range(length)[:: -1 if params["reverse"] else 1]:
         found = _run(body.jaxpr, body.consts, [*fixed, *carry, *(array[k] for array in along)])

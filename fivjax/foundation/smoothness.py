@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, Literal
 
-from .taylor import within
+from .jaxprs import of_scan, within
 
 # Primitives that are smooth wherever their values and derivatives are finite, and those that only move numbers.
 # fmt: off
@@ -69,7 +69,7 @@ def _looped(params, flags: list[bool]) -> tuple[list[bool], bool]:
         body, fixed, condition = params["body_jaxpr"], params["body_nconsts"], params["cond_jaxpr"]
         carried = len(flags) - fixed
     else:
-        body, fixed, carried, condition, asked = params["jaxpr"], params["num_consts"], params["num_carry"], None, []
+        (fixed, carried), body, condition, asked = of_scan(params), params["jaxpr"], None, []
     while True:
         ends, smooth = _smooth(body.jaxpr, flags)
         begin = flags[fixed:][:carried]

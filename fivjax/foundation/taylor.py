@@ -11,8 +11,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
+
+from .jaxprs import of_scan, within
 
 
 class Series(NamedTuple):
@@ -46,25 +48,6 @@ def composed(outer: Sequence[Array], inner: Sequence[Array], powers: list[Array]
     last = len(inner) - 1
     powers.append(sum((inner[j] * before[last - j] for j in range(2, last + 1)), inner[1] * before[last - 1]))
     return jnp.sum(f * powers[-1], axis=0)
-
-
-def within(params) -> ClosedJaxpr | None:
-    """The traced function that an equation calls once, if it calls one."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        part = params.get(name)
-        if isinstance(part, Jaxpr):
-            return ClosedJaxpr(part, ())
-        if isinstance(part, ClosedJaxpr):
-            return part
-    return None
-
-
-def solution(params, operands: Sequence) -> tuple[ClosedJaxpr, list]:
-    """The traced function by which an equation `custom_linear_solve` is solved, and its operands."""
-    lengths, solve = params["const_lengths"], params["jaxprs"].solve
-    ends = np.cumsum(lengths).tolist()
-    end = ends[list(lengths._fields).index("solve")]
-    return solve, [*operands[end - lengths.solve : end], *operands[ends[-1] :]]
 
 
 def _through(function: Callable, *parts: Series) -> list:
@@ -314,8 +297,8 @@ def _select(params, operands: list, length: int) -> list:
 
 
 def _scan(params, operands: list, length: int) -> list:
-    constants, carried = params["num_consts"], params["num_carry"]
-    body: ClosedJaxpr = params["jaxpr"]
+    constants, carried = of_scan(params)
+    body = params["jaxpr"]
     fixed, begin, along = operands[:constants], operands[constants:][:carried], operands[constants + carried :]
     moving = _moving_carry(body.jaxpr, fixed, begin, along)
     ends = _moved(body.jaxpr, [*_flags(fixed), *moving, *_flags(along)])

@@ -66,10 +66,12 @@ def _tell(told, what, inside: list) -> None:
         for part in parts:
             _tell(told, part, inside)
 
-    if isinstance(what, core.ClosedJaxpr):
-        tell(what.jaxpr, list(what.consts))
-    elif isinstance(what, core.Jaxpr):
+    if isinstance(what, core.Jaxpr):
         _tell_operations(told, what, inside)
+        # In newer versions of JAX it holds its constants itself.
+        tell(list(getattr(what, "consts", ())))
+    elif isinstance(what, core.ClosedJaxpr):
+        tell(what.jaxpr, list(what.consts))
     elif isinstance(what, str | bytes | bool | int | float | complex | type(None) | np.dtype | enum.Enum):
         told.update(repr(what).encode())
     elif isinstance(what, np.ndarray | np.generic | jax.Array):
