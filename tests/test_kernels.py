@@ -15,7 +15,7 @@ from fivjax.contact import Mechanics, Status, status_from_forces
 from fivjax.foundation import warp_library
 from fivjax.foundation.compiling import compiled
 from fivjax.foundation.scalar_code import scalar_source
-from fivjax.foundation.warp_library import devices, load, warp
+from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, load, warp
 from fivjax.maps import groups as sharing
 from fivjax.maps.kernel_programs import programs
 from fivjax.maps.progress import next_step_end
@@ -276,10 +276,11 @@ def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
 
 def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
     monkeypatch.setattr(warp(), "get_cuda_devices", lambda: [type("Device", (), {"alias": "cuda:0"})()])
-    assert devices() == ["cuda:0"] or jax.config.jax_platforms == "cpu"
+    assert gpus_for(LEAST_ON_GPUS) == ["cuda:0"] or jax.config.jax_platforms == "cpu"
+    assert gpus_for(LEAST_ON_GPUS - 1) == []
     with monkeypatch.context() as patch:
         patch.setattr(type(jax.config), "jax_platforms", "cpu", raising=False)
-        assert devices() == ["cpu"]
+        assert gpus_for(LEAST_ON_GPUS) == []
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import numpy as np
 
 from .kept_programs import kept_value
 from .kernel_text import Form, text, written
-from .warp_library import ONE_AT_A_TIME, folder_of_texts, load, warp
+from .warp_library import ONE_AT_A_TIME, folder_of_texts, gpus_for, load, warp
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
 WIDTHS = (1, 2, 4, 8, 16)
@@ -62,6 +62,10 @@ class Kernel:
     def launch(self, given: list, found: list, pool: Executor | None = None) -> None:
         """Run the kernel for all rows of these arrays, and fill those that are `found`."""
         wp = warp()
+        # Several tangents side by side are a type of the compiler for CPUs.
+        if self.width <= 1 and (devices := gpus_for(len(found[0]))):
+            self._launch_on_gpus(devices, given, found)
+            return
         arrays = [wp.array(part, dtype=wp.float64, device="cpu", copy=False) for part in (*given, *found)]
         lanes = len(found[0])
 
@@ -74,6 +78,21 @@ class Kernel:
         parts = min(lanes, AT_A_TIME * getattr(pool, "_max_workers", 2))
         for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
             pass
+
+    def _launch_on_gpus(self, devices: list[str], given: list, found: list) -> None:
+        wp = warp()
+        load(self.kernel.module, devices)
+        ends = np.linspace(0, len(found[0]), len(devices) + 1).astype(int).tolist()
+        launched = []
+        for device, part in zip(devices, map(slice, ends, ends[1:]), strict=True):
+            # What is the same for all trajectories has one row.
+            own = [whole if len(whole) == 1 else whole[part] for whole in (*given, *found)]
+            arrays = [wp.array(rows, dtype=wp.float64, device=device) for rows in own]
+            wp.launch(self.kernel, dim=part.stop - part.start, inputs=[*arrays, 0], device=device)
+            launched.append((part, arrays[len(given) :]))
+        for part, arrays in launched:
+            for whole, array in zip(found, arrays, strict=True):
+                whole[part] = array.numpy()
 
     def slopes(self, end_dots, row_dots, count: int):
         """The derivatives of real results from rows of directions: trees like those of the results, without the others."""

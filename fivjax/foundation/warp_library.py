@@ -20,6 +20,8 @@ from . import kept_kernels
 
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()
+# One trajectory takes a GPU some thirty times as long as a core of a CPU: what that comes to for all of several cores.
+LEAST_ON_GPUS = 1024
 # Modules that are loaded, with the devices that they are loaded on.
 _LOADED: set[tuple[Any, str]] = set()
 
@@ -82,10 +84,14 @@ def folder_of_texts() -> Path | None:
     return kept_kernels.folder_of_texts(warp())
 
 
-def devices() -> list[str]:
-    """Where kernels run: on all GPUs, or on the CPU, where there is none or where JAX is told to use the CPU only."""
-    gpus = [] if jax.config.jax_platforms == "cpu" else warp().get_cuda_devices()
-    return [device.alias for device in gpus] or ["cpu"]
+def gpus() -> list[str]:
+    """The GPUs that kernels run on: all of them, or none where JAX is told to use the CPU only."""
+    return [] if jax.config.jax_platforms == "cpu" else [device.alias for device in warp().get_cuda_devices()]
+
+
+def gpus_for(trajectories: int) -> list[str]:
+    """The GPUs that so many trajectories side by side are left to: none if a CPU has finished before."""
+    return gpus() if trajectories >= LEAST_ON_GPUS else []
 
 
 def load(module, names: list[str]) -> None:

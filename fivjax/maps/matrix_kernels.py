@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from ..foundation.blocks import workers
 from ..foundation.flattened import Flattened, flatten
-from ..foundation.warp_library import ONE_AT_A_TIME, devices, load, warp
+from ..foundation.warp_library import ONE_AT_A_TIME, gpus, gpus_for, load, warp
 from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
@@ -61,7 +61,7 @@ def begin_building(batch: Batch) -> None:
 def _built(form: Form) -> Programs:
     with ONE_AT_A_TIME:
         found = programs(form)
-        load(found.module, devices())
+        load(found.module, ["cpu", *gpus()])
     return found
 
 
@@ -89,9 +89,10 @@ class Kernels:
             (numbers, self.types.mechanics),
             (np.array(prepared.interval), wp.float64),
         ]
-        self.devices, self.threads = devices(), workers()
+        self.threads = workers()
         self.of_groups = {
-            device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups] for device in self.devices
+            device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups]
+            for device in ("cpu", *gpus())
         }
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
@@ -129,7 +130,8 @@ class Kernels:
     def _launch(self, kernel, group: Int[np.ndarray, " m"], rows: list[np.ndarray], steps: int, values: list) -> None:
         """Run a kernel for each row of these arrays, which are changed in place. A row takes some `steps` steps."""
         count, wp, group = len(group), self.wp, group.astype(np.int32)
-        if self.devices == ["cpu"]:
+        devices = gpus_for(count)
+        if not devices:
             given = [
                 *self.of_groups["cpu"],
                 *(wp.array(part, device="cpu", copy=False) for part in (group, *rows)),
@@ -141,10 +143,10 @@ class Kernels:
             def run(part: tuple[int, int]) -> None:
                 wp.launch(kernel, dim=part[1] - part[0], inputs=[*given, part[0]], device="cpu")
         else:
-            ends = np.linspace(0, count, len(self.devices) + 1).astype(int).tolist()
+            ends = np.linspace(0, count, len(devices) + 1).astype(int).tolist()
 
             def run(part: tuple[int, int]) -> None:
-                device = self.devices[ends.index(part[0])]
+                device = devices[ends.index(part[0])]
                 own = slice(*part)
                 moved = [wp.array(whole[own], device=device) for whole in (group, *rows)]
                 given = [*self.of_groups[device], *moved, *values, 0]
