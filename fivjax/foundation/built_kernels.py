@@ -162,7 +162,8 @@ wide* row_dots = (wide*)row_dots_.data + lane_ * {f"count * {row_dots}" if width
     space = {"wp": wp, "body": body, **{f"A{axes}": wp.array(dtype=wp.float64, ndim=axes) for axes in (2, 3, 4)}}
     exec(compile(code, place, "exec"), space)
     module = wp.get_module(f"fivjax.kernel_{name}")
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast"
+    # What is compared with itself is compared to see whether it is a number.
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast -Wno-tautological-compare"
     module.options.update(max_unroll=1, cpu_compiler_flags=flags, enable_backward=False)
     kernel = wp.kernel(space["followed"], enable_backward=False, module=module)
     load(module, ["cpu"])

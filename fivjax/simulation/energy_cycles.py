@@ -8,7 +8,6 @@ With several contacts, the velocity that rises is the weighted sum of `steppers.
 row (or two, where rounding puts one of them behind the other).
 """
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -18,13 +17,16 @@ from jaxtyping import Array, Float
 
 from ..contact import Contact, Mechanics, State
 from ..foundation import arguments
-from ..foundation.compiling import compiled, power_of_4
+from ..foundation.carried import depending_on
+from ..foundation.compiling import power_of_4
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
 from ..model.scene import Scene, refuse_vector_contacts
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact
+from ..steppers.kernel_scope import has_kernel
 from . import energy as accounts
 from .energy import Energy, EnergyData, Ledger
 from .trajectory import Trajectory
@@ -65,7 +67,7 @@ def energy_per_cycle(run: Trajectory) -> "xr.Dataset":
         25
     """
     _check(run)
-    found, _ = _marks(run, _crossings)
+    found, _ = _marks(run, "crossings")
     energy = _mechanical(run.scene, found)
     work = {**found.ledger.work.lines("work"), "contact_work": found.ledger.work.contact}
     lines = {
@@ -116,7 +118,7 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
         (0.2491, 2)
     """
     _check(run)
-    found, before = _marks(run, _events)
+    found, before = _marks(run, "events")
     several = len(run.scene.structure.contacts) > 1
     of_each = ("event", "contact") if several else "event"
     status = {
@@ -134,15 +136,6 @@ def energy_per_event(run: Trajectory) -> "xr.Dataset":
     return labelled(xr.Dataset(status | {name: ("event", x) for name, x in variables.items()}, coords), run.scene)
 
 
-# Named functions, so that programs compiled for them are found again.
-def _crossings(ledger: Ledger) -> Array:
-    return ledger.crossings
-
-
-def _events(ledger: Ledger) -> Array:
-    return ledger.events
-
-
 def _check(run) -> None:
     arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
     refuse_vector_contacts(run.scene.structure, "A table of cycles or events")
@@ -156,73 +149,81 @@ def _check(run) -> None:
         )
 
 
-def _marks(run: Trajectory, count: Callable[[Ledger], Array]) -> tuple[_Instant, np.ndarray]:
+def _marks(run: Trajectory, counted: str) -> tuple[_Instant, np.ndarray]:
     """All instants at which a count of the ledger rises, one per row; and the status that ended there."""
     scene = run.scene
     rows = jax.tree.map(np.asarray, _row_instants(run))
-    counted = np.asarray(count(rows.ledger))
     finite = np.isfinite(rows.y).all(axis=1)
-    rising = np.diff(counted) * finite[1:]
+    rising = np.diff(getattr(rows.ledger, counted)) * finite[1:]
     chosen = np.flatnonzero(rising)
-    # Padded to one of few shapes, so that not every trajectory compiles anew; surplus rows repeat the first row and are
-    # dropped.
-    most = power_of_4(max(int(rising.max(initial=1)), 4))
-    padded_rows = power_of_4(max(len(chosen), 4096 // most, 64))
-    padded = np.concatenate([chosen, np.zeros(padded_rows - len(chosen), int)])
+    by_kernel, most, size = has_kernel(scene, EventExact()), int(rising.max(initial=1)), max(len(chosen), 1)
+    if not by_kernel:
+        # One of few shapes, so that not every trajectory compiles anew.
+        most = power_of_4(max(most, 4))
+        size = power_of_4(max(size, 4096 // most, 64))
+    # Surplus rows repeat the first row and are dropped.
+    padded = np.concatenate([chosen, np.zeros(size - len(chosen), int)])
     starts = jax.tree.map(lambda leaf: leaf[padded], rows)
-    found, before = jax.tree.map(np.asarray, _find(scene, starts, rows.t[padded + 1], count, most))
-    wanted = np.zeros((padded_rows, most), bool)
+    own, numbers = (starts, rows.t[padded + 1]), np.arange(1.0, most + 1.0)
+    _, (found, before) = _to_marks((scene, np.asarray(counted == "events")), numbers, own=own, by_kernel=by_kernel)
+    wanted = np.zeros((len(padded), most), bool)
     wanted[: len(chosen)] = np.arange(most) < rising[chosen][:, None]
     # Events of several contacts at one instant are one row.
-    reached = np.asarray(count(found.ledger))
-    wanted &= np.diff(reached, axis=1, prepend=np.asarray(count(starts.ledger))[:, None]) > 0
+    begun, reached = (np.asarray(getattr(ledger, counted)) for ledger in (starts.ledger, found.ledger))
+    wanted &= np.diff(reached, axis=1, prepend=begun[:, None]) > 0
     return jax.tree.map(lambda leaf: leaf[wanted], found), before[wanted]
 
 
-@compiled
-def _find(scene: Scene, starts: _Instant, ends: Float[Array, " r"], count: Callable, most: int):
-    """The first `most` instants after each start, and before each end, at which the count rises."""
+def _find(args, numbers: Float[Array, " most"]):
+    """The instants after a start, and before an end, at which the count of events, or of crossings, has risen by each of these
+    numbers.
+    """
+    scene, of_events, begin, end = args
     mechanics, energy_data, method = Mechanics(scene), EnergyData(scene), EventExact()
 
-    def to_next(start: _Instant, end):
-        def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
-            """The motion to the next such instant, the next jump of the load or the end, whichever comes first."""
-            jumps = jnp.where(scene.load.jumps > now.t, scene.load.jumps, jnp.inf)
-            stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
+    def count(ledger: Ledger) -> Array:
+        return jnp.where(of_events, ledger.events, ledger.crossings)
 
-            def enter(total, segment: Segment):
-                return accounts.enter(energy_data, method, mechanics, total[0], segment), segment.contact.status
+    def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
+        """The motion to the next such instant, the next jump of the load or the end, whichever comes first."""
+        jumps = jnp.where(scene.load.jumps > now.t, scene.load.jumps, jnp.inf)
+        stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
 
-            found = follow(
-                method,
-                mechanics,
-                now.contact,
-                scene.load(0.5 * (now.t + stop)),
-                now.y,
-                stop - now.t,
-                total=(now.ledger, now.contact.status),
-                observe=enter,
-                until=lambda total: count(total[0]) != count(start.ledger),
-                # Cycles end where the tangential velocity rises through zero, so segments have to end there.
-                at_section=True,
-                kind="lax",
-            )
-            t = jnp.where(found.left <= 0, stop, stop - found.left)
-            ledger, before = found.total
-            return _Instant(t, found.y, found.contact, ledger), before, ~found.enough
+        def enter(total, segment: Segment):
+            return accounts.enter(energy_data, method, mechanics, total[0], segment), segment.contact.status
 
+        found = follow(
+            method,
+            mechanics,
+            now.contact,
+            scene.load(0.5 * (now.t + stop)),
+            now.y,
+            stop - now.t,
+            total=(now.ledger, now.contact.status),
+            observe=enter,
+            until=lambda total: count(total[0]) > count(now.ledger),
+            # Cycles end where the tangential velocity rises through zero, so segments have to end there.
+            at_section=True,
+            kind="lax",
+        )
+        t = jnp.where(found.left <= 0, stop, stop - found.left)
+        ledger, before = found.total
+        return _Instant(t, found.y, found.contact, ledger), before, ~found.enough
+
+    def to_next(start: _Instant, number):
         def going(carry):
             now, _, failed = carry
-            return (count(now.ledger) == count(start.ledger)) & (now.t < end) & ~failed
+            return (count(now.ledger) < count(begin.ledger) + number) & (now.t < end) & ~failed
 
-        begin = start, start.contact.status, jnp.zeros((), bool)
-        found, before, _ = jax.lax.while_loop(going, lambda carry: stretch(carry[0]), begin)
+        nothing_yet = start, start.contact.status, jnp.zeros((), bool)
+        found, before, _ = jax.lax.while_loop(going, lambda carry: stretch(carry[0]), nothing_yet)
         return found, (found, before)
 
-    def of_row(start: _Instant, end):
-        return jax.lax.scan(lambda instant, _: to_next(instant, end), start, None, length=most)[1]
+    _, rows = jax.lax.scan(to_next, depending_on((scene, begin, end), begin), numbers)
+    return (), rows
 
-    return jax.vmap(of_row)(starts, ends)
+
+_to_marks = KernelFunction(_find)
 
 
 def _row_instants(run: Trajectory) -> _Instant:
