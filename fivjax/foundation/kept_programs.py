@@ -199,6 +199,8 @@ def _made(function: Callable, structure, rest: tuple, arrays: Sequence, options)
         forms.append(jax.tree.structure(result))
         return jax.tree.leaves(result)
 
+    # By this name a profiler knows the program.
+    of_arrays.__name__ = getattr(function, "__name__", of_arrays.__name__)
     like = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]
     if can_serialize():
         lowered = jax.jit(of_arrays, keep_unused=True, compiler_options=options).lower(*like)

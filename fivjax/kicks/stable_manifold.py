@@ -102,8 +102,8 @@ class Approach(NamedTuple):
     slope: np.ndarray  # its derivative in p
 
 
-def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"], which: int = 0) -> Approach:
-    """`F_N` along a trajectory, with the derivative along one direction."""
+def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"]) -> Approach:
+    """`F_N` along a trajectory, with the derivative along the first direction."""
     target = weights * np.asarray(saddle.closed.point.y)
     away = weights * path.y[: path.count] - target
     distance = np.linalg.norm(away, axis=-1) / np.linalg.norm(target)
@@ -111,7 +111,7 @@ def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state
     # Up to the closest crossing: later the trajectory leaves, and may return on another way.
     closest = int(np.argmin(np.where(status, distance, np.inf)))
     place = np.flatnonzero((distance < NEAR) & status & (np.arange(path.count) <= closest))
-    slopes = (weights * path.y_parameter[which, : path.count]) @ saddle.left
+    slopes = (weights * path.y_parameter[0, : path.count]) @ saddle.left
     return Approach(place, distance[place], (away @ saddle.left)[place], slopes[place])
 
 
@@ -126,11 +126,12 @@ def critical_kick(
     """
     stepper, weights = EventExact(), np.asarray(scene.structure.weights)
     low, high = bracket
-    along_p = directions_of(scene, ("p",))
+    # With all derivatives in each trajectory: one kernel for these, too, takes longer to build than they take.
+    directions = directions_of(scene, ("p", *names))
     # From the side that slides: there only the saddle makes a motion with events repeat.
     p, best, crossings = low, np.inf, MOST_CROSSINGS
     for taken in range(1, MOST_TRAJECTORIES + 1):
-        path = kicked(scene.replace(p=p), stepper, along_p, crossings)
+        path = kicked(scene.replace(p=p), stepper, directions, crossings)
         if saddle is None:
             saddle = saddle_passed(scene, path)
             if saddle is None:
@@ -146,7 +147,7 @@ def critical_kick(
         if not low - (high - low) <= p + step <= high + (high - low):
             return None
         if abs(step) <= EXACT * p or (best < 1e-11 * p and abs(step) >= 0.5 * best):
-            slopes = _derivatives(scene.replace(p=p), stepper, names, saddle, weights, int(near.place[-1]) + 1)
+            slopes = _derivatives(scene.replace(p=p), stepper, names, directions, saddle, path, near)
             return Critical(p, slopes, taken, saddle.closed)
         # The next trajectory stays near the saddle for longer, but not twice as long.
         crossings = min(2 * int(near.place[-1]) + 32, MOST_CROSSINGS)
@@ -158,21 +159,19 @@ def _derivatives(
     scene: Scene,
     stepper: EventExact,
     names: tuple[str, ...],
+    directions: Scene,
     saddle: Saddle,
-    weights: Float[np.ndarray, " state"],
-    crossings: int,
+    path: Crossings,
+    near: Approach,
 ) -> dict[str, float]:
-    every = ("p", *names)
-    directions = directions_of(scene, every)
-    path = kicked(scene, stepper, directions, crossings)
-    near = approach(path, saddle, weights)
+    weights = np.asarray(scene.structure.weights)
     with np.errstate(all="ignore"):
         error = near.distance / np.abs(near.slope)
     place = int(near.place[np.nanargmin(error)])
     of_saddle = returned(scene, stepper, directions, saddle.closed.point, saddle.closed.crossings)
     moved = (weights * of_saddle.y_parameter[:, saddle.closed.crossings - 1]) @ saddle.left / (1 - saddle.multiplier)
     value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
-    found = {name: float(-value[k] / value[0]) for k, name in enumerate(every) if name != "p"}
+    found = dict(zip(names, (-value[1:] / value[0]).tolist(), strict=True))
     if float(np.asarray(scene.restitution)) == 0 and "restitution" in found:
         # At restitution 0 the derivative misses the short flight after a small rebound. The additional impulse of the impact is
         # what the forces during the flight and the next impact lack, so to first order nothing changes.
