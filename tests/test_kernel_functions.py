@@ -96,6 +96,13 @@ def test_its_derivatives_are_those_of_jax():
         np.testing.assert_allclose(jax.grad(of_kernel)(x, matrix), expected[0], rtol=1e-11, atol=1e-11)
 
 
+def test_a_tangent_may_be_a_number_of_pythons():
+    kernel = KernelFunction(lambda args, instants: (args[0] ** 2, ()))
+    with jax.enable_x64(True):
+        square = jax.jit(lambda x: jax.jvp(lambda x: kernel((x,), np.zeros(1))[0], (x,), (1.0,)))
+        assert square(3.0) == (9.0, 6.0)
+
+
 def test_a_batch_is_what_single_calls_are():
     _, matrix, count = given(4)
     x, instants = np.random.default_rng(1).normal(size=(3, 2, 4)), np.linspace(0, 1, 3)

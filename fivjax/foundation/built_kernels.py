@@ -3,14 +3,16 @@
 They are kept for later processes.
 """
 
+import functools
 import hashlib
 import linecache
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from itertools import pairwise
 
 import jax
 import numpy as np
 
+from .blocks import workers
 from .kept_programs import kept_value
 from .kernel_text import Form, text, written
 from .warp_library import ONE_AT_A_TIME, folder_of_texts, gpus_for, load, warp
@@ -66,16 +68,22 @@ class Kernel:
         if self.width <= 1 and (devices := gpus_for(len(found[0]))):
             self._launch_on_gpus(devices, given, found)
             return
-        arrays = [wp.array(part, dtype=wp.float64, device="cpu", copy=False) for part in (*given, *found)]
-        lanes = len(found[0])
+        self.launch_on_cpu(
+            [wp.array(part, dtype=wp.float64, device="cpu", copy=False) for part in (*given, *found)], pool
+        )
+
+    def launch_on_cpu(self, arrays: list, pool: Executor | None = None) -> None:
+        """The same for arrays of Warp's, in as many threads as there are cores."""
+        wp, lanes = warp(), arrays[len(GIVEN)].shape[0]
 
         def run(part: tuple[int, int]) -> None:
             wp.launch(self.kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
 
-        if pool is None or lanes == 1:
+        if lanes == 1:
             run((0, lanes))
             return
-        parts = min(lanes, AT_A_TIME * getattr(pool, "_max_workers", 2))
+        pool = _threads() if pool is None else pool
+        parts = min(lanes, AT_A_TIME * workers())
         for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
             pass
 
@@ -116,6 +124,11 @@ class Kernel:
             [place.of(rows, rows.shape[-1] // total) for place in self.text.rows],
         )
         return tuple(map(jax.tree.unflatten, self.text.structures, parts))
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers(), "fivjax kernels")
 
 
 _KERNELS: dict = {}

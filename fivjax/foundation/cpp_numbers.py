@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from .cpp_arrays import Value, View, of_numbers
-from .numpy_primitives import applied
+from .numpy_primitives import function_of
 
 # Types in C++. What is wide is declared by the kernel: so many numbers in double precision.
 WIDE = "wide"
@@ -164,4 +164,4 @@ def of_known(equation, operands: list[Value]) -> list[Value]:
         np.array(part.tolist(), atom.aval.dtype).reshape(part.shape)
         for part, atom in zip(operands, equation.invars, strict=True)
     ]
-    return list(map(of_numbers, applied(equation, values)))
+    return list(map(of_numbers, function_of(equation)(values)))

@@ -70,7 +70,8 @@ def _spread(values, dots, places: Sequence[Place], dot_places: Sequence[Place], 
 
 
 def is_real(array) -> bool:
-    return jnp.issubdtype(array.dtype, jnp.floating)
+    # A tangent may be a number of Python's.
+    return isinstance(array, float) or jnp.issubdtype(array.dtype, jnp.floating)
 
 
 def _bind(function, form: Form, arrays: Sequence, instants, wide: tuple[bool, ...], width: int, directions):
@@ -211,13 +212,7 @@ def _callable(kernel: _Hashed):
     def launch(given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_):
         for part in (rows_, end_dots_, row_dots_):
             part.zero_()
-        wp.launch(
-            own.kernel,
-            dim=given_.shape[0],
-            inputs=[given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_, 0],
-            device="cpu",
-            block_dim=1,
-        )
+        own.launch_on_cpu([given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_])
 
     launch.__annotations__ = {
         f"{name}_": wp.array(dtype=wp.float64, ndim=axes) for name, axes in {**GIVEN, **FOUND}.items()

@@ -6,7 +6,7 @@ XLA takes longer to compile such a function than NumPy takes for a hundred calls
 import functools
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr, Literal
 from .compiling import compiled, transformed
 from .jaxprs import of_scan, solution, within
 from .kernel_text import Form
-from .numpy_primitives import applied
+from .numpy_primitives import function_of
 
 # Calls after which it is compiled, and results that are kept in case they are asked for again.
 REPAID, LATEST = 100, 16
@@ -73,29 +73,67 @@ def _copied(leaf):
     return leaf.copy() if isinstance(leaf, np.ndarray) else leaf
 
 
+class _Step(NamedTuple):
+    """An equation, ready to be computed."""
+
+    function: Callable  # of a list of operands, to its results
+    reads: list[int]  # places of operands among all values
+    writes: list[int]
+    types: list[np.dtype]  # of results
+
+
+class _Plan:
+    """A traced function whose equations are looked up once, and not in each call: that takes longer than computing them."""
+
+    def __init__(self, jaxpr: Jaxpr):
+        self.values: list = []  # literals, at their places
+        places: dict = {}
+
+        def new(variable) -> int:
+            places[variable] = len(self.values)
+            self.values.append(None)
+            return places[variable]
+
+        def place(atom) -> int:
+            if not isinstance(atom, Literal):
+                return places[atom]
+            self.values.append(np.asarray(atom.val, atom.aval.dtype))
+            return len(self.values) - 1
+
+        self.given = [new(variable) for variable in (*jaxpr.constvars, *jaxpr.invars)]
+        self.steps = []
+        for equation in jaxpr.eqns:
+            reads = list(map(place, equation.invars))
+            writes = list(map(new, equation.outvars))
+            types = [np.dtype(variable.aval.dtype) for variable in equation.outvars]
+            self.steps.append(_Step(_function_of(equation), reads, writes, types))
+        self.ends = list(map(place, jaxpr.outvars))
+
+    def __call__(self, given) -> list:
+        values = self.values.copy()
+        for own, value in zip(self.given, given, strict=True):
+            values[own] = value
+        for function, reads, writes, types in self.steps:
+            for own, result, kind in zip(writes, function([values[k] for k in reads]), types, strict=True):
+                values[own] = result if getattr(result, "dtype", None) == kind else np.asarray(result, kind)
+        return [values[own] for own in self.ends]
+
+
+_plan_of = functools.cache(_Plan)
+
+
 def _run(jaxpr: Jaxpr, consts, given) -> list:
-    known = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
-    known |= dict(zip(jaxpr.invars, given, strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else known[atom]
-
-    for equation in jaxpr.eqns:
-        results = _applied(equation, list(map(read, equation.invars)))
-        for variable, result in zip(equation.outvars, results, strict=True):
-            known[variable] = np.asarray(result, variable.aval.dtype)
-    return list(map(read, jaxpr.outvars))
+    return _plan_of(jaxpr)([*map(np.asarray, consts), *given])
 
 
-def _applied(equation, operands: list) -> list:
-    primitive, params = equation.primitive, equation.params
-    name = primitive.name
+def _function_of(equation) -> Callable:
+    params, name = equation.params, equation.primitive.name
     if name in LOOPS:
-        return LOOPS[name](params, operands)
+        return functools.partial(LOOPS[name], params)
     called = within(params)
     if called is not None:
-        return _run(called.jaxpr, called.consts, operands)
-    return applied(equation, operands)
+        return functools.partial(_run, called.jaxpr, called.consts)
+    return function_of(equation)
 
 
 def _while(params, operands: list) -> list:

@@ -1,6 +1,6 @@
 """JAX's primitives by NumPy, for values that are known; and which places of arrays the indexing ones read and write."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -72,19 +72,22 @@ WITH_PARAMETERS: dict[str, Callable] = {
 }
 
 
-def applied(equation, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """A primitive's results; what NumPy does not have is left to JAX, which compiles a program for it."""
+def function_of(equation) -> Callable[[list[np.ndarray]], Sequence[np.ndarray]]:
+    """A primitive's results from its operands; what NumPy does not have is left to JAX, which compiles a program for it."""
     primitive, params = equation.primitive, equation.params
     name = primitive.name
-    if name in PLAIN:
-        return [PLAIN[name](*operands)]
-    if name in WITH_PARAMETERS:
-        found = WITH_PARAMETERS[name](*operands, params)
-        if found is not None:
-            return [found]
-    with jax.enable_x64(True):
-        found = primitive.bind(*map(jnp.asarray, operands), **params)
-    return list(found) if primitive.multiple_results else [found]
+    if (plain := PLAIN.get(name)) is not None:
+        return lambda operands: (plain(*operands),)
+    by_numpy = WITH_PARAMETERS.get(name)
+
+    def applied(operands):
+        if by_numpy is not None and (found := by_numpy(*operands, params)) is not None:
+            return (found,)
+        with jax.enable_x64(True):
+            found = primitive.bind(*map(jnp.asarray, operands), **params)
+        return list(map(np.asarray, found)) if primitive.multiple_results else (np.asarray(found),)
+
+    return applied
 
 
 def gathered_places(shape: tuple[int, ...], places, params) -> Int[np.ndarray, "..."] | None:

@@ -17,7 +17,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_slope
-from ..model.scene import Scene
+from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
 from ..steppers.core import Segment
 from ..steppers.event_exact import EventExact, for_derivatives
@@ -57,7 +57,8 @@ class Step(NamedTuple):
 def _motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
     """How a motion ended (an `Ending`), and its rows.
 
-    `args`: the scene, the state at the first instant, the most steps between two rows, and a `How`.
+    `args`: the scene, the state at the first instant (None for the sliding equilibrium, whose derivatives then need no
+    directions of their own), the most steps between two rows, and a `How`.
     """
     return _followed(args, instants, args[3].method)
 
@@ -70,9 +71,11 @@ _by_kernel = KernelFunction(_motion, _differentiated)
 
 
 def rows_by_kernel(
-    scene: Scene, method: EventExact, y0: State, saved: Float[Array, " T"], most: int, energy: bool
+    scene: Scene, method: EventExact, y0: State | None, saved: Float[Array, " T"], most: int, energy: bool
 ) -> tuple[Int[Array, ""], dict]:
-    """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`)."""
+    """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`). It starts at the sliding
+    equilibrium unless `y0` is given.
+    """
     ending, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), How(method, energy)), saved)
     rows["status"] = rows["status"].astype(np.int8)
     return ending, {"t": saved, **rows}
@@ -80,6 +83,9 @@ def rows_by_kernel(
 
 def _followed(args, instants, method: EventExact):
     scene, y0, most, how = args
+    if y0 is None:
+        q, _ = steady_sliding(scene, scene.load.force)
+        y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     mechanics = Mechanics(scene)
     accounts_of = EnergyData(scene) if how.energy else None
     begin = _begun(scene, mechanics, y0, method, accounts_of)

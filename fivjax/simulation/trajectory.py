@@ -227,8 +227,8 @@ def simulate(
             f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
             f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
         )
-    start = "sliding equilibrium" if y0 is None else "given by y0"
-    y0 = start_state(scene, y0)
+    start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
+    y0 = start_state(scene, None) if given is None else given
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
@@ -239,7 +239,7 @@ def simulate(
     once = all(times_differentiated(leaf) < 2 for leaf in jax.tree.leaves((scene, y0)))
     if has_kernel(scene, method) and once:
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
-            ending, found = rows_by_kernel(scene, method, y0, saved, most, bool(energy))
+            ending, found = rows_by_kernel(scene, method, given, saved, most, bool(energy))
             tick(len(saved) - 1)
     # Runs with known values are not differentiated.
     elif all(map(is_known, jax.tree.leaves((scene, method, y0)))):
