@@ -86,7 +86,9 @@ class CycleMisfit(AbstractMisfit):
         turns = self.phases + self.times * (1 / cycle.period - self.frequency)
         turns = turns + shifted / (2 * jnp.pi) + OFFSET_UNIT * shift[0] / cycle.period
         nothing = jnp.zeros_like(self.means), jnp.zeros(self.means.shape, bool)
-        model, touched = jax.lax.cond(share < 1, lambda: nothing, lambda: self._waveform(scene, cycle, lines, turns))
+        model, touched = jax.lax.cond(
+            share < 1, lambda: nothing, lambda: self._waveform(scene, cycle, after, lines, turns)
+        )
         left = self.means - model
         weight = self.kept / self.sigma**2
         zeros = jnp.sum(weight * left, axis=0) / jnp.maximum(jnp.sum(weight, axis=0), 1e-300)
@@ -115,31 +117,36 @@ class CycleMisfit(AbstractMisfit):
         apart = (wanted - found) / (ROUGH_LINES * size)
         return jnp.concatenate([step[None], apart.real.ravel(), apart.imag.ravel()[1:]])
 
-    def _waveform(self, scene, cycle: Cycle, lines, turns):
+    def _waveform(self, scene, cycle: Cycle, after: Around, lines, turns):
         """The channels at these turns, as they are sampled; and where they would jump if an event moved."""
         if self.response is not None:
             orders = jnp.arange(1, lines.shape[0] + 1)
             waves = jnp.exp(2j * jnp.pi * turns[:, None] * orders)
             return (waves @ lines).real, jnp.zeros(self.means.shape, bool)
         if not self.sampled.averages:
-            found = waveform(scene, self.method, cycle, _in_period(turns) * cycle.period, self.channels)
-            return found.values, self._touched(found.from_changes, found.from_landings, cycle)
+            instants = _in_period(turns) * cycle.period
+            found = waveform(scene, self.method, cycle, instants, self.channels)
+            return self._known(found, after), self._touched(*after.events.away(instants, cycle.period), cycle)
         # An average is a change of what it is the derivative of; that of a displacement is Simpson's, whose error is of fourth
         # order in the interval.
         half = 0.5 * self.interval / cycle.period
         around = _in_period(jnp.concatenate([turns - half, turns, turns + half]))
         below = tuple(Channel(QUANTITY_BELOW[c.quantity], c.coordinate) for c in self.channels)
-        found = waveform(scene, self.method, cycle, around * cycle.period, below)
-        before, middle, later = jnp.split(found.values, 3)
+        instants = around * cycle.period
+        before, middle, later = jnp.split(waveform(scene, self.method, cycle, instants, below), 3)
         columns = [
             (later[:, k] - before[:, k]) / self.interval
             if channel.derivative
             else (before[:, k] + 4 * middle[:, k] + later[:, k]) / 6
             for k, channel in enumerate(self.channels)
         ]
-        sides = [jnp.split(part, 3, axis=1) for part in (found.from_changes, found.from_landings)]
+        sides = [jnp.split(part, 3, axis=1) for part in after.events.away(instants, cycle.period)]
         changes, landings = (jnp.minimum(begin, end) for begin, _, end in sides)
-        return jnp.stack(columns, axis=1), self._touched(changes, landings, cycle)
+        return self._known(jnp.stack(columns, axis=1), after), self._touched(changes, landings, cycle)
+
+    def _known(self, values, after: Around):
+        """The values; none where there were more events than can be noted."""
+        return jnp.where(jnp.any(jnp.isnan(after.events.changes)), jnp.nan, values)
 
     def _touched(self, changes, landings, cycle: Cycle) -> Bool[Array, "B k"]:
         reach = BESIDE * self.apart * cycle.period

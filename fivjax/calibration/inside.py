@@ -22,26 +22,38 @@ def channels_inside(
 
     By the series of `EventExact`, which its advance has computed already; else by a cubic between the ends of the step.
     """
-    n = segment.y.shape[0] // 2
-    if isinstance(method, EventExact):
-        series, unit = method.series(mechanics, segment.contact, segment.load, segment.y)
-        slope = jnp.concatenate([series[1:] * jnp.arange(1, series.shape[0])[:, None], jnp.zeros((1, 2 * n))]) / unit
-        terms = jnp.stack([_column(series, slope, n, channel) for channel in channels], axis=1)
-        times = times / unit
-    else:
-        h = jnp.where(segment.after.h > 0, segment.after.h, 1.0)
-        y, later = segment.y, segment.after.end
-        begin, end = (rates(mechanics, segment.contact, segment.load, at) * h for at in (y, later))
-        cubic = jnp.stack([y, begin, 3 * (later - y) - 2 * begin - end, 2 * (y - later) + begin + end])
-        slope = jnp.concatenate([cubic[1:] * jnp.arange(1, 4)[:, None], jnp.zeros((1, 2 * n))]) / h
-        terms = jnp.stack([_column(cubic, slope, n, channel) for channel in channels], axis=1)
-        times = times / h
+    terms, unit = channel_series(method, mechanics, segment, channels)
+    times = times / unit
 
     def horner(total, term):
         return total * times[:, None] + term, None
 
     begin = jnp.broadcast_to(terms[-1], (times.shape[0], len(channels)))
     return jax.lax.scan(horner, begin, terms[-2::-1])[0]
+
+
+def channel_series(
+    method: AbstractStepper, mechanics: Mechanics, segment: Segment, channels: tuple[Channel, ...]
+) -> tuple[Float[Array, "terms k"], Float[Array, ""]]:
+    """The coefficients of the channels in time after the segment's start, and the unit of that time (s)."""
+    n = segment.y.shape[0] // 2
+    if isinstance(method, EventExact):
+        series, unit = method.series(mechanics, segment.contact, segment.load, segment.y)
+        slope = jnp.concatenate([series[1:] * jnp.arange(1, series.shape[0])[:, None], jnp.zeros((1, 2 * n))]) / unit
+        terms = jnp.stack([_column(series, slope, n, channel) for channel in channels], axis=1)
+    else:
+        unit = h = jnp.where(segment.after.h > 0, segment.after.h, 1.0)
+        y, later = segment.y, segment.after.end
+        begin, end = (rates(mechanics, segment.contact, segment.load, at) * h for at in (y, later))
+        cubic = jnp.stack([y, begin, 3 * (later - y) - 2 * begin - end, 2 * (y - later) + begin + end])
+        slope = jnp.concatenate([cubic[1:] * jnp.arange(1, 4)[:, None], jnp.zeros((1, 2 * n))]) / h
+        terms = jnp.stack([_column(cubic, slope, n, channel) for channel in channels], axis=1)
+    return terms, unit
+
+
+def terms_of(method: AbstractStepper) -> int:
+    """The number of coefficients of such a series."""
+    return method.order_ + 1 if isinstance(method, EventExact) else 4
 
 
 def jumps(segment: Segment) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

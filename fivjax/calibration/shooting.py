@@ -16,21 +16,26 @@ see no impulse, so its share is known apart.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..contact.coordinates import at_places
+from ..foundation.carried import depending_on
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.polynomial import value_and_slope
 from ..io.recordings import Channel
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
-from ..steppers.base import AbstractStepper, Within
-from ..steppers.core import Segment, follow
+from ..steppers.base import MOST_ADVANCES, AbstractStepper, Within
+from ..steppers.core import Segment, advanced, follow
 from ..steppers.event_exact import for_derivatives
-from .inside import channels_inside, jumps
+from ..steppers.kernel_scope import has_kernel
+from .inside import channel_series, jumps, terms_of
 
 # A motion is followed for so many periods before it counts as nearly periodic.
 SETTLING_PERIODS = 80
@@ -67,11 +72,38 @@ class Around(NamedTuple):
     lines: Complex[Array, "count n"]  # of the velocities: v(t) = Re sum of c_h exp(2πi h t / period), m/s
     impulses: Complex[Array, "count n"]  # the part of the accelerations' lines that is impulses, m/s²
     fractions: Float[Array, "2"]  # of time, sticking and detached
+    events: "Events"
+
+
+class Events(NamedTuple):
+    """When contacts change their modes in a period, s after its start; infinite where there are no more."""
+
+    changes: Float[Array, " e"]
+    landings: Float[Array, " e"]  # those of them in which one lands
+
+    def away(self, instants: Float[Array, " q"], period: Float[Array, ""]) -> tuple[Array, Array]:
+        """How far instants are from each of them in time (s), before or after; without derivatives."""
+        instants, half = jax.lax.stop_gradient(instants), 0.5 * period
+
+        def from_one(event):
+            found = jnp.abs(jnp.mod(instants - event + half, period) - half)
+            return jnp.where(jnp.isinf(event), jnp.inf, found)
+
+        changes, landings = (jax.lax.stop_gradient(jax.vmap(from_one)(part)) for part in self)
+        return changes, landings
 
 
 def first_tangential(structure: Structure) -> int:
     """The tangential coordinate of the only or the first contact."""
     return int(np.ravel(contact_coordinates(structure)[0])[0])
+
+
+class How(eqx.Module):
+    """How a period is followed and what of it is kept, fixed when it is traced."""
+
+    method: AbstractStepper = eqx.field(static=True)
+    count: int = eqx.field(static=True, default=0)  # of lines
+    channels: tuple[Channel, ...] = eqx.field(static=True, default=())
 
 
 def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
@@ -81,20 +113,10 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     Its state where the tangential velocity rises through zero, and the time, near 1/`frequency` (Hz), after which it is closest
     to that state again.
     """
-    mechanics, load = Mechanics(scene), scene.load.final
     n, tangential = scene.structure.size, first_tangential(scene.structure)
-    q, _ = steady_sliding(scene, load)
-    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + mechanics.tangential].set(0.9 * scene.belt_speed)
-
-    def to_next(carry, h):
-        y, contact = carry
-        after = follow(method, mechanics, contact, load, y, h, kind="lax")
-        y = jnp.where(after.enough, after.y, jnp.nan)
-        return (y, after.contact), (y, after.contact)
-
     longest = int(LONGEST * LOOKS) + 1
-    durations = jnp.full(2 * longest + 1, 1 / (LOOKS * frequency)).at[0].set(SETTLING_PERIODS / frequency)
-    _, (states, contacts) = jax.lax.scan(to_next, (y0, status_from_forces(mechanics, load, y0)), durations)
+    instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 1) / LOOKS) / frequency
+    _, (states, contacts) = _settling((scene, How(method)), instants, by_kernel=has_kernel(scene, method))
     speed = states[:, n + tangential]
     rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
     begin = jnp.argmax(rises) + 1
@@ -109,78 +131,119 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     return Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
 
 
+def _settle(args, instants: Float[Array, " q"]):
+    scene, how = args
+    mechanics, load, n = Mechanics(scene), scene.load.final, scene.structure.size
+    q, _ = steady_sliding(scene, load)
+    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + mechanics.tangential].set(0.9 * scene.belt_speed)
+
+    def to_next(carry, instant):
+        t, y, contact = carry
+        after = follow(how.method, mechanics, contact, load, y, instant - t, kind="lax")
+        y = jnp.where(after.enough, after.y, jnp.nan)
+        return (instant, y, after.contact), (y, after.contact)
+
+    return (), jax.lax.scan(to_next, (jnp.zeros(()), y0, status_from_forces(mechanics, load, y0)), instants)[1]
+
+
+_settling = KernelFunction(_settle)
+
+
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
+    args, nothing = (scene, cycle, How(for_derivatives(method), count)), np.zeros(1)
+    (after, lines, impulses), _ = _period(args, nothing, by_kernel=has_kernel(scene, method))
+    lines, impulses = ((2 / cycle.period) * (part[:, 0] - 1j * part[:, 1]) for part in (lines, impulses))
+    return after._replace(lines=lines, impulses=impulses)
+
+
+def _once_around(args, _):
+    """An `Around` without its lines and impulses, and the integrals that these are made of."""
+    scene, cycle, how = args
     mechanics, load = Mechanics(scene), scene.load.final
-    method, codes = for_derivatives(method), jnp.array([Status.STICK, Status.DETACH])
+    method, count, codes = how.method, how.count, jnp.array([Status.STICK, Status.DETACH])
 
     def add(total, segment: Segment):
-        lines, impulses, spent = total
+        lines, impulses, spent, seen, changes, landings = total
         within = method.within(mechanics, segment.contact, load, segment.y, segment.after.h)
         # With several contacts, those of the first; fractions in a recording are refused then.
         status = segment.contact.status[0] if mechanics.several else segment.contact.status
         spent = spent + jnp.where(status == codes, segment.after.h, 0.0)
         n = scene.structure.size
         jump = (segment.after.y - segment.after.end)[n:]
-        turns = 2 * jnp.pi * jnp.arange(1, count + 1) * ((segment.t + segment.after.h) / cycle.period)
+        end = segment.t + segment.after.h
+        turns = 2 * jnp.pi * jnp.arange(1, count + 1) * (end / cycle.period)
         impulses = impulses + jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)[..., None] * jump
-        return lines + _integrals(within, segment.t, cycle.period, count), impulses, spent
+        changed, landed = jumps(segment)
+        end, here = jax.lax.stop_gradient(end), (jnp.arange(MOST_EVENTS) == seen) & changed
+        changes, landings = jnp.where(here, end, changes), jnp.where(here & landed, end, landings)
+        lines = lines + _integrals(within, segment.t, cycle.period, count)
+        return lines, impulses, spent, seen + changed, changes, landings
 
-    zeros = jnp.zeros((count, 2, scene.structure.size))
-    total = (zeros, zeros, jnp.zeros(2))
+    zeros, none = jnp.zeros((count, 2, scene.structure.size)), jnp.full(MOST_EVENTS, jnp.inf)
+    total = (zeros, zeros, jnp.zeros(2), jnp.zeros((), jnp.int32), none, none)
     after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
-    *sums, spent = after.total
-    lines, impulses = ((2 / cycle.period) * (part[:, 0] - 1j * part[:, 1]) for part in sums)
-    return Around(jnp.where(after.enough, after.y, jnp.nan), after.contact, lines, impulses, spent / cycle.period)
+    *sums, spent, seen, changes, landings = after.total
+    # With more events than can be noted, nothing is known of them.
+    noted = Events(jnp.where(seen <= MOST_EVENTS, changes, jnp.nan), landings)
+    y = jnp.where(after.enough, after.y, jnp.nan)
+    return (Around(y, after.contact, None, None, spent / cycle.period, noted), *sums), ()
 
 
-class Waveform(NamedTuple):
-    """A cycle at instants of its period, and how far in time each is from the contact's events."""
-
-    values: Float[Array, "q k"]
-    from_changes: Float[
-        Array, "e q"
-    ]  # to each of the first events in which a contact changes its mode, s; infinite if none
-    from_landings: Float[Array, "e q"]  # to those of them in which one lands
+_period = KernelFunction(_once_around)
 
 
 def waveform(
-    scene: Scene,
-    method: AbstractStepper,
-    cycle: Cycle,
-    instants: Float[Array, " q"],
-    channels: tuple[Channel, ...],
-) -> Waveform:
+    scene: Scene, method: AbstractStepper, cycle: Cycle, instants: Float[Array, " q"], channels: tuple[Channel, ...]
+) -> Float[Array, "q k"]:
     """Channels of a cycle at instants between 0 and its period (s), in any order. Differentiable in forward mode."""
-    mechanics, load = Mechanics(scene), scene.load.final
-    method = for_derivatives(method)
+    fixed = jax.lax.stop_gradient(instants)
+    order = jnp.argsort(fixed)
+    args = scene, cycle, How(for_derivatives(method), channels=channels)
+    _, rows = _along_period(args, fixed[order], by_kernel=has_kernel(scene, method))
+    values, slopes = (jnp.zeros_like(part).at[order].set(part) for part in rows)
+    # The rows are those of fixed instants.
+    return values + jax.lax.stop_gradient(slopes) * (instants - fixed)[:, None]
 
-    def add(total, segment: Segment):
-        values, seen, changes, landings = total
-        here = (instants >= segment.t) & (instants < segment.t + segment.after.h)
-        times = jnp.where(here, instants - segment.t, 0.0)
-        found = channels_inside(method, mechanics, segment, times, channels)
-        values = jnp.where(here[:, None], found, values)
-        changed, landed = jumps(segment)
-        end = jax.lax.stop_gradient(segment.t + segment.after.h)
-        place = jnp.where(changed, seen, MOST_EVENTS)
-        changes = changes.at[place].set(end, mode="drop")
-        landings = landings.at[place].set(jnp.where(landed, end, jnp.inf), mode="drop")
-        return values, seen + changed, changes, landings
 
-    none = jnp.full(MOST_EVENTS, jnp.inf)
-    total = (jnp.zeros((len(instants), len(channels))), jnp.zeros((), jnp.int32), none, none)
-    after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
-    values, seen, *events = after.total
-    # With more events than can be noted, nothing is known.
-    values = jnp.where(after.enough & (seen <= MOST_EVENTS), values, jnp.nan)
-    half = 0.5 * cycle.period
+class _Step(NamedTuple):
+    """One step of a motion: the channels' series, and its end."""
 
-    def away(event):
-        found = jnp.abs(jnp.mod(jax.lax.stop_gradient(instants) - event + half, cycle.period) - half)
-        return jnp.where(jnp.isfinite(event), found, jnp.inf)
+    t: Float[Array, ""]  # s
+    terms: Float[Array, "c k"]
+    unit: Float[Array, ""]  # of their time, s
+    y: State  # at its end
+    contact: Contact
+    left: Float[Array, ""]  # of the period then, s
+    taken: Int[Array, ""]
 
-    return Waveform(values, *(jax.lax.stop_gradient(jax.vmap(away)(part)) for part in events))
+
+def _channels_along(args, instants: Float[Array, " q"]):
+    """The channels of a cycle at instants that rise, and their derivatives by time."""
+    scene, cycle, how = args
+    mechanics, load, period = Mechanics(scene), scene.load.final, jax.lax.stop_gradient(cycle.period)
+
+    def step(now: _Step) -> _Step:
+        after, left = advanced(how.method, mechanics, now.contact, load, now.y, now.left)
+        segment = Segment(period - now.left, load, now.contact, now.y, after)
+        terms, unit = channel_series(how.method, mechanics, segment, how.channels)
+        return _Step(segment.t, terms, unit, after.y, after.contact, left, now.taken + 1)
+
+    def row(now: _Step, instant):
+        def going(now: _Step):
+            return (period - now.left <= instant) & (now.left > 0) & (now.taken < MOST_ADVANCES)
+
+        now = jax.lax.while_loop(going, step, now)
+        value, slope = value_and_slope(now.terms, (instant - now.t) / now.unit)
+        value = jnp.where(now.taken < MOST_ADVANCES, value, jnp.nan)
+        return now, (value, slope / now.unit)
+
+    zero, none = jnp.zeros_like(period), jnp.zeros((terms_of(how.method), len(how.channels)))
+    begin = _Step(zero, none, zero + 1, cycle.y, cycle.contact, period, jnp.zeros((), jnp.int32))
+    return (), jax.lax.scan(row, depending_on((scene, cycle), begin), instants)[1]
+
+
+_along_period = KernelFunction(_channels_along)
 
 
 def unclosed(scene: Scene, cycle: Cycle, after: Around) -> State:

@@ -42,8 +42,14 @@ class Kernel:
         self.function, self.form, self.wide, self.width = own, form, wide, width
         self.text = text(kept_value(written, own, form, wide, folder=folder_of_texts()))
         self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
+
+    @functools.cached_property
+    def kernel(self):
+        """What Warp launches. It is compiled when it is launched first: JAX asks what a function finds, and may then call only its
+        derivatives.
+        """
         with ONE_AT_A_TIME:
-            self.kernel = _compiled(self.text.source, self.text.widths, self.directions, width)
+            return _compiled(self.text.source, self.text.widths, self.directions, self.width)
 
     def launched(self, given, instants, dots=None, pool: Executor | None = None):
         """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""

@@ -1,7 +1,9 @@
 """Parts of what JAX traces, whichever version of JAX has traced it."""
 
+import functools
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
@@ -15,7 +17,16 @@ def within(params) -> ClosedJaxpr | None:
             return part
         if isinstance(part, Jaxpr):
             return ClosedJaxpr(part, ())
-    return None
+    # A primitive of newer versions that stands for others.
+    return None if (standing := params.get("_prim")) is None else _expanded(standing, tuple(standing.in_avals_flat))
+
+
+@functools.cache
+def _expanded(primitive, avals: tuple) -> ClosedJaxpr:
+    def expand(*args):
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))
+
+    return jax.make_jaxpr(expand)(*avals)
 
 
 def of_scan(params) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
 from ..model.scene import Scene
+from ..steppers.core import left_after, next_part
 from ..steppers.event_exact import EventExact, for_derivatives
 from .about_sliding import longest_return, mechanics_about_sliding
 from .peak_speed import higher_peak
@@ -101,10 +102,9 @@ def to_crossing(
         if way.kick is not None:
             kicked = way.kick.duration > 0
             left, load = jnp.where(kicked, way.kick.duration, left), jnp.where(kicked, way.kick.load, load)
-        # Equal parts. The 1e-6 keeps rounding from adding another part of vanishing length.
-        parts = jnp.maximum(jnp.ceil(left / method.dt - 1e-6), 1.0)
-        after, states, unit = method.with_series(mechanics, way.contact, load, way.y, left / parts, at_section=True)
-        left = jnp.where((parts == 1) & (after.h >= left), 0.0, left - after.h)
+        part, is_last = next_part(left, method.dt)
+        after, states, unit = method.with_series(mechanics, way.contact, load, way.y, part, at_section=True)
+        left = left_after(after, left, is_last)
         kick = None
         if way.kick is not None:
             kick = way.kick._replace(duration=jnp.where(kicked, left, 0.0))

@@ -19,7 +19,7 @@ from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_slope
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
-from ..steppers.core import Segment
+from ..steppers.core import Segment, next_part
 from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
@@ -177,12 +177,10 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
     t, y, contact = now.end, now.y_end, now.contact_end
     until = _next_jump(scene, t)
     load = _load_from(scene, t)
-    h = until - t
-    # Equal parts, if steps are limited. The 1e-6 keeps rounding from adding another part of vanishing length.
-    parts = jnp.where(jnp.isfinite(h), jnp.maximum(jnp.ceil(h / method.dt - 1e-6), 1.0), 1.0)
+    part, is_last = next_part(until - t, method.dt)
     # The ledger counts crossings of the section.
-    after, states, unit = method.with_series(mechanics, contact, load, y, h / parts, accounts_of is not None)
-    arrived = (parts == 1) & (after.h >= h)
+    after, states, unit = method.with_series(mechanics, contact, load, y, part, accounts_of is not None)
+    arrived = is_last & (after.h >= until - t)
     ledger = None
     if accounts_of is not None:
         ledger = accounts.enter(accounts_of, method, mechanics, now.ledger_end, Segment(t, load, contact, y, after))

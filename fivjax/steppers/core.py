@@ -47,6 +47,29 @@ def nothing(total: Total, segment: Segment) -> Total:
     return total
 
 
+def advanced(
+    stepper: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y: State, left, at_section: bool = False
+) -> tuple[Advance, Float[Array, ""]]:
+    """The next advance of a motion for which so much time is `left` (s), and how much is left after it."""
+    part, is_last = next_part(left, stepper.dt)
+    after = stepper.advance(mechanics, contact, load, y, part, at_section)
+    return after, left_after(after, left, is_last)
+
+
+def next_part(left: Float[Array, ""], dt) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The longest that the next advance may take of the time that is left: one of equal parts of at most `dt`; and whether that
+    is all of it.
+    """
+    # The 1e-6 keeps rounding from adding another part of vanishing length.
+    parts = jnp.where(jnp.isfinite(left), jnp.maximum(jnp.ceil(left / dt - 1e-6), 1.0), 1.0)
+    return left / parts, parts == 1
+
+
+def left_after(after: Advance, left: Float[Array, ""], is_last: Bool[Array, ""]) -> Float[Array, ""]:
+    """The time that is left after an advance: exactly none after one to the end."""
+    return jnp.where(is_last & (after.h >= left), 0.0, left - after.h)
+
+
 def follow(
     stepper: AbstractStepper,
     mechanics: Mechanics,
@@ -72,12 +95,9 @@ def follow(
 
     def body(carry):
         y, contact, left, total = carry
-        # Equal parts. The 1e-6 keeps rounding from adding another part of vanishing length.
-        parts = jnp.maximum(jnp.ceil(left / stepper.dt - 1e-6), 1.0)
-        after = stepper.advance(mechanics, contact, load, y, left / parts, at_section)
-        arrived = (parts == 1) & (after.h >= left)
+        after, still = advanced(stepper, mechanics, contact, load, y, left, at_section)
         total = observe(total, Segment(h - left, load, contact, y, after))
-        return after.y, after.contact, jnp.where(arrived, 0.0, left - after.h), total
+        return after.y, after.contact, still, total
 
     def going(carry):
         _, _, left, total = carry
