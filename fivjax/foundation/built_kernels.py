@@ -45,9 +45,7 @@ class Kernel:
 
     @functools.cached_property
     def kernel(self):
-        """What Warp launches. It is compiled when it is launched first: JAX asks what a function finds, and may then call only its
-        derivatives.
-        """
+        """What Warp launches; compiled at its first launch, because JAX may ask for shapes and call only the derivatives."""
         with ONE_AT_A_TIME:
             return _compiled(self.text.source, self.text.widths, self.directions, self.width)
 
