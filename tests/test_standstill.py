@@ -181,7 +181,7 @@ def test_lapack_gets_one_matrix_at_a_time():
 
 PREPARING = """
 import numpy as np
-from fivjax.maps import groups as sharing
+from fivjax.maps import groups
 from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
 from test_standstill import chain

@@ -9,15 +9,14 @@ from ..contact import same_mode
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 
-MOST_ITERATIONS, HALVINGS = 30, 5
+MOST_ITERATIONS = 30
+# Next to the onset of an event, or to a change of the mode in which the section is met, a step of Newton's method may lead
+# astray: so many times in a row it is halved, or the search goes on from the image.
+HALVINGS = 5
 # A cycle is closed if the return map misses its start by less than this share of its size.
 CLOSED = 1e-10
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
-# Next to the onset of an event, or to a change of the mode in which the section is met, a step may lead astray: `HALVINGS`
-# times in a row it is halved, or the search goes on from the image. Of many guesses of which few are near a cycle, each has so
-# many iterations, and may miss so often.
-FEW_ITERATIONS, MISSES = 14, 3
 
 
 class FixedPoint(NamedTuple):
@@ -96,7 +95,9 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
     here, at = (Section(*(np.array(part) for part in guess)) for _ in range(2))
     best = Closed(at, crossings.copy(), np.zeros(count), np.zeros((count, size, size)), np.full(count, np.inf))
     step, since, running = np.full((count, size), np.nan), np.zeros(count, int), np.arange(count)
-    for _ in range(MOST_ITERATIONS if patient else FEW_ITERATIONS):
+    # Of many guesses few are near a cycle: each has fewer iterations, and may miss so often in all, not in a row.
+    iterations, misses = (MOST_ITERATIONS, HALVINGS) if patient else (14, 2)
+    for _ in range(iterations):
         if not len(running):
             break
         now = here.rows(running)
@@ -111,9 +112,7 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
         since[running] = np.where(better, 0 if patient else since[running], since[running] + 1)
         begun = np.isfinite(best.residual[running])
         other_mode = usable & ~alike
-        done = (
-            (better & (missed <= EXACT)) | (since[running] > (HALVINGS if patient else MISSES - 1)) | (~usable & ~begun)
-        )
+        done = (better & (missed <= EXACT)) | (since[running] > misses) | (~usable & ~begun)
         # A step that no longer helps is the last one.
         done |= ~better & ~other_mode & (best.found[running] | ~np.all(np.isfinite(step[running]), axis=1))
         step[rows] = _newton_steps(maps, derived[better], (image.y - now.y)[better])

@@ -15,8 +15,10 @@ from ..io.datasets import labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
 from ..maps.crossing import NO_KICK, Crossing, first_crossings, with_ends
 from ..maps.datasets import time_limit
-from ..maps.engine import run_to_verdict
+from ..maps.engine import Means, run_to_verdict
 from ..maps.executors import with_workers
+from ..maps.groups import Limits
+from ..maps.plan import Listed
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
@@ -131,10 +133,13 @@ def critical_perturbation(
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
 
-    # Attractors of the rows, which are the same in the scan and in all later runs.
-    run = functools.partial(
-        run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={}, executor=executor
-    )
+    known: dict = {}  # attractors of the rows, which are the same in the scan and in all later runs
+
+    def run(values, method, label: str, limits: Limits | None = None):
+        limits = Limits(t_max) if limits is None else limits
+        means = Means(label, memory, progress, executor)
+        return run_to_verdict(scene, Listed(values), method, limits, means, attractors=known)
+
     scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)
@@ -191,9 +196,8 @@ def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarr
         outcome = run(
             values={name: column[known] for name, column in columns.items()},
             method=method,
-            t_max=float(np.max(start + duration)),
+            limits=Limits(float(np.max(start + duration)), energy=True),
             label="energy",
-            energy=True,
         )
         energies["critical_energy"][known] = outcome.energy["kick_energy"]
         energies["kick_work"][known] = outcome.energy["kick_work"]

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..attractors.known import Attractors
+from ..attractors.catalogue import Attractors
+from ..maps.basin_map import verdicts_from
 from ..maps.crossing import Crossing, first_crossings, with_ends
-from ..maps.states import verdicts_from
 from ..model.scene import Scene
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .stable_manifold import Saddle, manifold_normal

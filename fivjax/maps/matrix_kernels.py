@@ -19,7 +19,7 @@ from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
 from ..steppers.kernel_matrices import matrices
-from .groups import Batch, with_values
+from .groups import Task, with_values
 from .kernel_programs import (
     CROSSED,
     CROSSINGS,
@@ -44,18 +44,18 @@ STEPS_TO_CROSSING = 9
 _FORMS: dict[Any, Form] = {}
 
 
-def begin_building(batch: Batch) -> None:
-    """Begin to compile a batch's kernels in one of its threads."""
+def begin_building(task: Task, pool: Executor) -> None:
+    """Begin to compile the kernels for a task in one of these threads."""
 
     def mechanics(row):
-        return mechanics_about_sliding(with_values(batch.scene, batch.names, row))
+        return mechanics_about_sliding(with_values(task.scene, task.names, row))
 
-    leaves, structure = jax.tree.flatten(batch.scene)
-    key = structure, tuple(np.shape(leaf) for leaf in leaves), batch.names
+    leaves, structure = jax.tree.flatten(task.scene)
+    key = structure, tuple(np.shape(leaf) for leaf in leaves), task.names
     if key not in _FORMS:
         # Without values: those of a group may be none that a scene could have.
-        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(batch.names))))
-    batch.pool.submit(_built, _FORMS[key])
+        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
+    pool.submit(_built, _FORMS[key])
 
 
 def _built(form: Form) -> Programs:
@@ -71,7 +71,7 @@ def for_conclusions(shared: Flattened) -> Flattened:
     return flatten(jax.tree.map(np.asarray, without))
 
 
-class Kernels:
+class MatrixKernels:
     """The kernels for a batch, with the data of its groups on each device."""
 
     def __init__(self, shared: Flattened, pool: Executor):

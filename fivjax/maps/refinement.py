@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
+from .plan import Places
 from .results import Verdicts, not_run
-from .shares import wilson
-from .trajectories import Places
 
 # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A torus
 # and the cycle that it locks to next door do not.
@@ -111,15 +110,6 @@ def _audited(computed: Places, total: int, share: float) -> Places:
     which = np.sort(np.random.default_rng(0).choice(left, count, replace=False))
     # So many points that were not computed come before each that was.
     return which + np.searchsorted(computed - np.arange(len(computed)), which, side="right")
-
-
-def audit_note(audit: Audit) -> dict[str, float | int]:
-    """The audit as attributes of a dataset: counts, the rate of wrong cells and its interval of 95 %."""
-    note: dict[str, float | int] = {"audit_cells": audit.cells, "audit_wrong": audit.wrong}
-    if audit.cells:
-        rate, low, high = (float(part) for part in wilson(audit.wrong, audit.cells))
-        note |= {"audit_rate": rate, "audit_rate_low": low, "audit_rate_high": high}
-    return note
 
 
 def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:

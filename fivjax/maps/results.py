@@ -6,7 +6,7 @@ import numpy as np
 
 from ..simulation.energy import exchanged
 from ..verdicts.verdict import Verdict
-from .progress import Progress
+from .one_trajectory import Progress
 
 # `attractor_kind` of a trajectory that no attractor has captured, and of such a one whose neighbours diverge exponentially.
 NO_ATTRACTOR, CHAOTIC = -1, 2
@@ -107,7 +107,7 @@ def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -
     verdicts.verdict[index] = verdict
 
 
-def counted(count: int, noun: str) -> str:
+def count_of(count: int, noun: str) -> str:
     """A number with its noun: "1 trajectory", "2 trajectories"."""
     plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
     return f"{count:,} {noun if count == 1 else plural}"

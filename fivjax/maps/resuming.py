@@ -16,9 +16,8 @@ from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .groups import bytes_per_trajectory, in_bulk, kernels_by
-from .plan import in_a_job
+from .plan import Grid, in_a_job
 from .store import Store, is_store
-from .trajectories import Grid
 
 # Packages whose versions may change a map's last bits.
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
