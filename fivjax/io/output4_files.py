@@ -6,8 +6,6 @@ from pathlib import Path
 from . import sparse_parts
 from .separate_reading import parts_of
 
-KIND = "OUTPUT4"
-
 
 def output4_matrices(path: Path) -> dict:
     """The matrices of a file by name, sparse, of whatever shape.
@@ -20,12 +18,13 @@ def output4_matrices(path: Path) -> dict:
             f"matrices as DMIG in a `.pch` file."
         )
     shapes, parts = {}, {}
-    for about, values in parts_of(path, "output4", KIND):
+    kind = "OUTPUT4"
+    for about, values in parts_of(path, "output4", kind):
         if values is None:
             shapes[about["name"]] = tuple(about["shape"])
         else:
             parts[about["name"]] = values
     return {
-        name: sparse_parts.listed(path, KIND, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape)
+        name: sparse_parts.listed(path, kind, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape)
         for name, shape in shapes.items()
     }

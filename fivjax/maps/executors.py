@@ -1,4 +1,5 @@
-"""Executors of jobs: any in the manner of `concurrent.futures`, and how a new one is made when its workers die.
+"""Executors of jobs: any in the manner of `concurrent.futures`; how jobs are handed out to one, and how a new one is made when
+its workers die.
 
 An executor is
 
@@ -23,10 +24,6 @@ from ..foundation import arguments
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-# The most jobs handed out at a time, if the number of workers is not known.
-HANDED_OUT = 512
-MOST_BREAKS = 32
 
 
 def with_workers(function: Callable[P, R]) -> Callable[P, R]:
@@ -88,7 +85,7 @@ class Workers:
         **Raises:** `RuntimeError` if a new one cannot be made, or if executors keep breaking before any job is done.
         """
         self._breaks += 1
-        if self._breaks > MOST_BREAKS:
+        if self._breaks > 32:
             raise RuntimeError(
                 f"The workers of `executor` died {self._breaks} times without one finished job. If they are started from "
                 'a script, its own work must stand below `if __name__ == "__main__":`; else look at their memory.'
@@ -190,11 +187,6 @@ def _kinds(error: BaseException) -> set[str]:
     return {kind.__name__ for kind in type(error).__mro__}
 
 
-MOST_LOSSES = 3
-# Time between two checks for a request to stop, while no result arrives, s.
-LOOK_EVERY = 0.2
-
-
 def hand_out(
     jobs: Sequence[int],
     submit: Callable[[int], Any],
@@ -205,7 +197,9 @@ def hand_out(
 ) -> None:
     """Run all jobs (numbers): `submit` hands one out and returns its future, `done` gets its result, in any order.
 
-    `given_up` is called for jobs that kill their workers.
+    Workers may die. If several jobs run at a time, a broken pool does not tell which of them killed a worker, so a lost job is
+    first run again after all others. A job that is lost three times waits until all others are done, and then runs alone; if
+    its worker dies three times again, the job is the cause, and `given_up` is called for it.
 
     **Raises:** `KeyboardInterrupt` once `stop()` is true, or if a worker was interrupted; `RuntimeError` if there are no
     workers any more; and anything that a job raises.
@@ -216,9 +210,11 @@ def hand_out(
     under_way: dict[Any, int] = {}  # futures, in the order in which they were handed out
     alone: int | None = None  # the job that runs alone
     back: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    most_losses = 3
     try:
         while waiting or suspects or under_way:
-            room = HANDED_OUT if workers.side_by_side is None else workers.side_by_side + 1
+            # Where the number of workers is not known, so many jobs.
+            room = 512 if workers.side_by_side is None else workers.side_by_side + 1
             chosen = waiting if waiting or under_way else suspects
             while chosen and len(under_way) < (1 if chosen is suspects else room):
                 number = chosen[0]
@@ -236,7 +232,8 @@ def hand_out(
                 under_way[future] = number
                 future.add_done_callback(back.put)
             try:
-                future = back.get(timeout=LOOK_EVERY)
+                # While no result arrives, requests to stop are looked for.
+                future = back.get(timeout=0.2)
             except queue.Empty:
                 future = None
             if stop():
@@ -264,14 +261,14 @@ def hand_out(
                 workers.renew()
             for one, number in gone:
                 # Jobs begin in order, so only the first ones were running.
-                blamed = MOST_LOSSES if is_proof(error) else int(one in running)
+                blamed = most_losses if is_proof(error) else int(one in running)
                 if number == alone:
                     lost_alone[number] += blamed
                 else:
                     lost[number] += blamed
-                if lost_alone[number] >= MOST_LOSSES:
+                if lost_alone[number] >= most_losses:
                     given_up(number)
-                elif lost[number] >= MOST_LOSSES:
+                elif lost[number] >= most_losses:
                     suspects.append(number)
                 else:
                     waiting.append(number)

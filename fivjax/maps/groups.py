@@ -31,10 +31,6 @@ from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 
 # Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
 HISTORY = ("p", "duration", "start")
-# Number of groups worked out at a time, so that one size is compiled.
-GROUPS_AT_A_TIME = 64
-# States kept of a torus, mostly.
-OF_TORUS = 512
 
 
 class Shared(eqx.Module):
@@ -106,7 +102,7 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     own = 8 * (3 * 2 * n + 60)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
-    attractor = 8 * OF_TORUS * 2 * n
+    attractor = 8 * 512 * 2 * n  # mostly so many states are kept of a torus
     return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
@@ -122,7 +118,8 @@ def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[
 
 def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
     """`Shared` of each row of `distinct`, as one array."""
-    size, parts = GROUPS_AT_A_TIME, []
+    # So many groups are worked out at a time, so that one size is compiled.
+    size, parts = 64, []
     for start in range(0, len(distinct), size):
         # Padded with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)

@@ -28,12 +28,6 @@ from .groups import Task, grouped
 from .job_files import JobFile, JobState
 from .results import Ended, Verdicts, not_run, record
 
-# Rounds after which the attractors of the groups of those that are undecided are computed.
-KNOWN_FROM = 4
-# Those that are undecided later ask for a cycle of their own, each time after twice the steps.
-OWN_FROM = 16
-# Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long anyway.
-MORE_FROM = 64
 # How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
 LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 
@@ -102,7 +96,9 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     pending = np.arange(len(group))
     trajectories = begin(batch, group, columns)
     capture = Capture(batch, of_groups, group, seeds, report)
-    known_from, own_from = KNOWN_FROM * task.method.round, OWN_FROM * task.method.round
+    # After so many rounds the attractors of the groups of those that are undecided are computed; those that are undecided later
+    # ask for a cycle of their own, each time after twice the steps.
+    known_from, own_from = 4 * task.method.round, 16 * task.method.round
     limit = task.limits.t_max
     if limit is None:
         limit = np.maximum(LEAST_TIME, LEAST_PERIODS * batch.shared.tree.modes.slowest_period)
@@ -120,6 +116,9 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     def state() -> JobState:
         return JobState(done, own_from, verdicts, pending, trajectories.numbers, dict(known), *capture.state())
 
+    # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long
+    # anyway.
+    more_from = 64
     while True:
         _, now = trajectories.tree
         verdict = np.array(now.verdict)
@@ -152,7 +151,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
         if done == known_from:
             capture.search(np.unique(group[pending]), known, lambda: file.note(state()))
         elif done >= own_from:
-            crossings = CROSSINGS if done < MORE_FROM * task.method.round else MORE_CROSSINGS
+            crossings = CROSSINGS if done < more_from * task.method.round else MORE_CROSSINGS
             capture.search_alone(pending, trajectories.tree[1], crossings)
             own_from = 2 * done
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.

@@ -1,6 +1,7 @@
-"""The plan of a run of many trajectories: its jobs, and which of them need the attractors of others first.
+"""The plan of a run of many trajectories: how they are divided into jobs, and which jobs need the attractors of others first.
 
 The plan follows from the trajectories alone, not from the executor, so results are the same, bit for bit, on any executor.
+Trajectories of a group (`groups`) share data, above all their attractors, so a job has whole groups if these are small enough.
 """
 
 import math
@@ -21,8 +22,8 @@ from .groups import HISTORY, Limits, Task, bytes_per_trajectory, grouped, in_bul
 # Indices of trajectories in a run; those of one job, for instance.
 Places = Int[np.ndarray, " r"]
 # Attractors are computed from scratch for one in so many values of each parameter, and continued from there to the values that
-# follow, if these differ by no more than this share (`attractor_search`).
-SEEDING, SEEDED_WITHIN = 4, 0.2
+# follow (`attractors.search`).
+SEEDING = 4
 
 
 class Grid:
@@ -122,7 +123,8 @@ class Listed:
 
 def _near_enough(own: Float[np.ndarray, "r k"], other: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
     """The other parameters where they differ little from the own ones, else the own ones."""
-    near = np.all(np.abs(other - own) <= SEEDED_WITHIN * np.abs(own), axis=1)
+    # Further away an attractor cannot be continued.
+    near = np.all(np.abs(other - own) <= 0.2 * np.abs(own), axis=1)
     return np.where(near[:, None], other, own)
 
 
@@ -185,8 +187,6 @@ def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
     return [places[order[a:b]] for a, b in zip(ends, [*ends[1:], len(places)], strict=True) if b > a]
 
 
-# Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.
-SIDE_BY_SIDE = 16
 # The most trajectories of a job, with `Propagation` and with other steppers: a second or two of work, because an interrupt
 # loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
@@ -224,7 +224,9 @@ def plan_of(
             later.append(number)
         counts[groups] += here
     total = int(counts.sum())
-    in_rows = np.sum(-(-counts // SIDE_BY_SIDE)) * SIDE_BY_SIDE
+    # Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.
+    side_by_side = 16
+    in_rows = np.sum(-(-counts // side_by_side)) * side_by_side
     task = Task(
         scene=jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, scene),
         method=followed,
@@ -234,7 +236,7 @@ def plan_of(
         limits=limits,
         # The same in all jobs, because matrix products of other shapes round differently. A trajectory in a row of its own
         # costs four times as much as one in a full row.
-        width=SIDE_BY_SIDE if in_rows <= 4 * total else 1,
+        width=side_by_side if in_rows <= 4 * total else 1,
         many=total >= MANY,
     )
     waiting = set(later)

@@ -13,10 +13,6 @@ from ..verdicts.verdict import Verdict
 from .plan import Places
 from .results import Verdicts, not_run
 
-# If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A torus
-# and the cycle that it locks to next door do not.
-JUMP = 1.1
-
 # A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
 Run = Callable[[Places, str], Verdicts]
 
@@ -117,7 +113,10 @@ def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.nd
     verdict = verdicts.verdict[corners]
     size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
     low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
-    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > JUMP * low)
+    # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A
+    # torus and the cycle that it locks to next door do not.
+    jump = 1.1
+    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > jump * low)
 
 
 def _over_corners(combine, values: np.ndarray) -> np.ndarray:

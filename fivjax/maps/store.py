@@ -6,6 +6,9 @@ trajectories that have not been run have the verdict `NOT_RUN`. A chunk is the p
 in a checksum (Zarr's codec `crc32c`). Only the process that hands out the jobs writes chunks, so a chunk has one writer; a file
 lock keeps other processes out. The verdicts of a job are written last, after all its other results are on the disk: a chunk
 with verdicts is complete, even if the process is killed. A chunk that cannot be read counts as not run.
+
+Zarr's metadata carry no checksums. So those of all files that make an empty store are kept in a file of their own, `checksums`.
+A damaged one of these files is made anew, because it follows from the run.
 """
 
 import contextlib
@@ -34,6 +37,133 @@ from .results import Verdicts, by_name, not_run
 KIND = "fivjax store"
 CHECKSUMS, LOCK = "checksums", ".lock"
 HOW_ON = "Delete it to begin the run anew, or give another path."
+
+
+# The subfolders for attractors that later jobs need, and for jobs that are under way.
+FOUND, JOBS = "attractors", "jobs"
+
+
+def is_store(path: str | Path) -> bool:
+    """Whether results are to be kept in a folder of chunks."""
+    return Path(path).suffix == ".zarr"
+
+
+class Store:
+    """The folder of a run: reads the results of an earlier run, and writes new ones.
+
+    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a folder that is no store, the store
+    of another run (naming the first difference), one whose metadata are damaged, and one that another process is writing;
+    `ImportError` without Zarr.
+    """
+
+    def __init__(self, path: str | Path, run: dict, grid: Grid, tile: tuple[int, ...], energy: bool):
+        self.path, self.tiles = Path(path), Tiles(grid.shape, tile)
+        self.found: dict[int, dict[bytes, Attractors]] = {}
+        self.energy, self.run = energy, {**run, "chunk": list(tile)}
+        fields = by_name(not_run(1, energy))
+        if not self.path.exists():
+            create(self.path, self.run, grid, tile, fields)
+        check_begun(self.path, self.run, grid, tile, fields)
+        self._lock = locked(self.path)
+        try:
+            # A chunk without a file is one that was not written, or is lost.
+            with zarr().config.set({"array.write_empty_chunks": True}):
+                group = zarr().open_group(self.path, mode="r+", use_consolidated=False)
+                self.arrays = {name: group[name] for name in fields}
+            # Chunks that this run begins have nothing to recall.
+            self._earlier = set(self._begun())
+            for file in sorted((self.path / FOUND).glob("*.npz")):
+                # Without it, the job that found it is run again.
+                with contextlib.suppress(OSError, Damaged, ValueError):
+                    self.found[int(file.stem)] = from_bytes(unsealed(file.read_bytes()))
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _begun(self) -> Iterator[int]:
+        return (number for number in range(len(self.tiles)) if self._chunk("verdict", number).exists())
+
+    def recalled(self, places: Places | None) -> Verdicts:
+        """The results kept by earlier runs of these trajectories (all, unless given)."""
+        verdicts = not_run(self.tiles.total if places is None else len(places), self.energy)
+        for number, inside, rows in self.tiles.among(places):
+            if number not in self._earlier:
+                continue
+            parts = self._read(number)
+            if not parts:
+                self._earlier.remove(number)
+                continue
+            for name, values in by_name(verdicts).items():
+                values[rows] = parts[name][inside]
+        return verdicts
+
+    def _read(self, number: int) -> dict[str, np.ndarray]:
+        """All results in a chunk, by name; none where any of them is damaged, of which then none counts."""
+        parts, at = {}, self.tiles.slices(number)
+        for name, array in self.arrays.items():
+            try:
+                if not self._chunk(name, number).exists():
+                    raise FileNotFoundError(errno.ENOENT, "missing")
+                parts[name] = np.array(array[at]).ravel()
+            except Exception:  # a damaged chunk may raise any error in its decoder
+                file = self._chunk(name, number).relative_to(self.path)
+                # Without verdicts, none of its trajectories counts as run.
+                self._chunk("verdict", number).unlink(missing_ok=True)
+                warnings.warn(
+                    f"Store `{self.path}` is damaged: file `{file}` is not what was written. The trajectories of this chunk "
+                    f"are computed anew.",
+                    stacklevel=6,
+                )
+                return {}
+        return parts
+
+    def job_file(self, places: Places) -> tuple[str, str]:
+        """The path and the key of the file for the job with these trajectories."""
+        return file_of(self.path / JOBS, self.run, places)
+
+    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
+        """Keep the results of the job with these trajectories."""
+        if found is not None:
+            folder = self.path / FOUND
+            folder.mkdir(exist_ok=True)
+            replace_whole(folder / f"{int(places[0])}.npz", sealed(to_bytes(found)))
+        fields = by_name(verdicts)
+        parts = []
+        for number, inside, rows in self.tiles.among(places):
+            shape = [part.stop - part.start for part in self.tiles.slices(number)]
+            # Of a part that has several jobs, what the others have written stays.
+            earlier = {}
+            if len(rows) < math.prod(shape) and self._chunk("verdict", number).exists():
+                earlier = self._read(number)
+            parts.append((number, inside, rows, shape, earlier))
+        for name in sorted(fields, key=lambda name: name == "verdict"):  # verdicts last
+            for number, inside, rows, shape, earlier in parts:
+                nothing = np.full(math.prod(shape), self.arrays[name].fill_value, fields[name].dtype)
+                values = earlier.get(name, nothing)
+                values[inside] = fields[name][rows]
+                self.arrays[name][self.tiles.slices(number)] = values.reshape(shape)
+                _sync(self._chunk(name, number))
+        Path(self.job_file(places)[0]).unlink(missing_ok=True)
+
+    def _chunk(self, name: str, number: int) -> Path:
+        return self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
+
+    def flush(self) -> None:
+        """Nothing to do: every job is written at once."""
+
+    def close(self) -> None:
+        """Release the lock, so that other processes may write."""
+        with contextlib.suppress(OSError):  # jobs are under way, or there never were any
+            (self.path / JOBS).rmdir()
+        self._lock.close()
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def zarr():
@@ -167,130 +297,3 @@ def locked(path: Path):
         file.write(f"number {os.getpid()} on {platform.node()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
         file.flush()
     return file
-
-
-# The subfolders for attractors that later jobs need, and for jobs that are under way.
-FOUND, JOBS = "attractors", "jobs"
-
-
-def is_store(path: str | Path) -> bool:
-    """Whether results are to be kept in a folder of chunks."""
-    return Path(path).suffix == ".zarr"
-
-
-class Store:
-    """The folder of a run: reads the results of an earlier run, and writes new ones.
-
-    **Raises:** `ValueError`, before any work is done, for a path that cannot be written, a folder that is no store, the store
-    of another run (naming the first difference), one whose metadata are damaged, and one that another process is writing;
-    `ImportError` without Zarr.
-    """
-
-    def __init__(self, path: str | Path, run: dict, grid: Grid, tile: tuple[int, ...], energy: bool):
-        self.path, self.tiles = Path(path), Tiles(grid.shape, tile)
-        self.found: dict[int, dict[bytes, Attractors]] = {}
-        self.energy, self.run = energy, {**run, "chunk": list(tile)}
-        fields = by_name(not_run(1, energy))
-        if not self.path.exists():
-            create(self.path, self.run, grid, tile, fields)
-        check_begun(self.path, self.run, grid, tile, fields)
-        self._lock = locked(self.path)
-        try:
-            # A chunk without a file is one that was not written, or is lost.
-            with zarr().config.set({"array.write_empty_chunks": True}):
-                group = zarr().open_group(self.path, mode="r+", use_consolidated=False)
-                self.arrays = {name: group[name] for name in fields}
-            # Chunks that this run begins have nothing to recall.
-            self._earlier = set(self._begun())
-            for file in sorted((self.path / FOUND).glob("*.npz")):
-                # Without it, the job that found it is run again.
-                with contextlib.suppress(OSError, Damaged, ValueError):
-                    self.found[int(file.stem)] = from_bytes(unsealed(file.read_bytes()))
-        except BaseException:
-            self._lock.close()
-            raise
-
-    def _begun(self) -> Iterator[int]:
-        return (number for number in range(len(self.tiles)) if self._chunk("verdict", number).exists())
-
-    def recalled(self, places: Places | None) -> Verdicts:
-        """The results kept by earlier runs of these trajectories (all, unless given)."""
-        verdicts = not_run(self.tiles.total if places is None else len(places), self.energy)
-        for number, inside, rows in self.tiles.among(places):
-            if number not in self._earlier:
-                continue
-            parts = self._read(number)
-            if not parts:
-                self._earlier.remove(number)
-                continue
-            for name, values in by_name(verdicts).items():
-                values[rows] = parts[name][inside]
-        return verdicts
-
-    def _read(self, number: int) -> dict[str, np.ndarray]:
-        """All results in a chunk, by name; none where any of them is damaged, of which then none counts."""
-        parts, at = {}, self.tiles.slices(number)
-        for name, array in self.arrays.items():
-            try:
-                if not self._chunk(name, number).exists():
-                    raise FileNotFoundError(errno.ENOENT, "missing")
-                parts[name] = np.array(array[at]).ravel()
-            except Exception:  # a damaged chunk may raise any error in its decoder
-                file = self._chunk(name, number).relative_to(self.path)
-                # Without verdicts, none of its trajectories counts as run.
-                self._chunk("verdict", number).unlink(missing_ok=True)
-                warnings.warn(
-                    f"Store `{self.path}` is damaged: file `{file}` is not what was written. The trajectories of this chunk "
-                    f"are computed anew.",
-                    stacklevel=6,
-                )
-                return {}
-        return parts
-
-    def job_file(self, places: Places) -> tuple[str, str]:
-        """The path and the key of the file for the job with these trajectories."""
-        return file_of(self.path / JOBS, self.run, places)
-
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
-        """Keep the results of the job with these trajectories."""
-        if found is not None:
-            folder = self.path / FOUND
-            folder.mkdir(exist_ok=True)
-            replace_whole(folder / f"{int(places[0])}.npz", sealed(to_bytes(found)))
-        fields = by_name(verdicts)
-        parts = []
-        for number, inside, rows in self.tiles.among(places):
-            shape = [part.stop - part.start for part in self.tiles.slices(number)]
-            # Of a part that has several jobs, what the others have written stays.
-            earlier = {}
-            if len(rows) < math.prod(shape) and self._chunk("verdict", number).exists():
-                earlier = self._read(number)
-            parts.append((number, inside, rows, shape, earlier))
-        for name in sorted(fields, key=lambda name: name == "verdict"):  # verdicts last
-            for number, inside, rows, shape, earlier in parts:
-                nothing = np.full(math.prod(shape), self.arrays[name].fill_value, fields[name].dtype)
-                values = earlier.get(name, nothing)
-                values[inside] = fields[name][rows]
-                self.arrays[name][self.tiles.slices(number)] = values.reshape(shape)
-                _sync(self._chunk(name, number))
-        Path(self.job_file(places)[0]).unlink(missing_ok=True)
-
-    def _chunk(self, name: str, number: int) -> Path:
-        return self.path.joinpath(name, "c", *map(str, np.unravel_index(number, self.tiles.parts)))
-
-    def flush(self) -> None:
-        """Nothing to do: every job is written at once."""
-
-    def close(self) -> None:
-        """Release the lock, so that other processes may write."""
-        with contextlib.suppress(OSError):  # jobs are under way, or there never were any
-            (self.path / JOBS).rmdir()
-        self._lock.close()
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

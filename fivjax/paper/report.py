@@ -11,8 +11,6 @@ from .figures import FIGURES
 from .findings import Kind, Made, summary
 from .runs import Runs
 
-REPORT = "reproduce.md"
-
 
 class Reproduction(dict[str, Made]):
     """The results, by name of figure or table."""
@@ -55,11 +53,12 @@ def reproduce(
         μ_coupling
     """
     names = _names(figure)
+    report = "reproduce.md"
     if out is not None:
         out = Path(out)
         if not out.exists() and out.parent.is_dir():
             out.mkdir()
-        check_writable(out / REPORT)
+        check_writable(out / report)
     runs, made = Runs(), Reproduction()
     with following("reproduce", shown=progress, total=len(names), unit=" figures"):
         for name in names:
@@ -72,7 +71,7 @@ def reproduce(
                 save(one.data, out / f"{_file_name(name)}.nc")
             tick()
     if out is not None:
-        save_text(markdown(made), out / REPORT)
+        save_text(markdown(made), out / report)
     return made
 
 
