@@ -16,9 +16,9 @@ from fivjax.attractors.tori import (
     _holds_one_of,
     _in_clusters,
     _on_one_torus,
+    capturing_tori,
     goes_on,
     is_drifting,
-    reached,
 )
 from fivjax.attractors.tube import Tube
 from fivjax.maps.capture import Capture
@@ -114,15 +114,15 @@ def test_a_torus_captures_what_stays_in_half_its_tube():
     radii = 0.5 + half * np.array([0.0, 0.9, -0.9, 1.1, -1.1, 3.0])
     states = np.stack([4 + radii, 0 * radii], axis=-1) / maps.weights
     at = Section(states, np.zeros(6, np.int32), np.ones(6))
-    found = reached(maps, Motions(np.zeros(6, int), at), states, [(np.arange(6), torus)])  # type: ignore[arg-type]
+    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.arange(6), torus)])  # type: ignore[arg-type]
     assert found == dict.fromkeys((0, 1, 2), torus)
     assert maps.asked == [5]
     # One whose last crossing is not known, and another torus, which has been asked about first.
     states = np.where(np.arange(6)[:, None] == 0, np.nan, states)
     other = torus._replace(amplitude=2.0)
-    found = reached(maps, Motions(np.zeros(6, int), at), states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
+    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
     assert found == {1: other, 2: torus}
-    assert reached(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
+    assert capturing_tori(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
 
 
 def circle(radius=0.5, count=STATES):

@@ -81,7 +81,7 @@ def test_a_damaged_part_of_a_checkpoint_is_named_and_alone_is_computed_anew(pape
     flipped(path, 8 * at)
     with pytest.warns(UserWarning, match=rf"`amplitude` of trajectories {BLOCK} to {2 * BLOCK - 1} is not what was"):
         again = Checkpoint(path, run, 3 * BLOCK, energy=False)
-    assert np.flatnonzero(again.recalled(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
+    assert np.flatnonzero(again.recall(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
 
 
 def test_attractors_that_are_lost_are_found_again(paper_scene, tmp_path, jobs_run):

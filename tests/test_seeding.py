@@ -54,6 +54,6 @@ def test_what_is_continued_is_what_releases_find(paper_scene, monkeypatch, speed
 
 
 def test_where_nothing_can_be_continued_motions_are_released(paper_scene, monkeypatch):
-    monkeypatch.setattr(search, "_continued", lambda *_: None)
+    monkeypatch.setattr(search, "_continue_from_seeds", lambda *_: None)
     m = fj.bistability_map(paper_scene.replace(belt_speed=1.0), mu=MUS[:2], p=[2.0], progress=False)
     assert m["verdict"].values.tolist() == [[1], [1]] and len(m["attractor_period"]) == 2

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..section.return_maps import ReturnMaps
-from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, captured, is_new, stable_cycles
+from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, capturing_cycles, is_new, stable_cycles
 from .motions import Motions, far_apart
-from .tori import TUBES, Torus, reached, tori_from
+from .tori import TUBES, Torus, capturing_tori, tori_from
 
 
 class Attractors(NamedTuple):
@@ -88,7 +88,7 @@ class Catalogue(NamedTuple):
         self, motions: Motions, asked: Bool[np.ndarray, " m"], latest: Float[np.ndarray, "m 2n"] | None = None
     ) -> dict[int, StableCycle | Torus]:
         """The known attractors of their groups by which motions have been captured, by row. Only those that are `asked` count;
-        `latest` are their last crossings (`cycles.captured`), unless they are on the section.
+        `latest` are their last crossings (`cycles.capturing_cycles`), unless they are on the section.
         """
         group, latest = motions.group, motions.at.y if latest is None else latest
         rows = np.flatnonzero(asked)
@@ -98,10 +98,10 @@ class Catalogue(NamedTuple):
         which, first = np.unique(group[rows], return_index=True)
         own = [(part, self.of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True)]
         cycles = [(part, cycle) for part, known in own for cycle in known.cycles]
-        place = captured(self.maps, motions, latest, cycles)
+        place = capturing_cycles(self.maps, motions, latest, cycles)
         found: dict[int, StableCycle | Torus] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
         tori = [(part[place[part] < 0], torus) for part, known in own for torus in known.tori]
-        return found | reached(self.maps, motions, latest, tori)
+        return found | capturing_tori(self.maps, motions, latest, tori)
 
     def only(self, groups) -> "Catalogue":
         """The catalogue of these groups; what is added to it is added to the whole."""

@@ -68,12 +68,12 @@ def close(maps: ReturnMaps, group: Int[np.ndarray, " m"], guess: Section, crossi
             continue
         at = best.at.rows(rows)
         image = maps.returns(group[rows], at, count).at
-        rows = rows[(_missed(maps, at, image) <= CLOSED) & _alike(image, at)]
+        rows = rows[(_closing_error(maps, at, image) <= CLOSED) & _alike(image, at)]
         if len(rows):
             at = best.at.rows(rows)
             image, time, derived = maps.derived(group[rows], at, count)
             best.crossings[rows], best.period[rows], best.jacobian[rows] = count, time, derived
-            best.residual[rows] = _missed(maps, at, image)
+            best.residual[rows] = _closing_error(maps, at, image)
             open_[rows] = False
     return best
 
@@ -87,7 +87,7 @@ def closed_at(maps: ReturnMaps, point: Point, crossings: int) -> FixedPoint:
     """The cycle through this point, of the only group, as it is."""
     at = Section.of(point)
     image, time, derived = maps.derived(np.zeros(1, int), at, crossings)
-    return FixedPoint(at.point(0), crossings, float(time[0]), derived[0], float(_missed(maps, at, image)[0]))
+    return FixedPoint(at.point(0), crossings, float(time[0]), derived[0], float(_closing_error(maps, at, image)[0]))
 
 
 def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, " m"], patient: bool) -> Closed:
@@ -102,7 +102,7 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
             break
         now = here.rows(running)
         image, time, derived = maps.derived(group[running], now, crossings[running])
-        missed = _missed(maps, now, image)
+        missed = _closing_error(maps, now, image)
         usable = np.isfinite(missed) & np.all(np.isfinite(derived), axis=(1, 2))
         alike = _alike(image, now)
         better = usable & alike & (missed < best.residual[running])
@@ -143,7 +143,7 @@ def _newton_steps(maps: ReturnMaps, jacobian, gap) -> Float[np.ndarray, "m 2n"]:
     return steps
 
 
-def _missed(maps: ReturnMaps, at: Section, image: Section) -> Float[np.ndarray, " m"]:
+def _closing_error(maps: ReturnMaps, at: Section, image: Section) -> Float[np.ndarray, " m"]:
     """The distance of images from where they began, relative to the size there."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.linalg.norm(maps.weights * at.y, axis=1)

@@ -48,7 +48,7 @@ class _Drift(NamedTuple):
             whole[chosen] = part
 
 
-def crept(
+def creep(
     maps: ReturnMaps,
     motions: Motions,
     arrived: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]],
@@ -60,7 +60,7 @@ def crept(
     last = Section(*(np.array(part) for part in at))
     time, events, creeps = np.zeros(len(group)), np.zeros(len(group), int), np.zeros(len(group), bool)
     share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), 128), np.zeros(len(group), int)
-    rows, here = np.arange(len(group)), _measured(maps, motions)
+    rows, here = np.arange(len(group)), _measure_drift(maps, motions)
     for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
         # A shorter drift is rounding.
@@ -76,7 +76,7 @@ def crept(
         times[plain] = 0.0
         leapt = here.at._replace(y=here.at.y + times[:, None] * here.way / maps.weights)
         settled = maps.returns(group[rows], leapt, np.where(plain, 512, settles[rows]))
-        there = _measured(maps, Motions(group[rows], settled.at))
+        there = _measure_drift(maps, Motions(group[rows], settled.at))
         with np.errstate(divide="ignore", invalid="ignore"):
             faster = np.linalg.norm(there.way, axis=1) / length
             longer = np.fmin(np.minimum(2 * share[rows], LONGEST_LEAP), TRUSTED * share[rows] / np.abs(np.log(faster)))
@@ -101,7 +101,7 @@ def crept(
     return creeps, last, time, events
 
 
-def _measured(maps: ReturnMaps, motions: Motions) -> _Drift:
+def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     """How motions drift in the latter half of `2 * OVER` returns."""
     group, at = motions
     middle = maps.returns(group, at, OVER)

@@ -74,7 +74,7 @@ def stable_cycles(
     """The stable cycles that motions are near to: of each the group, the rows that led to it, and it. Those of a group that are
     `known` are not computed anew.
     """
-    near, closed = _nearly_closed(maps, motions, recurrence)
+    near, closed = _close_recurring(maps, motions, recurrence)
     group, lag = motions.group, closed.crossings
     # Sliding closes upon itself as well.
     periodic = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
@@ -97,7 +97,7 @@ def stable_cycles(
             alike[kind].append(len(kept))
             kept.append(row)
             rows_of.append([near[row]])
-    before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    before = [_cycle_through(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = np.max(np.abs(np.linalg.eigvals(closed.jacobian[kept])), axis=1)
     found, stable, trials = [], [], []
     for k, row in enumerate(kept):
@@ -119,7 +119,9 @@ def stable_cycles(
     return found
 
 
-def _nearly_closed(maps: ReturnMaps, motions: Motions, recurrence: Recurrence) -> tuple[Int[np.ndarray, " r"], Closed]:
+def _close_recurring(
+    maps: ReturnMaps, motions: Motions, recurrence: Recurrence
+) -> tuple[Int[np.ndarray, " r"], Closed]:
     """The rows of motions that nearly repeat, and what Newton's method makes of each."""
     group = motions.group
     last, states = maps.path(*motions, recurrence.crossings + 1)
@@ -142,7 +144,7 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
     found = np.zeros(len(group), bool)
     if len(maps.structure.contacts) == 1:
         return found
-    near, closed = _nearly_closed(maps, motions, AT_FIRST)
+    near, closed = _close_recurring(maps, motions, AT_FIRST)
     rows = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
     multipliers = np.linalg.eigvals(closed.jacobian[rows])
     found[near[rows]] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)
@@ -151,10 +153,10 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
 
 def is_new(maps: ReturnMaps, cycle: StableCycle, known: list[StableCycle]) -> bool:
     """Whether a cycle is none of the known ones of its group."""
-    return _passing(maps, cycle.points[0], known) is None
+    return _cycle_through(maps, cycle.points[0], known) is None
 
 
-def _passing(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[StableCycle]) -> StableCycle | None:
+def _cycle_through(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[StableCycle]) -> StableCycle | None:
     """The one of these cycles that has this state among its points."""
     return next((cycle for cycle in cycles if _passes(maps, y, cycle.points)), None)
 
@@ -188,7 +190,7 @@ def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
     return returned
 
 
-def captured(
+def capturing_cycles(
     maps: ReturnMaps,
     motions: Motions,
     latest: Float[np.ndarray, "m 2n"],

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
 from .catalogue import Catalogue
-from .creeping import crept
+from .creeping import creep
 from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle
 from .divergence import long_divergence
 from .motions import Motions, far_apart
@@ -67,7 +67,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
     return Fates(chaotic, attractor, quiet, at, time, events)
 
 
-class _Run(NamedTuple):
+class _Underway(NamedTuple):
     """Motions that are followed on: where they are by now, how much later that is (s), and their contact events on the way.
     All change in place.
     """
@@ -90,7 +90,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     maps, group = catalogue.maps, motions.group
     followed = long_divergence(maps, motions)
     now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
-    run = _Run(Motions(group, now), time, events)
+    run = _Underway(Motions(group, now), time, events)
     attractor: dict[int, StableCycle | Torus] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
@@ -118,7 +118,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
 
 
 def _creep(
-    catalogue: Catalogue, run: _Run, asked: Bool[np.ndarray, " m"], slides: Slides | None
+    catalogue: Catalogue, run: _Underway, asked: Bool[np.ndarray, " m"], slides: Slides | None
 ) -> Bool[np.ndarray, " m"]:
     """Which of these motions creep along a line of states: they are taken to where an attractor captures them, where they are
     certain to slide for ever, or where they creep no more.
@@ -133,14 +133,14 @@ def _creep(
 
     creeping = np.zeros(len(asked), bool)
     if len(asked_rows):
-        creeps, at, later, more = crept(catalogue.maps, run.motions.rows(asked_rows), arrived)
+        creeps, at, later, more = creep(catalogue.maps, run.motions.rows(asked_rows), arrived)
         rows = asked_rows[creeps]
         creeping[rows] = True
         run.move(rows, at.rows(creeps), later[creeps], more[creeps])
     return creeping
 
 
-def _drift(maps: ReturnMaps, run: _Run, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+def _drift(maps: ReturnMaps, run: _Underway, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
     """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: they are taken further."""
     rows, drifting = np.flatnonzero(asked), np.zeros(len(asked), bool)
     if len(rows):

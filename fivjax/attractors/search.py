@@ -47,7 +47,7 @@ def search_groups(
     found |= {g: Attractors([], []) for g in seeded}
     for start in range(0, len(seeded), TOGETHER):
         part = seeded[start : start + TOGETHER]
-        _continued(catalogue, {g: seeds[g] for g in part})
+        _continue_from_seeds(catalogue, {g: seeds[g] for g in part})
         complete([g for g in part if found[g].cycles or found[g].tori])
     by_releases([g for g in seeded if not (found[g].cycles or found[g].tori)])
 
@@ -72,7 +72,7 @@ def search_from(catalogue: Catalogue, motions: Motions) -> Motions:
         if not len(motions.group):
             return motions
         catalogue.report(0)
-        motions, done = _lasting(catalogue.maps, motions, stop - done), stop
+        motions, done = _follow_lasting(catalogue.maps, motions, stop - done), stop
         captured = np.zeros(len(motions.group), bool)
         captured[list(catalogue.captures(motions, ~captured))] = True
         picked = far_apart(weights * motions.at.y, motions.group, ~captured)
@@ -82,7 +82,7 @@ def search_from(catalogue: Catalogue, motions: Motions) -> Motions:
     return motions.rows(catalogue.add_tori_by_turns(motions, np.ones(len(motions.group), bool)))
 
 
-def _lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions:
+def _follow_lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions:
     """Those of the motions, so many returns later, that neither fade nor stop crossing the section."""
     half = returns // 2
     middle = maps.returns(*motions, half).at
@@ -94,7 +94,7 @@ def _lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions:
     return Motions(motions.group, last.at).rows(goes_on)
 
 
-def _continued(catalogue: Catalogue, seeds: dict[int, int]) -> None:
+def _continue_from_seeds(catalogue: Catalogue, seeds: dict[int, int]) -> None:
     """Adds the attractors of these groups to which motions come that begin on those of the group that seeds each."""
     on_cycles, on_tori = [], []
     for g, seed in seeds.items():
@@ -105,9 +105,9 @@ def _continued(catalogue: Catalogue, seeds: dict[int, int]) -> None:
     own = catalogue.only(seeds)
     catalogue.report(0)
     # Returns after which a motion from a cycle, or from a torus, nearby has come near to the one of its own group.
-    motions = _moved(catalogue.maps, on_cycles, 32)
+    motions = _follow_from(catalogue.maps, on_cycles, 32)
     motions = motions.rows(~own.add_cycles(motions))
-    further = _moved(catalogue.maps, on_tori, 256)
+    further = _follow_from(catalogue.maps, on_tori, 256)
     group = np.concatenate([motions.group, further.group])
     at = Section(*(np.concatenate(parts) for parts in zip(motions.at, further.at, strict=True)))
     motions, usable = Motions(group, at), np.all(np.isfinite(at.y), axis=1)
@@ -115,7 +115,7 @@ def _continued(catalogue: Catalogue, seeds: dict[int, int]) -> None:
     own.add_tori_by_turns(motions, usable)
 
 
-def _moved(maps: ReturnMaps, starts: list, returns: int) -> Motions:
+def _follow_from(maps: ReturnMaps, starts: list, returns: int) -> Motions:
     """Motions from these starts on the section, each with its group, so many returns later."""
     group = np.array([g for g, _ in starts], int)
     y = np.array([y for _, y in starts]).reshape(len(starts), len(maps.weights))

@@ -1,9 +1,10 @@
 """Tori of many groups: the sets that long motions trace on the section, whether these attract, whether neighbours part on them,
 and how high they go.
 
-A set counts as a torus by these checks, each with its tolerance beside it: the motion goes on and repeats nothing (`goes_on`),
-drifts no more (`is_drifting`), and its amplitude has settled (`_settled`); whatever starts on the edge of a tube about the set
-comes back (`_back`); and motions that start there go about the same set without parting (`_attracting`, `_on_one_torus`).
+A set counts as a torus by these checks, each with its tolerance beside it: the motion goes on and repeats nothing
+(`goes_on`), drifts no more (`is_drifting`), and its amplitude has settled (`_settled_amplitude`); whatever starts on the
+edge of a tube about the set comes back (`_tubes_returned_to`); and motions that start there go about the same set without
+parting (`_attracting_tubes`, `_on_one_torus`).
 """
 
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from . import tube
 from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
 from .divergence import growth_rates
 from .motions import NOMINATED, Motions, section_at
-from .tube import Tube, thinned, tree_of
+from .tube import Tube, thin, tree_of
 
 # Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
 TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
@@ -72,22 +73,22 @@ def tori_from(
     known of each row's group. Of the `tubes` the first that attracts counts.
     """
     group = motions.group
-    traced = _traced(maps, motions, tori, max(TRACED, tubes[-1][1]))
+    traced = _trace(maps, motions, tori, max(TRACED, tubes[-1][1]))
     found: dict[int, Torus] = {}
-    locked = _repeating(maps, group, traced, cycles)
+    locked = _cycles_repeated(maps, group, traced, cycles)
     for row, _ in locked:
         del traced[row]
-    around = _traced_around(maps, group, traced)
+    around = _trace_around(maps, group, traced)
     # A tube that is wider says more, where everything in it comes back.
     for radius, count in tubes:
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
-            tried = [(row, Tube(thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
+            tried = [(row, Tube(thin(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
             tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
             if not tried:
                 continue
-            new, of_locked = _attracting(maps, group, tried, cycles, report)
+            new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
             found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
@@ -96,7 +97,7 @@ def tori_from(
     return found, locked
 
 
-def _repeating(
+def _cycles_repeated(
     maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], cycles: list[list[StableCycle]]
 ) -> list[tuple[int, StableCycle]]:
     """The cycles of motions that have nearly come to one of many crossings by the end of what they trace, with their rows."""
@@ -115,14 +116,14 @@ def _repeating(
     return [(rows[k], cycle) for _, which, cycle in near for k in which]
 
 
-def reached(
+def capturing_tori(
     maps: ReturnMaps,
     motions: Motions,
     latest: Float[np.ndarray, "m 2n"],
     known: list[tuple[Int[np.ndarray, " r"], Torus]],
 ) -> dict[int, Torus]:
     """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
-    `cycles.captured`, `latest` tells which to ask, and their next crossings decide.
+    `cycles.capturing_cycles`, `latest` tells which to ask, and their next crossings decide.
     """
     near = []
     for rows, torus in known:
@@ -141,7 +142,7 @@ def reached(
     return found
 
 
-def _traced(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: int) -> dict[int, Traced]:
+def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: int) -> dict[int, Traced]:
     """At least so many states of those motions, by row, that may be on a torus that is none of the known ones."""
     group, at = motions
     running, paths = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1]))
@@ -172,7 +173,7 @@ def _traced(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: 
             drifting = is_drifting(whole) & is_drifting(np.moveaxis(paths, 1, 0))
             left &= goes_on(whole)
             for k in np.flatnonzero(left):
-                amplitude = _settled(peaks[k])
+                amplitude = _settled_amplitude(peaks[k])
                 if amplitude is not None and not drifting[k]:
                     traced[int(running[k])] = Traced(
                         paths[k, -LONGER:].copy(), amplitude, float(np.mean(times[k])) / AT_A_TIME
@@ -200,7 +201,7 @@ def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*st
     return np.tensordot(weights / np.sum(weights), values, axes=1)
 
 
-def _settled(peaks: Float[np.ndarray, " k"]) -> float | None:
+def _settled_amplitude(peaks: Float[np.ndarray, " k"]) -> float | None:
     """The largest of the later half of successive peaks (m/s): the amplitude, if that of the earlier half differs little. What
     shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats may be rare.
     """
@@ -241,7 +242,7 @@ def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
     """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will: distances between
     neighbours are mostly smaller than this share of those of states that are spread over a curve.
     """
-    states = thinned(path, TUBES[0][1])
+    states = thin(path, TUBES[0][1])
     return bool(np.median(_spacing(states)) <= 0.05 * 2 * np.pi * extent(states) / len(states))
 
 
@@ -250,7 +251,7 @@ def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
     return tree_of(states).query(states, k=2)[0][:, 1]
 
 
-def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
+def _trace_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
     """The motions that are in clusters, with the states that others about them trace once they have come to the torus; their
     amplitudes are their own.
     """
@@ -267,7 +268,7 @@ def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[
     }
 
 
-def _attracting(
+def _attracting_tubes(
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
     tubes: list[tuple[int, Tube]],
@@ -276,7 +277,7 @@ def _attracting(
 ) -> tuple[dict[int, Tube], list[tuple[int, StableCycle]]]:
     """Which of these tubes, each with its row, are about tori; and the cycles of tori that are locked."""
     own = np.array([groups[row] for row, _ in tubes])
-    back, last = _back(maps, own, [one for _, one in tubes], report)
+    back, last = _tubes_returned_to(maps, own, [one for _, one in tubes], report)
     if not len(back):
         return {}, []
     # So many of the starts are followed further: first from the edge of the tube to the torus.
@@ -317,7 +318,7 @@ def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> boo
     return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
 
 
-def _back(
+def _tubes_returned_to(
     maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube], report
 ) -> tuple[Int[np.ndarray, " t"], Section]:
     """From the edges of which tubes all starts come back, within so many crossings; and where the starts are then, tube by

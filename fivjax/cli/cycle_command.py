@@ -12,7 +12,7 @@ from .structure_options import StructureOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Cycle:
+class CycleCommand:
     """The limit cycle under the final load: period, multipliers, contact modes. Writes OUT.nc and OUT.png."""
 
     saddle: bool = False

@@ -19,7 +19,7 @@ from .engine import Means, run_to_verdict
 from .executors import with_workers
 from .groups import Limits
 from .plan import Grid
-from .refinement import finer, refined
+from .refinement import finer_axis, refine_grid
 from .results import Verdicts
 from .resuming import keeper_at
 
@@ -113,7 +113,7 @@ def bistability_map(
     arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     check_size(axes, refine, bool(energy))
-    axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
+    axes = {name: finer_axis(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = Grid(axes)
     limits = Limits(t_max, int(max_steps), bool(energy))
     refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
@@ -132,7 +132,7 @@ def bistability_map(
         def level(places: np.ndarray, what: str) -> Verdicts:
             return run_to_verdict(scene, grid, method, limits, means._replace(label=f"map, {what}"), places, found)
 
-        cells = refined(grid.shape, refine, audit, level)
+        cells = refine_grid(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
     return map_dataset(scene, method, t_max, grid, cells.verdicts, _known_by_now(limit, cells.verdicts), cells)
 

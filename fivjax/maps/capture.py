@@ -191,7 +191,7 @@ def later(
     return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 
-def described(count: int, attractor: dict[int, StableCycle | Torus], chaotic: np.ndarray):
+def attractor_columns(count: int, attractor: dict[int, StableCycle | Torus], chaotic: np.ndarray):
     """Kind, amplitude, period, multiplier, reach and contraction of the attractor of each of so many trajectories."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
     amplitude, period, multiplier, reach, contraction = np.full((5, count), np.nan)

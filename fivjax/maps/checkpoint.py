@@ -80,7 +80,7 @@ class Checkpoint:
             warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=5)
         return bool(kept.damaged) or kept.elsewhere
 
-    def recalled(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Places | None) -> Verdicts:
         """The results kept of these trajectories (all, unless given)."""
         chosen = slice(None) if places is None else places
         return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
@@ -140,7 +140,7 @@ def recall(path: str | Path, run: dict) -> Contents | None:
         return None
     try:
         data = path.read_bytes()
-        kept = read(data)
+        kept = contents_from_bytes(data)
     except OSError as error:
         raise ValueError(f"Checkpoint `{path}` cannot be read: {error.strerror}.") from None
     except Damaged:
@@ -173,7 +173,7 @@ def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
 def keep(path: Path, run: dict, results: dict[str, np.ndarray], found: dict[int, bytes]) -> bool:
     """Write the checkpoint; if the disk does not take it, warn and leave the earlier one. Whether it was written."""
     try:
-        replace_whole(check_writable(path), written(run, results, found))
+        replace_whole(check_writable(path), contents_to_bytes(run, results, found))
     except (OSError, ValueError) as error:
         warnings.warn(
             f"Checkpoint `{path}` could not be written ({error}); the run goes on and will try again.", stacklevel=3
@@ -204,7 +204,7 @@ def _difference(name: str, theirs, ours) -> str:
     return f"its `{name}` is {short[0]} and not {short[1]}"
 
 
-def written(run: dict, results: dict[str, np.ndarray], found: Mapping[int, bytes]) -> bytes:
+def contents_to_bytes(run: dict, results: dict[str, np.ndarray], found: Mapping[int, bytes]) -> bytes:
     """The bytes of a checkpoint: NetCDF for any reader, and behind it a list of its contents with checksums, for fivjax.
 
     A checksum stands for so many values of a result. Damage to one costs these; damage to the rest of the NetCDF costs nothing,
@@ -235,7 +235,7 @@ def written(run: dict, results: dict[str, np.ndarray], found: Mapping[int, bytes
     return b"".join([data, *blobs.values(), listed, len(listed).to_bytes(LENGTH, "little"), MARK])
 
 
-def read(data: bytes) -> Contents:
+def contents_from_bytes(data: bytes) -> Contents:
     """The contents again.
 
     **Raises:** `Damaged` where the list of the contents is.

@@ -22,7 +22,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
 from .executors import Workers, hand_out
-from .groups import Limits, grouped
+from .groups import Limits, groups_of
 from .jobs import Done, Job, run_job
 from .plan import Grid, Listed, Places, Plan, plan_of
 from .results import Verdicts, count_of, not_run
@@ -33,7 +33,7 @@ class Keeper(Protocol):
 
     found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
 
-    def recalled(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Places | None) -> Verdicts:
         """The results of an earlier run of these trajectories (all, unless given), in their order."""
         ...
 
@@ -80,7 +80,7 @@ def run_to_verdict(
     """
     plan, keeper = plan_of(scene, trajectories, method, limits, places), means.keeper
     total = trajectories.total if places is None else len(places)
-    verdicts = not_run(total, limits.energy) if keeper is None else keeper.recalled(places)
+    verdicts = not_run(total, limits.energy) if keeper is None else keeper.recall(places)
     already, unit = total - int(verdicts.pending().sum()), " trajectories"
     with (
         stop_requests() as requested,
@@ -122,7 +122,7 @@ class _Run(NamedTuple):
     def job(self, number: int) -> Job:
         own, task = self.plan.jobs[number], self.plan.task
         values, seeding = self.plan.trajectories.columns(own), self.plan.trajectories.seeding(own)
-        groups = grouped(values, tuple(task.states))[0] if self.attractors else np.zeros((0, seeding.shape[1]))
+        groups = groups_of(values, tuple(task.states))[0] if self.attractors else np.zeros((0, seeding.shape[1]))
         keys = {row.tobytes() for row in (*groups, *np.unique(seeding, axis=0))}
         known = {key: self.attractors[key] for key in keys & self.attractors.keys()}
         file = (None, "") if self.means.keeper is None else self.means.keeper.job_file(own)

@@ -67,7 +67,7 @@ class Workers:
     def __init__(self, executor):
         self._made_here = _makes_one(executor)
         self._make: Callable[[], Any] | None = executor if self._made_here else None
-        self._executor = _adopted(executor() if self._made_here else executor)
+        self._executor = _with_submit(executor() if self._made_here else executor)
         self._breaks, self._left_running = 0, False
 
     @property
@@ -94,7 +94,7 @@ class Workers:
         with contextlib.suppress(Exception):
             broken.shutdown(wait=False)
         if self._make is not None:
-            self._executor = _adopted(self._make())
+            self._executor = _with_submit(self._make())
         elif isinstance(broken, ProcessPoolExecutor) and type(broken).__module__.startswith("concurrent."):
             self._executor, self._made_here = _like(broken), True
         else:
@@ -130,7 +130,7 @@ def _makes_one(executor) -> bool:
     return isinstance(executor, type) or not (hasattr(executor, "submit") or hasattr(executor, "get_executor"))
 
 
-def _adopted(executor):
+def _with_submit(executor):
     """The object to which jobs are submitted.
 
     **Raises:** `TypeError` or `ValueError` if a function has made an object that is no executor.
@@ -255,7 +255,7 @@ def hand_out(
             gone = [(future, number)]
             if is_broken(error):
                 # Jobs that were finished before the workers died still report their results.
-                gone += [one for one in under_way.items() if not _finished(one[0])]
+                gone += [one for one in under_way.items() if not _has_result(one[0])]
                 for one, _ in gone[1:]:
                     del under_way[one]
                 workers.renew()
@@ -276,5 +276,5 @@ def hand_out(
         workers.take_back(under_way)
 
 
-def _finished(future) -> bool:
+def _has_result(future) -> bool:
     return future.done() and not future.cancelled() and future.exception() is None

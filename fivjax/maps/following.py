@@ -70,7 +70,7 @@ def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray,
     if (task.by_kernel or task.by_series) and len(group):
         # What concludes is compiled while the kernels are being built.
         columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
-        _concluded(batch, for_conclusions(batch.shared), np.zeros(1, int), columns, now, np.array(now.t))
+        _conclude(batch, for_conclusions(batch.shared), np.zeros(1, int), columns, now, np.array(now.t))
     return trajectories
 
 
@@ -98,7 +98,7 @@ def _follow_by_kernel(
     asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
     if len(asks):
         columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], trajectories.tree)
-        concluded = _concluded(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
+        concluded = _conclude(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
         trajectories.numbers[asks] = concluded.numbers
 
 
@@ -114,7 +114,7 @@ def _may_be_concluded(
     return (now.events == events) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * yardstick[group])
 
 
-def _concluded(
+def _conclude(
     batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray
 ) -> Flattened:
     task = batch.task
@@ -164,7 +164,7 @@ def _begin_block(
     return flatten((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
 
 
-def _followed(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
     of_all = functools.partial(_of_all, scene, method, names, history, shared.tree, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
@@ -174,7 +174,7 @@ def _followed(scene, method, names, history, steps, shared: Flattened, trajector
     return flatten((columns, concluded(begun.t, after)), row_axes=2)
 
 
-_follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_compiled=False)
+_follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
 @kept

@@ -106,7 +106,7 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
-def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
     """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
     own = [column for name, column in values.items() if name not in HISTORY and name not in states]
     if not own:
@@ -123,7 +123,7 @@ def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
     for start in range(0, len(distinct), size):
         # Padded with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = jax.tree.map(np.asarray, _prepared(task.scene, task.method, task.names, distinct[rows]))
+        part = jax.tree.map(np.asarray, _prepare(task.scene, task.method, task.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
     modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
@@ -139,7 +139,7 @@ def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
 
 
 @kept
-def _prepared(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
+def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)

@@ -22,9 +22,9 @@ from ..foundation.flattened import Flattened
 from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
 from ..verdicts.verdict import Verdict
-from .capture import Capture, described
+from .capture import Capture, attractor_columns
 from .following import Batch, begin, follow
-from .groups import Task, grouped
+from .groups import Task, groups_of
 from .job_files import JobFile, JobState
 from .results import Ended, Verdicts, not_run, record
 
@@ -88,7 +88,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     have ended. The file keeps the state between rounds, and has the one from which an interrupted run goes on.
     """
     task, (verdicts, known) = job.task, results
-    of_groups, group = grouped(job.values, tuple(task.states))
+    of_groups, group = groups_of(job.values, tuple(task.states))
     of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(group, return_index=True)[1]])
     batch = Batch(task, of_groups, pool)
     own = [job.values[name] for name in (*task.history, *task.states)]
@@ -139,7 +139,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             pending, now, finished & (verdict == Verdict.UNDECIDED), proving=task.limits.t_max is None
         )
         verdict[list(late.attractor)], verdict[late.sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
-        ended = Ended(verdict, *described(len(pending), entered | late.attractor, late.chaotic))
+        ended = Ended(verdict, *attractor_columns(len(pending), entered | late.attractor, late.chaotic))
         rows = np.flatnonzero(finished)
         record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, ended)))
         pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))

@@ -37,10 +37,10 @@ def begin_building(task: Task, pool: Executor) -> None:
     if key not in _FORMS:
         # Without values: those of a group may be none that a scene could have.
         _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
-    pool.submit(_built, _FORMS[key])
+    pool.submit(_build, _FORMS[key])
 
 
-def _built(form: Form) -> Programs:
+def _build(form: Form) -> Programs:
     with ONE_AT_A_TIME:
         found = programs(form)
         load(found.module, devices())
@@ -61,7 +61,7 @@ class MatrixKernels:
         mechanics, prepared = tree.mechanics, tree.prepared
         form = Form.of(mechanics, leading=1)
         self.pool, self.wp = pool, wp
-        self.types, self.programs = stepping(form).types, _built(form)
+        self.types, self.programs = stepping(form).types, _build(form)
         self.for_conclusions = for_conclusions(shared)
         self.longest = np.asarray(tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)

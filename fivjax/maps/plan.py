@@ -17,7 +17,7 @@ from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import HISTORY, Limits, Task, bytes_per_trajectory, grouped, in_bulk
+from .groups import HISTORY, Limits, Task, bytes_per_trajectory, groups_of, in_bulk
 
 # Indices of trajectories in a run; those of one job, for instance.
 Places = Int[np.ndarray, " r"]
@@ -90,7 +90,7 @@ class Listed:
     def __init__(self, values: Mapping[str, np.ndarray], states: Mapping[str, int] | None = None):
         self.values, self.names, self.states = dict(values), tuple(values), dict(states or {})
         self.total = len(next(iter(values.values())))
-        self._distinct, self._group = grouped(self.values, self.states)
+        self._distinct, self._group = groups_of(self.values, self.states)
         self.group_count = len(self._distinct)
 
     def columns(self, places: Places | None = None) -> dict[str, np.ndarray]:

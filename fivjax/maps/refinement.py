@@ -33,7 +33,7 @@ class Refined(NamedTuple):
     audit: Audit
 
 
-def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
+def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
     """An axis with each of its intervals halved `halvings` times."""
     parts = 2**halvings
     share = np.arange(parts) / parts
@@ -41,7 +41,7 @@ def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, "
     return np.append(inside.ravel(), values[-1])
 
 
-def refined(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
+def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
     """Compute some points of a grid of this shape.
 
     The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
@@ -67,9 +67,9 @@ def refined(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Re
     for level in range(1, halvings + 1):
         # An interrupt leaves trajectories that were not run.
         if not np.any(verdicts.pending()):
-            wanted = _halved(shape, 2 ** (halvings - level), verdicts, row)
+            wanted = _halve(shape, 2 ** (halvings - level), verdicts, row)
             row[wanted] = compute(wanted, f"halving {level} of {halvings}")
-    chosen = _audited(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
+    chosen = _points_to_audit(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
     rows, assumed = compute(chosen, "audit"), row[chosen]
     row[chosen] = rows
     known = ~verdicts.pending(rows)
@@ -85,7 +85,7 @@ def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray,
     return functools.reduce(np.add, np.ix_(*along))
 
 
-def _halved(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
+def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
     """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
     the `row` of the corner before them.
     """
@@ -99,7 +99,7 @@ def _halved(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.n
     return new[wanted]
 
 
-def _audited(computed: Places, total: int, share: float) -> Places:
+def _points_to_audit(computed: Places, total: int, share: float) -> Places:
     """A random share of the points that were not `computed`, without a list of them all."""
     left = total - len(computed)
     count = min(left, math.ceil(share * left))

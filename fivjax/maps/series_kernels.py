@@ -31,7 +31,7 @@ class Following(eqx.Module):
     method: EventExact = eqx.field(static=True)
 
 
-def _followed(args, instants):
+def _follow_one(args, instants):
     """A trajectory so many steps further."""
     of_all, (values, mechanics, weights, longest), row, now, steps = args
     scene = with_values(with_values(of_all.scene, of_all.names, values), of_all.history, row)
@@ -42,7 +42,7 @@ def _followed(args, instants):
     return jax.tree.leaves(after), ()
 
 
-_follow = KernelFunction(_followed)
+_follow = KernelFunction(_follow_one)
 
 
 class SeriesKernels:

@@ -64,14 +64,14 @@ class Store:
         if not self.path.exists():
             create(self.path, self.run, grid, tile, fields)
         check_begun(self.path, self.run, grid, tile, fields)
-        self._lock = locked(self.path)
+        self._lock = lock(self.path)
         try:
             # A chunk without a file is one that was not written, or is lost.
             with zarr().config.set({"array.write_empty_chunks": True}):
                 group = zarr().open_group(self.path, mode="r+", use_consolidated=False)
                 self.arrays = {name: group[name] for name in fields}
             # Chunks that this run begins have nothing to recall.
-            self._earlier = set(self._begun())
+            self._earlier = set(self._chunks_begun())
             for file in sorted((self.path / FOUND).glob("*.npz")):
                 # Without it, the job that found it is run again.
                 with contextlib.suppress(OSError, Damaged, ValueError):
@@ -80,10 +80,10 @@ class Store:
             self._lock.close()
             raise
 
-    def _begun(self) -> Iterator[int]:
+    def _chunks_begun(self) -> Iterator[int]:
         return (number for number in range(len(self.tiles)) if self._chunk("verdict", number).exists())
 
-    def recalled(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Places | None) -> Verdicts:
         """The results kept by earlier runs of these trajectories (all, unless given)."""
         verdicts = not_run(self.tiles.total if places is None else len(places), self.energy)
         for number, inside, rows in self.tiles.among(places):
@@ -271,7 +271,7 @@ def _checksum(file: Path) -> int | None:
         return None
 
 
-def locked(path: Path):
+def lock(path: Path):
     """A lock on the store, which the operating system releases at the latest when the process ends.
 
     **Raises:** `ValueError` where another process has it, saying which.
