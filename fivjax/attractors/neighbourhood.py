@@ -136,7 +136,7 @@ def trial(
 
     **Arguments:** `centre`, the cycle's state on the section; `status` and `direction`, its contact mode; `jacobian`, the
     derivative of the return map there; `weights` of the state's coordinates; `basis`, the weighted directions that are free on
-    the section (`verdicts.free_directions`). States are deviations from the sliding equilibrium.
+    the section (`ReturnMaps.free_directions`). States are deviations from the sliding equilibrium.
     """
     found = adapted_norm(basis.T @ (weights[:, None] * jacobian / weights) @ basis)
     size = float(np.linalg.norm(weights * centre))
