@@ -29,7 +29,6 @@ from .one_trajectory import (
     at_equilibrium,
     conclude,
     with_initial_values,
-    with_release,
     with_step,
 )
 from .series_kernels import SeriesKernels
@@ -54,19 +53,15 @@ class Batch:
         return SeriesKernels(self.task, self.shared, self.pool) if self.task.by_series else None
 
 
-def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"], releases=None) -> Flattened:
-    """Trajectories at their beginning, each with its kick and initial values in `columns`; those that are released (from these
-    multiples of their final load) after all kicks.
-    """
-    task, releases = batch.task, np.full(len(group), np.nan) if releases is None else releases
+def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
+    """Trajectories at their beginning, each with its kick and initial values in `columns`."""
+    task = batch.task
 
     def function(*block):
         states = tuple(task.states.values())
         return _begin_block(task.scene, task.names, task.history, states, task.limits.energy, task.by_kernel, *block)
 
-    trajectories = in_blocks(
-        function, batch.shared, group, flatten((columns, releases)), task.width, batch.pool, size=batch.block
-    )
+    trajectories = in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
     if (task.by_kernel or task.by_series) and len(group):
         # What concludes is compiled while the kernels are being built.
         columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
@@ -149,19 +144,18 @@ def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
 def _begin_block(
     scene, names, history, states, energy: bool, for_kernel: bool, shared: Flattened, trajectories: Flattened
 ) -> Flattened:
-    def group(shared, columns, releases):
+    def group(shared, columns):
         own = with_values(scene, names, shared.values)
 
-        def one(row, release):
+        def one(row):
             scene = with_values(own, history, row)
             now = at_equilibrium(scene, shared, energy, for_kernel)
-            now = with_initial_values(now, scene, shared, states, row[len(history) :])
-            return with_release(now, own, shared.modes, release)
+            return with_initial_values(now, scene, shared, states, row[len(history) :])
 
-        return jax.vmap(one)(columns, releases)
+        return jax.vmap(one)(columns)
 
-    columns, releases = trajectories.tree
-    return flatten((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
+    columns = trajectories.tree
+    return flatten((columns, jax.vmap(group)(shared.tree, columns)), row_axes=2)
 
 
 def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:

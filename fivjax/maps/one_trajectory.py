@@ -18,7 +18,7 @@ from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, op
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.propagation import Propagation
-from ..verdicts.sliding_proof import SlidingModes, used_up
+from ..verdicts.sliding_proof import used_up
 from ..verdicts.slow_growth import slid_on
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
@@ -113,17 +113,6 @@ def with_initial_values(now: Progress, scene: Scene, shared: Shared, places: tup
     return eqx.tree_at(
         lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
     )
-
-
-def with_release(now: Progress, scene: Scene, modes: SlidingModes, load: Float[Array, ""]) -> Progress:
-    """The trajectory released from rest under `load` times its final load, at a time after all kicks; if `load` is NaN, the
-    trajectory as it is.
-    """
-    q, _ = steady_sliding(scene, load * scene.load.final)
-    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
-    after = deviation, jnp.max(scene.load.jumps, initial=0.0)
-    chosen = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(load), old, new), after, (now.y, now.t))
-    return eqx.tree_at(lambda now: (now.y, now.t), now, chosen)
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
