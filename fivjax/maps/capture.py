@@ -57,8 +57,9 @@ class Capture:
         self.known: dict[int, Attractors] = {}
         # Those of each group when the time of its trajectories is over.
         self.known_at_last: dict[int, Attractors] = {}
-        # Time that the known cycles of each group take to attract, s.
+        # Time that the known cycles of each group take to attract, and the most that is waited for them, s.
         self.settled_by = np.zeros(len(of_groups))
+        self.most_time = 20000.0 * np.asarray(batch.shared.tree.modes.slowest_period)
 
     def _catalogue(self, maps: ReturnMaps, known: dict[int, Attractors]) -> Catalogue:
         return Catalogue(maps, known, self.report)
@@ -127,10 +128,9 @@ class Capture:
         """From now on trajectories of the group have the time that its known cycles take to attract: twelve of their time
         constants, but not more than 20,000 periods of the slowest mode.
         """
-        most = 20000.0 * np.asarray(self.batch.shared.tree.modes.slowest_period)[g]
         for cycle in self.known[g].cycles:
             constants = 12.0 * cycle.period / (1 - cycle.multiplier)
-            self.settled_by[g] = max(self.settled_by[g], min(constants, most))
+            self.settled_by[g] = max(self.settled_by[g], min(constants, self.most_time[g]))
 
     def entered(self, pending: np.ndarray, now: Progress, undecided: np.ndarray) -> dict[int, StableCycle | Torus]:
         """The attractors that have captured trajectories, by row."""
