@@ -46,17 +46,8 @@ TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest
 def decided(trajectories: dict, energy: bool = False) -> Verdicts:
     start = extremes.FALLING if "decay" in trajectories else extremes.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
-        return engine.run_to_verdict(
-            start,
-            trajectories,
-            fj.EventExact(),
-            t_max=T_MAX,
-            memory=2e9,
-            max_steps=MAX_STEPS,
-            progress=None,
-            label="extremes",
-            energy=energy,
-        )
+        limits, means = engine.Limits(T_MAX, MAX_STEPS, energy), engine.Means("extremes")
+        return engine.run_to_verdict(start, engine.Listed(trajectories), fj.EventExact(), limits, means)
 
 
 def drawn() -> list[tuple[dict, np.ndarray, np.ndarray]]:

@@ -241,17 +241,15 @@ def watched_memory():
 
 def steps() -> None:
     """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
-    from fivjax.maps.following import begun
-    from fivjax.maps.groups import Batch, shared_by
-    from fivjax.maps.matrix_kernels import Kernels
+    from fivjax.maps.following import Batch, begin
+    from fivjax.maps.groups import Task
     from fivjax.steppers.propagation import Propagation
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
     with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
-        batch = Batch(scene(), Propagation(), ("mu",), ("p",), (), False, 16, False, pool)
-        shared = shared_by(batch, mu[:, None])
-        trajectories = begun(batch, shared, group, np.full((len(group), 1), 1.3))
-        kernels, prepared = Kernels(shared, pool), shared.tree.prepared
+        batch = Batch(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16), mu[:, None], pool)
+        trajectories = begin(batch, group, np.full((len(group), 1), 1.3))
+        kernels, prepared = batch.kernels, batch.shared.tree.prepared
         kernels.follow(group, trajectories, steps)
         found = []
         for _ in range(5):

@@ -6,7 +6,9 @@ import reference
 
 import fivjax as fj
 from fivjax.attractors import tube
-from fivjax.attractors.cycles import CROSSINGS, Cycle
+from fivjax.attractors.catalogue import Catalogue
+from fivjax.attractors.cycles import CROSSINGS, StableCycle
+from fivjax.attractors.motions import Motions
 from fivjax.attractors.tori import (
     LONGER,
     TRACED,
@@ -14,11 +16,12 @@ from fivjax.attractors.tori import (
     _holds_one_of,
     _in_clusters,
     _on_one_torus,
+    capturing_tori,
     goes_on,
     is_drifting,
-    reached,
 )
 from fivjax.attractors.tube import Tube
+from fivjax.maps.capture import Capture
 from fivjax.section.return_maps import Section
 
 STATES = 256
@@ -111,15 +114,15 @@ def test_a_torus_captures_what_stays_in_half_its_tube():
     radii = 0.5 + half * np.array([0.0, 0.9, -0.9, 1.1, -1.1, 3.0])
     states = np.stack([4 + radii, 0 * radii], axis=-1) / maps.weights
     at = Section(states, np.zeros(6, np.int32), np.ones(6))
-    found = reached(maps, np.zeros(6, int), at, states, [(np.arange(6), torus)])  # type: ignore[arg-type]
+    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.arange(6), torus)])  # type: ignore[arg-type]
     assert found == dict.fromkeys((0, 1, 2), torus)
     assert maps.asked == [5]
     # One whose last crossing is not known, and another torus, which has been asked about first.
     states = np.where(np.arange(6)[:, None] == 0, np.nan, states)
     other = torus._replace(amplitude=2.0)
-    found = reached(maps, np.zeros(6, int), at, states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
+    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
     assert found == {1: other, 2: torus}
-    assert reached(maps, np.zeros(6, int), at, states, []) == {}  # type: ignore[arg-type]
+    assert capturing_tori(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
 
 
 def circle(radius=0.5, count=STATES):
@@ -192,10 +195,10 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
 def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
     """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
-    for place in ("attractors.known.add_tori", "maps.rounds.add_tori"):
-        monkeypatch.setattr(f"fivjax.{place}", lambda *_: None)
-    monkeypatch.setattr("fivjax.maps.rounds.LEAST_TIME", 2.0)
-    monkeypatch.setattr("fivjax.maps.rounds.LEAST_PERIODS", 1.0)
+    monkeypatch.setattr(Catalogue, "add_tori_by_turns", lambda _, motions, usable: usable)
+    monkeypatch.setattr(Capture, "search_alone", lambda *_: None)
+    monkeypatch.setattr("fivjax.maps.jobs.LEAST_TIME", 2.0)
+    monkeypatch.setattr("fivjax.maps.jobs.LEAST_PERIODS", 1.0)
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
     assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0
@@ -290,7 +293,7 @@ def test_a_set_that_holds_a_known_cycle_is_no_torus():
     ring = np.stack([4 + 0.5 * np.cos(turns), 0.5 * np.sin(turns)], axis=-1)
     on_it = np.array([[4.5, 0.0], [3.5, 0.01]]) / Maps.weights
     for points, expected in ((on_it, True), (on_it * [[1.0, 1.0], [1.2, 1.0]], False)):
-        cycle = Cycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
+        cycle = StableCycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
         assert _holds_one_of(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
     assert not _holds_one_of(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps import attractors_listed
-from fivjax.maps.attractors_listed import attractor_table
+from fivjax.maps import datasets
+from fivjax.maps.datasets import attractor_table
 from fivjax.maps.results import not_run
 
 GROUPS, EACH = 40, 3
@@ -27,7 +27,7 @@ def results(count: int):
 
 @pytest.mark.parametrize("at_a_time", [1, 100, 10**6])
 def test_each_attractor_of_a_group_is_listed_once_however_many_are_looked_at(at_a_time, monkeypatch):
-    monkeypatch.setattr(attractors_listed, "AT_A_TIME", at_a_time)
+    monkeypatch.setattr(datasets, "AT_A_TIME", at_a_time)
     verdicts, group, attractor, amplitude = results(5000)
     place, table = attractor_table(lambda rows: group[rows], verdicts)
     on_one = verdicts.verdict == fj.Verdict.LIMIT_CYCLE

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import binomtest
 
 import fivjax as fj
-from fivjax.maps.shares import wilson
+from fivjax.maps.datasets import wilson
 
 
 def paper(v=3.0, mu=0.2):

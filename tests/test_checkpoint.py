@@ -14,10 +14,10 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax import cli
-from fivjax.attractors.known import Attractors
-from fivjax.maps import checkpoint, job_files, plan, rounds
-from fivjax.maps.halfway import Halfway
-from fivjax.maps.matrix_kernels import Kernels
+from fivjax.attractors.catalogue import Attractors
+from fivjax.maps import checkpoint, job_files, jobs, plan
+from fivjax.maps.job_files import JobState
+from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.maps.results import Ended, not_run, record
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
@@ -47,7 +47,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
     paper_scene, whole, tmp_path, monkeypatch, at_once, calls
 ):
     """A job's results do not depend on what runs beside it, and it is kept as a whole or not at all."""
-    real, made = Kernels.follow, []
+    real, made = MatrixKernels.follow, []
 
     def interrupted(*args):
         made.append(1)
@@ -56,7 +56,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
         return real(*args)
 
     path = tmp_path / "map.part"
-    monkeypatch.setattr(Kernels, "follow", interrupted)
+    monkeypatch.setattr(MatrixKernels, "follow", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         first = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     open_ = first["verdict"] == fj.Verdict.NOT_RUN
@@ -68,7 +68,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
     resumed = fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
     assert same(resumed, whole)
     # A finished map runs nothing again.
-    monkeypatch.setattr(rounds, "follow_all", None)
+    monkeypatch.setattr(jobs, "follow_all", None)
     assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
 
@@ -76,7 +76,7 @@ def test_a_map_interrupted_between_any_two_blocks_is_resumed_bit_for_bit(
 @pytest.mark.parametrize("calls", [3, 12])
 def test_an_interrupted_job_goes_on_from_where_it_was(paper_scene, whole, tmp_path, monkeypatch, calls):
     """A map of one job, stopped before and after its search for attractors: rounds that are done are not done again."""
-    real, made = Kernels.follow, []
+    real, made = MatrixKernels.follow, []
 
     def counting(*args):
         made.append(1)
@@ -84,7 +84,7 @@ def test_an_interrupted_job_goes_on_from_where_it_was(paper_scene, whole, tmp_pa
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(Kernels, "follow", counting)
+    monkeypatch.setattr(MatrixKernels, "follow", counting)
     monkeypatch.setattr(job_files, "KEEP_EVERY", 0.0)
     path, stop = tmp_path / "map.part", 0
     fj.bistability_map(paper_scene, progress=False, resume=tmp_path / "whole.part", **AXES)
@@ -106,7 +106,7 @@ def test_the_state_of_a_job_comes_back_from_its_file_bit_for_bit(tmp_path):
     verdicts = not_run(5, energy=True)
     for values in verdicts.energy.values():
         values[:] = rng.normal(size=5)
-    state = Halfway(
+    state = JobState(
         done=64,
         own_from=128,
         verdicts=verdicts,

@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 import fivjax as fj
-from fivjax.attractors.creeping import crept
+from fivjax.attractors.creeping import creep
+from fivjax.attractors.motions import Motions
 from fivjax.section.return_maps import Images, Section
 
 
@@ -38,7 +39,7 @@ def on_line(drift, starts, arrived, most=3.0, coupling=0.01):
         del rows
         return arrived(at.y[:, 0]) | (at.y[:, 0] > most)
 
-    creeps, last, time, _ = crept(Line(drift=drift, coupling=coupling), np.zeros(len(y), int), at, done)
+    creeps, last, time, _ = creep(Line(drift=drift, coupling=coupling), Motions(np.zeros(len(y), int), at), done)
     return creeps, last.y[:, 0], time
 
 

@@ -8,9 +8,9 @@ import pytest
 import fivjax as fj
 from fivjax.foundation import progress
 from fivjax.kicks import critical
-from fivjax.maps import bistability, rounds
+from fivjax.maps import bistability, jobs
 from fivjax.maps.crossing import first_crossings
-from fivjax.maps.results import counted, not_run
+from fivjax.maps.results import count_of, not_run
 
 KICKS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
@@ -43,9 +43,10 @@ def test_only_the_very_first_kick_may_be_undecided_below_a_limit_cycle_and_only_
 def told(verdict_of):
     """In place of `run_to_verdict`: verdicts as a function of the kick and of the label of the batch."""
 
-    def run(scene=None, values=None, method=None, *, label, energy=False, **_):
-        verdicts = not_run(len(values["p"]), energy)
-        verdicts.verdict[:] = [verdict_of(p, label) for p in values["p"]]
+    def run(scene, trajectories, method, limits, means, **_):
+        kicks = trajectories.columns()["p"]
+        verdicts = not_run(len(kicks), limits.energy)
+        verdicts.verdict[:] = [verdict_of(p, means.label) for p in kicks]
         return verdicts
 
     return run
@@ -116,7 +117,7 @@ def test_a_map_that_fails_as_a_whole_says_why(paper_scene, monkeypatch):
 
 
 def test_numbers_go_with_their_nouns():
-    assert counted(1, "trajectory") == "1 trajectory" and counted(4096, "trajectory") == "4,096 trajectories"
+    assert count_of(1, "trajectory") == "1 trajectory" and count_of(4096, "trajectory") == "4,096 trajectories"
 
 
 def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkeypatch):
@@ -124,14 +125,14 @@ def test_the_bar_says_that_it_compiles_before_anything_moves(paper_scene, monkey
     shown = io.StringIO()
     monkeypatch.setattr(progress, "tqdm", lambda **options: REAL(**{**options, "file": shown, "mininterval": 0}))
 
-    def two_rounds(batch, values, seeding, states, known, t_max, max_steps, verdicts, index, report, *_):
+    def two_rounds(job, pool, results, file, report):
         report(0)
         first = shown.getvalue()
         assert "map, compiling …" in first and "trajectories" in first
-        verdicts.verdict[index] = 0
-        report(len(index))
+        results.verdicts.verdict[:] = 0
+        report(len(results.verdicts.verdict))
 
-    monkeypatch.setattr(rounds, "follow_all", two_rounds)
+    monkeypatch.setattr(jobs, "follow_all", two_rounds)
     fj.bistability_map(paper_scene, p=KICKS, progress=True)
     assert "compiling" not in shown.getvalue().split("\r")[-1]
 

@@ -9,9 +9,8 @@ import pytest
 import stand_in_jobs
 
 import fivjax as fj
-from fivjax.maps import engine, job_files, plan, store_folder
-from fivjax.maps.checkpoint import Checkpoint
-from fivjax.maps.checkpoint_file import BLOCK
+from fivjax.maps import engine, job_files, plan, store
+from fivjax.maps.checkpoint import BLOCK, Checkpoint
 from fivjax.maps.results import not_run
 
 AXES = {"mu": np.linspace(0.1, 0.2, 3), "p": np.linspace(1.0, 3.0, 4)}
@@ -50,7 +49,7 @@ def test_a_flipped_bit_is_never_a_result(paper_scene, tmp_path, jobs_run, kind):
     right, path = the_map(paper_scene), tmp_path / f"map.{kind}"
     the_map(paper_scene, path)
     files = [file for file in ([path] if kind == "part" else sorted(path.rglob("*"))) if file.is_file()]
-    files = [file for file in files if file.name != store_folder.LOCK]
+    files = [file for file in files if file.name != store.LOCK]
     before = {file: file.read_bytes() for file in files}
     rng, refusals = random.Random(0), 0
     for _ in range(15):
@@ -82,7 +81,7 @@ def test_a_damaged_part_of_a_checkpoint_is_named_and_alone_is_computed_anew(pape
     flipped(path, 8 * at)
     with pytest.warns(UserWarning, match=rf"`amplitude` of trajectories {BLOCK} to {2 * BLOCK - 1} is not what was"):
         again = Checkpoint(path, run, 3 * BLOCK, energy=False)
-    assert np.flatnonzero(again.recalled(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
+    assert np.flatnonzero(again.recall(None).pending()).tolist() == list(range(BLOCK, 2 * BLOCK))
 
 
 def test_attractors_that_are_lost_are_found_again(paper_scene, tmp_path, jobs_run):
@@ -105,7 +104,7 @@ def test_damaged_metadata_are_made_again_or_refused(paper_scene, tmp_path, jobs_
     with pytest.warns(UserWarning, match="file `amplitude/zarr.json` is made anew"):
         the_map(paper_scene, path)
     assert (path / "amplitude" / "zarr.json").read_bytes() == before
-    flipped(path / store_folder.CHECKSUMS, 100)
+    flipped(path / store.CHECKSUMS, 100)
     with pytest.raises(ValueError, match="file `checksums` is not what was written"):
         the_map(paper_scene, path)
 

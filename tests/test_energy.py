@@ -16,7 +16,7 @@ import fivjax as fj
 from fivjax.contact import Mechanics, Status
 from fivjax.foundation import built_kernels
 from fivjax.foundation.compiling import compiled
-from fivjax.maps.engine import run_to_verdict
+from fivjax.maps.engine import Limits, Listed, Means, run_to_verdict
 from fivjax.plot import energy as plot_energy
 from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.simulation import energy as accounts
@@ -796,13 +796,10 @@ def test_the_balance_closes_however_little_moves_under_however_high_a_load(paper
     with jax.enable_x64(True):
         outcome = run_to_verdict(
             paper_scene,
-            {name: np.array(values) for name, values in lanes.items()},
+            Listed({name: np.array(values) for name, values in lanes.items()}),
             fj.EventExact(),
-            t_max=20.0,
-            memory=1e9,
-            progress=None,
-            label="",
-            energy=True,
+            Limits(20.0, energy=True),
+            Means("", memory=1e9),
         )
     assert outcome.verdict.tolist() == [Verdict.SLIDING, Verdict.SLIDING, Verdict.UNDECIDED]
     energy = outcome.energy

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fivjax.attractors import long_run, parting
+from fivjax.attractors import divergence, long_run
 from fivjax.maps import plan
 
 ROOT = Path(__file__).parents[1]
@@ -53,7 +53,7 @@ def test_sizes_of_jobs_are_those_of_the_plan():
 
 
 def test_how_long_motions_are_followed_on_is_as_in_the_code():
-    first, onward = parting.PARTING_OVER * parting.PARTING_TIMES, long_run.TIMES * long_run.ONWARD
+    first, onward = divergence.MEASURED_OVER * divergence.MEASURED, long_run.TIMES * long_run.ONWARD
     assert (round(first, -3), round(first + onward, -4)) == (6000, 40_000)
     assert "for six thousand crossings at most" in text_of(DOCS / "verdicts.md")
     assert "for up to forty thousand crossings" in text_of(ROOT / "fivjax" / "maps" / "bistability.py")

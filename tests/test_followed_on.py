@@ -10,11 +10,13 @@ from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
-from fivjax.attractors.known import Attractors
+from fivjax.attractors.catalogue import Attractors, Catalogue
 from fivjax.attractors.long_run import fates
+from fivjax.attractors.motions import Motions
 from fivjax.attractors.neighbourhood import LARGEST
-from fivjax.maps import rounds
-from fivjax.maps.progress import Progress
+from fivjax.maps import jobs
+from fivjax.maps.capture import later
+from fivjax.maps.one_trajectory import Progress
 from fivjax.section.return_maps import Images, Section
 
 GROWTH, RETURN = 2e-3, 0.1
@@ -74,7 +76,8 @@ def test_what_is_proved_after_the_time_is_over_has_its_own_time_and_events():
     y = np.stack([x0, *np.zeros((3, 3))], axis=1)
     known = {0: Attractors([], []), 1: Attractors([], [])}
     at = Section(y, np.ones(3, np.int32), np.ones(3))
-    found = fates(Line(), np.array([0, 1, 1]), at, known, lambda _: None)  # type: ignore[arg-type]
+    catalogue = Catalogue(Line(), known, lambda _: None)  # type: ignore[arg-type]
+    found = fates(catalogue, Motions(np.array([0, 1, 1]), at))
     assert set(found.attractor) == {0, 1, 2}
     for row, x in enumerate(x0):
         returns, events, there = round(found.time[row] / RETURN), 0, found.at.y[row, 0]
@@ -98,22 +101,22 @@ def test_the_result_is_that_of_the_instant_of_the_proof():
     parts = dict.fromkeys(field.name for field in dataclasses.fields(Progress))
     parts |= {"t": np.array([5.0, 6.0, 7.0]), "events": np.array([2, 3, 4]), "last_event": np.array([1.0, 2.0, 3.0])}
     now = Progress(**parts)  # type: ignore[arg-type]
-    later = rounds._later(now, np.array([2, 0]), np.array([10.0, 20.0]), np.array([0, 9]))
-    assert later.t.tolist() == [25.0, 6.0, 17.0] and later.events.tolist() == [11, 3, 4]
-    assert np.array_equal(later.last_event, [np.nan, 2.0, 3.0], equal_nan=True)
+    after = later(now, np.array([2, 0]), np.array([10.0, 20.0]), np.array([0, 9]))
+    assert after.t.tolist() == [25.0, 6.0, 17.0] and after.events.tolist() == [11, 3, 4]
+    assert np.array_equal(after.last_event, [np.nan, 2.0, 3.0], equal_nan=True)
     assert now.t.tolist() == [5.0, 6.0, 7.0], "what is followed by others stays"
 
 
 def test_who_reaches_a_cycle_with_the_last_step_is_captured(monkeypatch):
     """As many steps as the last trajectory took to its verdict are enough for it."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
-    taken, real = [], rounds.follow
+    taken, real = [], jobs.follow
 
     def counted(*args):
         taken.append(args[-1])
         real(*args)
 
-    monkeypatch.setattr(rounds, "follow", counted)
+    monkeypatch.setattr(jobs, "follow", counted)
     axes = {"mu": [0.2], "p": [1.02, 1.2, 1.5, 2.0]}
     expected = fj.bistability_map(scene, progress=False, **axes)
     assert fj.Verdict.LIMIT_CYCLE in expected["verdict"]

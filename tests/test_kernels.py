@@ -18,7 +18,7 @@ from fivjax.foundation.scalar_code import scalar_source
 from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, load, warp
 from fivjax.maps import groups as sharing
 from fivjax.maps.kernel_programs import programs
-from fivjax.maps.progress import next_step_end
+from fivjax.maps.one_trajectory import next_step_end
 from fivjax.steppers import kernel_scope
 from fivjax.steppers.kernel_advance import stepping
 from fivjax.steppers.kernel_laws import Form

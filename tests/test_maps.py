@@ -16,7 +16,7 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax.maps import engine, plan
-from fivjax.maps.matrix_kernels import Kernels
+from fivjax.maps.matrix_kernels import MatrixKernels
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
 TABLE_2 = np.array([1.06, 1.11, 1.17, 1.20, 1.20, 1.20, 1.20])
@@ -170,9 +170,8 @@ def test_trajectories_do_not_know_each_other(paper_scene, monkeypatch):
     def decided(mu, p):
         with np.errstate(all="ignore"), jax.enable_x64(True):
             values = {"mu": np.array(mu), "p": np.array(p)}
-            return engine.run_to_verdict(
-                paper_scene, values, fj.EventExact(), t_max=20.0, memory=1e9, progress=False, label=""
-            )
+            means = engine.Means("", memory=1e9, progress=False)
+            return engine.run_to_verdict(paper_scene, plan.Listed(values), fj.EventExact(), engine.Limits(20.0), means)
 
     healthy = whole.sel(mu=0.2)
     # Poison in the history of the load, among others of the same mechanics, and in the mechanics of a neighbour.
@@ -230,7 +229,7 @@ def test_undecided_trajectories_are_labelled_and_counted(paper_scene):
 
 def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     """Ctrl-C in the middle of a run: the decided trajectories are returned, the others labelled, and the user is told."""
-    real, calls = Kernels.follow, []
+    real, calls = MatrixKernels.follow, []
 
     def interrupted(*args):
         calls.append(1)
@@ -238,7 +237,7 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(Kernels, "follow", interrupted)
+    monkeypatch.setattr(MatrixKernels, "follow", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, mu=[0.227], p=[1.01, 1.015, 1.02, 1.19], progress=False).isel(mu=0)
     assert m["verdict"].values.tolist() == [0, 0, 0, fj.Verdict.NOT_RUN]

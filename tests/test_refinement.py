@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps.refinement import finer, refined
+from fivjax.maps.refinement import finer_axis, refine_grid
 from fivjax.maps.results import not_run
 
 
 def test_an_axis_is_halved_in_each_of_its_intervals():
     np.testing.assert_array_equal(
-        finer(np.array([0.0, 1.0, 4.0]), 2), [0.0, 0.25, 0.5, 0.75, 1.0, 1.75, 2.5, 3.25, 4.0]
+        finer_axis(np.array([0.0, 1.0, 4.0]), 2), [0.0, 0.25, 0.5, 0.75, 1.0, 1.75, 2.5, 3.25, 4.0]
     )
-    np.testing.assert_array_equal(finer(np.array([2.0]), 3), [2.0])
+    np.testing.assert_array_equal(finer_axis(np.array([2.0]), 3), [2.0])
 
 
 def fill(truth, halvings, audit=0.01, interrupt=None):
@@ -28,7 +28,7 @@ def fill(truth, halvings, audit=0.01, interrupt=None):
         verdicts.amplitude[done] = truth.ravel()[places[done]]
         return verdicts
 
-    cells = refined(truth.shape, halvings, audit, run)
+    cells = refine_grid(truth.shape, halvings, audit, run)
     computed = np.zeros(truth.size, bool)
     computed[cells.places] = ~cells.verdicts.pending()[:-1]
     return cells.verdicts.verdict[cells.row].reshape(truth.shape), computed.reshape(truth.shape), cells.audit, calls

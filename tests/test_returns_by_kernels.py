@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.attractors.tori import section_at
-from fivjax.maps.groups import Batch, shared_by
-from fivjax.maps.matrix_kernels import Kernels
+from fivjax.attractors.motions import section_at
+from fivjax.maps.groups import Task, shared_by
+from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
 from fivjax.section.return_maps import ReturnMaps, Section
 from fivjax.steppers.propagation import Propagation
@@ -22,10 +22,10 @@ CROSSINGS = 6
 def maps():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
-        batch = Batch(scene, Propagation(), ("mu",), (), (), False, 8, False, pool)
-        shared = shared_by(batch, np.array([[0.12], [0.2], [0.227]]))
+        task = Task(scene, Propagation(), ("mu",), (), {}, width=8)
+        shared = shared_by(task, np.array([[0.12], [0.2], [0.227]]))
         tree = shared.tree
-        yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, Kernels(shared, pool), pool)
+        yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, MatrixKernels(shared, pool), pool)
 
 
 @pytest.fixture(scope="module")

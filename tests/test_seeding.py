@@ -5,8 +5,8 @@ import pytest
 
 import fivjax as fj
 from fivjax.attractors import search
-from fivjax.maps import trajectories
-from fivjax.maps.trajectories import Grid, Listed
+from fivjax.maps import plan
+from fivjax.maps.plan import Grid, Listed
 
 MUS = np.linspace(0.2, 0.227, 7)
 
@@ -35,16 +35,16 @@ def test_what_is_continued_is_what_releases_find(paper_scene, monkeypatch, speed
     searched = []
     by_releases = search._by_releases
 
-    def counting(maps, equilibrium, groups, *rest):
-        searched.extend(MUS[np.searchsorted(MUS, maps.of_groups[0].friction.mu[groups])])
-        by_releases(maps, equilibrium, groups, *rest)
+    def counting(catalogue, equilibrium, groups):
+        searched.extend(MUS[np.searchsorted(MUS, catalogue.maps.of_groups[0].friction.mu[groups])])
+        by_releases(catalogue, equilibrium, groups)
 
     monkeypatch.setattr(search, "_by_releases", counting)
     axes = {"mu": MUS, "p": [1.0, 1.25, 2.0]}
     found = []
     for seeding in (1, 4):
         searched.clear()
-        monkeypatch.setattr(trajectories, "SEEDING", seeding)
+        monkeypatch.setattr(plan, "SEEDING", seeding)
         found.append(fj.bistability_map(paper_scene.replace(belt_speed=speed), progress=False, **axes))
         assert sorted(searched) == MUS[::seeding].tolist()
     each, continued = found
@@ -54,6 +54,6 @@ def test_what_is_continued_is_what_releases_find(paper_scene, monkeypatch, speed
 
 
 def test_where_nothing_can_be_continued_motions_are_released(paper_scene, monkeypatch):
-    monkeypatch.setattr(search, "_continued", lambda *_: None)
+    monkeypatch.setattr(search, "_continue_from_seeds", lambda *_: None)
     m = fj.bistability_map(paper_scene.replace(belt_speed=1.0), mu=MUS[:2], p=[2.0], progress=False)
     assert m["verdict"].values.tolist() == [[1], [1]] and len(m["attractor_period"]) == 2

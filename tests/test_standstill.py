@@ -77,20 +77,20 @@ def test_a_batch_of_trajectories_has_no_lapack():
     scene, names = chain(12, 1), ("mu",)
     method = groups.in_bulk(EventExact(), scene)
     own = np.full((2, 1), 0.3)
-    prepare = lambda rows: groups._prepared.__wrapped__(scene, method, names, rows)  # noqa: E731
+    prepare = lambda rows: groups._prepare.__wrapped__(scene, method, names, rows)  # noqa: E731
     of_preparing, (mechanics, prepared, linear, *rest) = of_program(prepare, own)
     assert "while" in of_preparing or "scan" in of_preparing, "elimination is a loop"
     for part in ("matrix", "frictionless"):
         getattr(linear, part)[:] = -np.eye(linear.matrix.shape[-1])
     shared = flatten(groups.Shared(own, mechanics, prepared, groups.sliding_modes(linear), *rest))
-    columns = flatten((np.zeros((2, 1)), np.zeros(2)))
+    columns = flatten(np.zeros((2, 1)))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 
     def begin(shared, rows):
         return following._begin_block.__wrapped__(scene, names, ("p",), (), False, False, shared, rows)
 
     def follow(shared, rows):
-        return following._followed(scene, method, names, ("p",), np.int32(4), shared, rows)
+        return following._follow_rows(scene, method, names, ("p",), np.int32(4), shared, rows)
 
     of_beginning, begun = of_program(begin, shared, rows)
     of_following, _ = of_program(follow, shared, begun)
@@ -181,7 +181,7 @@ def test_lapack_gets_one_matrix_at_a_time():
 
 PREPARING = """
 import numpy as np
-from fivjax.maps import groups as sharing
+from fivjax.maps import groups
 from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
 from test_standstill import chain

@@ -8,12 +8,13 @@ import stand_in_jobs
 import xarray as xr
 
 import fivjax as fj
-from fivjax.attractors.cycles import Cycle
-from fivjax.attractors.known import Attractors, Torus
+from fivjax.attractors.catalogue import Attractors
+from fivjax.attractors.cycles import StableCycle
 from fivjax.attractors.neighbourhood import Neighbourhood
+from fivjax.attractors.tori import Torus
 from fivjax.attractors.tube import Tube
 from fivjax.maps import engine, plan
-from fivjax.maps.attractor_files import from_bytes, to_bytes
+from fivjax.maps.job_files import from_bytes, to_bytes
 
 AXES = {"mu": np.linspace(0.1, 0.2, 6), "p": np.linspace(1.0, 3.0, 7)}
 
@@ -139,7 +140,7 @@ def test_a_refined_map_is_kept_level_by_level(paper_scene, tmp_path, jobs_run):
 def test_attractors_come_back_from_a_file_bit_for_bit():
     rng = np.random.default_rng(0)
     near = Neighbourhood(rng.normal(size=6), 1, -1.0, rng.normal(size=(6, 6)), 0.1, 0.7, 256)
-    cycle = Cycle(rng.normal(size=(2, 6)), 0.1, 0.5, 3.0, near)
+    cycle = StableCycle(rng.normal(size=(2, 6)), 0.1, 0.5, 3.0, near)
     found = {
         b"one": Attractors([cycle, cycle], []),
         b"two": Attractors([], [Torus(Tube(rng.normal(size=(9, 6)), radius), 2.0, 0.3) for radius in (0.04, 0.01)]),

@@ -204,7 +204,7 @@ def test_the_same_structure_from_every_format(folder, file, more):
 
 def test_rotations_keep_radians():
     """Translations become metres and rotations stay: the energy of any displacement is the same in both systems."""
-    from fivjax.io.model_units import SYSTEMS, in_si
+    from fivjax.io.structure_files import SYSTEMS, in_si
 
     rng = np.random.default_rng(1)
     matrix = sparse.csr_array(rng.normal(size=(4, 4)))

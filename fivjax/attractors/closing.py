@@ -9,15 +9,14 @@ from ..contact import same_mode
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 
-MOST_ITERATIONS, HALVINGS = 30, 5
+MOST_ITERATIONS = 30
+# Next to the onset of an event, or to a change of the mode in which the section is met, a step of Newton's method may lead
+# astray: so many times in a row it is halved, or the search goes on from the image.
+HALVINGS = 5
 # A cycle is closed if the return map misses its start by less than this share of its size.
 CLOSED = 1e-10
 # Newton's method stops when the distance no longer falls, or is below this.
 EXACT = 2e-15
-# Next to the onset of an event, or to a change of the mode in which the section is met, a step may lead astray: `HALVINGS`
-# times in a row it is halved, or the search goes on from the image. Of many guesses of which few are near a cycle, each has so
-# many iterations, and may miss so often.
-FEW_ITERATIONS, MISSES = 14, 3
 
 
 class FixedPoint(NamedTuple):
@@ -69,12 +68,12 @@ def close(maps: ReturnMaps, group: Int[np.ndarray, " m"], guess: Section, crossi
             continue
         at = best.at.rows(rows)
         image = maps.returns(group[rows], at, count).at
-        rows = rows[(_missed(maps, at, image) <= CLOSED) & _alike(image, at)]
+        rows = rows[(_closing_error(maps, at, image) <= CLOSED) & _alike(image, at)]
         if len(rows):
             at = best.at.rows(rows)
             image, time, derived = maps.derived(group[rows], at, count)
             best.crossings[rows], best.period[rows], best.jacobian[rows] = count, time, derived
-            best.residual[rows] = _missed(maps, at, image)
+            best.residual[rows] = _closing_error(maps, at, image)
             open_[rows] = False
     return best
 
@@ -88,7 +87,7 @@ def closed_at(maps: ReturnMaps, point: Point, crossings: int) -> FixedPoint:
     """The cycle through this point, of the only group, as it is."""
     at = Section.of(point)
     image, time, derived = maps.derived(np.zeros(1, int), at, crossings)
-    return FixedPoint(at.point(0), crossings, float(time[0]), derived[0], float(_missed(maps, at, image)[0]))
+    return FixedPoint(at.point(0), crossings, float(time[0]), derived[0], float(_closing_error(maps, at, image)[0]))
 
 
 def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, " m"], patient: bool) -> Closed:
@@ -96,12 +95,14 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
     here, at = (Section(*(np.array(part) for part in guess)) for _ in range(2))
     best = Closed(at, crossings.copy(), np.zeros(count), np.zeros((count, size, size)), np.full(count, np.inf))
     step, since, running = np.full((count, size), np.nan), np.zeros(count, int), np.arange(count)
-    for _ in range(MOST_ITERATIONS if patient else FEW_ITERATIONS):
+    # Of many guesses few are near a cycle: each has fewer iterations, and may miss so often in all, not in a row.
+    iterations, misses = (MOST_ITERATIONS, HALVINGS) if patient else (14, 2)
+    for _ in range(iterations):
         if not len(running):
             break
         now = here.rows(running)
         image, time, derived = maps.derived(group[running], now, crossings[running])
-        missed = _missed(maps, now, image)
+        missed = _closing_error(maps, now, image)
         usable = np.isfinite(missed) & np.all(np.isfinite(derived), axis=(1, 2))
         alike = _alike(image, now)
         better = usable & alike & (missed < best.residual[running])
@@ -111,9 +112,7 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
         since[running] = np.where(better, 0 if patient else since[running], since[running] + 1)
         begun = np.isfinite(best.residual[running])
         other_mode = usable & ~alike
-        done = (
-            (better & (missed <= EXACT)) | (since[running] > (HALVINGS if patient else MISSES - 1)) | (~usable & ~begun)
-        )
+        done = (better & (missed <= EXACT)) | (since[running] > misses) | (~usable & ~begun)
         # A step that no longer helps is the last one.
         done |= ~better & ~other_mode & (best.found[running] | ~np.all(np.isfinite(step[running]), axis=1))
         step[rows] = _newton_steps(maps, derived[better], (image.y - now.y)[better])
@@ -144,7 +143,7 @@ def _newton_steps(maps: ReturnMaps, jacobian, gap) -> Float[np.ndarray, "m 2n"]:
     return steps
 
 
-def _missed(maps: ReturnMaps, at: Section, image: Section) -> Float[np.ndarray, " m"]:
+def _closing_error(maps: ReturnMaps, at: Section, image: Section) -> Float[np.ndarray, " m"]:
     """The distance of images from where they began, relative to the size there."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.linalg.norm(maps.weights * at.y, axis=1)

@@ -17,20 +17,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
+from .motions import Motions
 
-# Returns over which a drift is measured; and in which a motion settles after a leap, at first and at most: what is left of
-# other deviations is magnified by a leap, so the next drift shows whether that was long enough.
-OVER, SETTLES, LONGEST = 48, 128, 4096
-# A leap is this share of the motion's size at most, and the first one that; and the most leaps of a motion.
-SHARE, FIRST, MOST = 0.05, 0.004, 1024
-# Leaps of fewer drifts than this are not worthwhile: the motion is followed for so many returns, and so often at most.
-LEAST, PLAIN, MOST_PLAIN = 4.0, 512, 48
+# Returns over which a drift is measured.
+OVER = 48
+# A leap is this share of the motion's size at most.
+LONGEST_LEAP = 0.05
+# Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
+LEAST_DRIFTS = 4.0
 # A leap over which the drift changes e-fold, by its two latest places, is too long: this part of it is trusted.
 TRUSTED = 0.25
-# Two drifts are alike if the cosine between them is this at least, and neither is longer than so many times the other.
-ALIGNED, ALIKE = 0.95, 1.5
-# A drift below this share of the size, in `OVER` returns, is rounding.
-ROUNDING = 1e-11
 
 
 class _Drift(NamedTuple):
@@ -52,42 +48,44 @@ class _Drift(NamedTuple):
             whole[chosen] = part
 
 
-def crept(
+def creep(
     maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
+    motions: Motions,
     arrived: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]],
 ) -> tuple[Bool[np.ndarray, " m"], Section, Float[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Which motions creep; and where they are, how much later (s), and after how many more contact events, when they have
     `arrived` (told by their rows and states), or creep no more.
     """
+    group, at = motions
     last = Section(*(np.array(part) for part in at))
     time, events, creeps = np.zeros(len(group)), np.zeros(len(group), int), np.zeros(len(group), bool)
-    share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), SETTLES), np.zeros(len(group), int)
-    rows, here = np.arange(len(group)), _measured(maps, group, at)
-    for _ in range(MOST):
+    share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), 128), np.zeros(len(group), int)
+    rows, here = np.arange(len(group)), _measure_drift(maps, motions)
+    for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
-        going = here.steady & (length > ROUNDING * size) & (plainly[rows] < MOST_PLAIN)
+        # A shorter drift is rounding.
+        going = here.steady & (length > 1e-11 * size) & (plainly[rows] < 48)
         rows, here, length, size = rows[going], here.rows(going), length[going], size[going]
         if not len(rows):
             break
         # The first leap is a short one, but worthwhile.
-        first = np.clip(1.5 * LEAST * length / size, FIRST, SHARE)
+        first = np.clip(1.5 * LEAST_DRIFTS * length / size, 0.004, LONGEST_LEAP)
         share[rows] = np.where(np.isnan(share[rows]), first, share[rows])
         times = share[rows] * size / length
-        plain = times < LEAST
+        plain = times < LEAST_DRIFTS
         times[plain] = 0.0
         leapt = here.at._replace(y=here.at.y + times[:, None] * here.way / maps.weights)
-        settled = maps.returns(group[rows], leapt, np.where(plain, PLAIN, settles[rows]))
-        there = _measured(maps, group[rows], settled.at)
+        settled = maps.returns(group[rows], leapt, np.where(plain, 512, settles[rows]))
+        there = _measure_drift(maps, Motions(group[rows], settled.at))
         with np.errstate(divide="ignore", invalid="ignore"):
             faster = np.linalg.norm(there.way, axis=1) / length
-            longer = np.fmin(np.minimum(2 * share[rows], SHARE), TRUSTED * share[rows] / np.abs(np.log(faster)))
+            longer = np.fmin(np.minimum(2 * share[rows], LONGEST_LEAP), TRUSTED * share[rows] / np.abs(np.log(faster)))
             # As long as the mean of what both drifts say.
             skipped = 0.5 * times * (1 + 1 / faster)
         kept = plain | (there.steady & _alike(here.way, there.way) & (there.events == here.events))
         share[rows] = np.where(plain, np.nan, np.where(kept, longer, 0.5 * share[rows]))
-        settles[rows] = np.where(kept, settles[rows], np.minimum(2 * settles[rows], LONGEST))
+        # What is left of other deviations is magnified by a leap, so the next drift shows whether the motion has settled.
+        settles[rows] = np.where(kept, settles[rows], np.minimum(2 * settles[rows], 4096))
         plainly[rows] += plain
         done = rows[kept]
         creeps[done] = True
@@ -103,8 +101,9 @@ def crept(
     return creeps, last, time, events
 
 
-def _measured(maps: ReturnMaps, group, at: Section) -> _Drift:
+def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     """How motions drift in the latter half of `2 * OVER` returns."""
+    group, at = motions
     middle = maps.returns(group, at, OVER)
     end = maps.returns(group, middle.at, OVER)
     before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
@@ -113,7 +112,7 @@ def _measured(maps: ReturnMaps, group, at: Section) -> _Drift:
 
 
 def _alike(one: Float[np.ndarray, "m 2n"], other: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
-    """Which drifts have one direction, and nearly one speed."""
+    """Which drifts have one direction (by the cosine between them), and nearly one speed."""
     a, b = np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (np.sum(one * other, axis=1) >= ALIGNED * a * b) & (np.maximum(a / b, b / a) <= ALIKE)
+        return (np.sum(one * other, axis=1) >= 0.95 * a * b) & (np.maximum(a / b, b / a) <= 1.5)

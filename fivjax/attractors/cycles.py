@@ -11,29 +11,43 @@ from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
 from .closing import Closed, close
+from .motions import Motions
 from .neighbourhood import LARGEST, Neighbourhood, Returned, Trial, neighbourhoods, side_by_side, trial
 
-# A motion that comes back to within this share of its size after some crossings may be near a cycle.
-NEARLY = 0.1
-# The same for many crossings: after so many of them any motion on a torus comes back nearly.
-MORE_NEARLY = 0.02
-CROSSINGS, MORE_CROSSINGS = 8, 40
-# Crossings of cycles on which neighbours close in.
-MOST_CROSSINGS = 512
-# The same for a motion whose time is over: it has settled on a cycle, or never will.
-SETTLED = 1e-3
-# A cycle of that many crossings is one that trajectories come to soon if its largest multiplier is below this, and its
-# neighbourhood, relative to its size, not smaller. Others lie on a torus that is locked weakly: that is better taken as one.
-WEAKLY, SMALLEST_OF_MANY = 0.95, 1e-3
+# Crossings of the section in one period: of cycles that are sought first; of those on a torus that is locked to them; and of
+# those on which neighbours close in.
+CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS = 8, 40, 512
 # A multiplier of the section's return map this close to 1 counts as 1.
 FAMILY = 1e-7
-# Points of the section that a group nominates at a time.
-NOMINATED = 2
-# The same cycle: a state this close to one of its own, relative to their size.
-SAME = 1e-6
 
 
-class Cycle(NamedTuple):
+class Recurrence(NamedTuple):
+    """How a motion has to come back to the section for a cycle to be computed near it, and which cycles then count."""
+
+    crossings: int = CROSSINGS  # it comes back within so many crossings
+    nearly: float = 0.1  # to within this share of its size
+    # Its time is over: it has settled on a cycle, or never will. All cycles count then, however weakly they attract and however
+    # near one has to be.
+    settled: bool = False
+
+    def is_met(self, missed: Float[np.ndarray, " m"], lag: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+        """Which motions come back, if they miss their start by such shares of their size after so many crossings."""
+        if self.settled:
+            return missed <= 1e-3
+        # After many crossings any motion on a torus comes back nearly.
+        return missed <= np.where(lag > CROSSINGS, 0.02, self.nearly)
+
+    def attracts_soon(self, multiplier: float, crossings: int) -> bool:
+        """Whether a cycle is one that motions come to soon. One of many crossings that attracts weakly lies on a torus that is
+        locked weakly: that is better taken as one.
+        """
+        return self.settled or crossings <= CROSSINGS or not multiplier > 0.95
+
+
+AT_FIRST = Recurrence()
+
+
+class StableCycle(NamedTuple):
     """A stable periodic cycle of a group, with the neighbourhood in which it captures."""
 
     points: Float[np.ndarray, "k 2n"]  # its states on the section, in order; the first is the neighbourhood's centre
@@ -55,20 +69,13 @@ class Cycle(NamedTuple):
 
 
 def stable_cycles(
-    maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
-    known: dict[int, list[Cycle]],
-    crossings: int = CROSSINGS,
-    settled: bool = False,
-    nearly: float = NEARLY,
-) -> list[tuple[int, Int, Cycle]]:
-    """The stable cycles of up to so many `crossings` that motions from these states are near to: of each the group, the rows
-    that led to it, and it. Those of a group that are `known` are not computed anew. Of motions that have `settled` all cycles
-    count, however weakly they attract and however near one has to be.
+    maps: ReturnMaps, motions: Motions, known: dict[int, list[StableCycle]], recurrence: Recurrence = AT_FIRST
+) -> list[tuple[int, Int, StableCycle]]:
+    """The stable cycles that motions are near to: of each the group, the rows that led to it, and it. Those of a group that are
+    `known` are not computed anew.
     """
-    near, closed = _nearly_closed(maps, group, at, crossings, settled, nearly)
-    lag = closed.crossings
+    near, closed = _close_recurring(maps, motions, recurrence)
+    group, lag = motions.group, closed.crossings
     # Sliding closes upon itself as well.
     periodic = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
     if not len(periodic):
@@ -90,14 +97,13 @@ def stable_cycles(
             alike[kind].append(len(kept))
             kept.append(row)
             rows_of.append([near[row]])
-    before = [_passing(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    before = [_cycle_through(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = np.max(np.abs(np.linalg.eigvals(closed.jacobian[kept])), axis=1)
-    many = (lag[kept] > CROSSINGS) & (not settled)
     found, stable, trials = [], [], []
     for k, row in enumerate(kept):
         if before[k] is not None:
             found.append((int(group[near[row]]), np.array(rows_of[k]), before[k]))
-        elif not (many[k] and largest[k] > WEAKLY) and (attempt := _trial(maps, closed, row, lag[row], many[k])):
+        elif recurrence.attracts_soon(largest[k], lag[row]) and (attempt := _trial(maps, closed, row, recurrence)):
             stable.append(k)
             trials.append(attempt)
     if not stable:
@@ -108,66 +114,68 @@ def stable_cycles(
     amplitude = maps.peaks(own, centre, lag[chosen])
     for k, row, where, peak in zip(stable, chosen, about, amplitude, strict=True):
         if where is not None:
-            cycle = Cycle(points_of[row], float(closed.period[row]), float(largest[k]), float(peak), where)
+            cycle = StableCycle(points_of[row], float(closed.period[row]), float(largest[k]), float(peak), where)
             found.append((int(group[near[row]]), np.array(rows_of[k]), cycle))
     return found
 
 
-def _nearly_closed(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, crossings: int, settled: bool, nearly: float
+def _close_recurring(
+    maps: ReturnMaps, motions: Motions, recurrence: Recurrence
 ) -> tuple[Int[np.ndarray, " r"], Closed]:
-    """The rows of motions that nearly repeat after up to so many `crossings`, and what Newton's method makes of each."""
-    last, states = maps.path(group, at, crossings + 1)
+    """The rows of motions that nearly repeat, and what Newton's method makes of each."""
+    group = motions.group
+    last, states = maps.path(*motions, recurrence.crossings + 1)
     path = maps.weights * states  # [row, crossing, coordinate]
     size = np.linalg.norm(path[:, -1], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         back = np.linalg.norm(path[:, -2::-1] - path[:, -1:], axis=-1) / size[:, None]
         nearest = back.min(axis=1)
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
-        repeats = nearest <= (SETTLED if settled else np.where(lag > CROSSINGS, MORE_NEARLY, nearly))
+        repeats = recurrence.is_met(nearest, lag)
     near = np.flatnonzero(np.isfinite(size) & maps.moves(group, states[:, -1]) & repeats)
     return near, close(maps, group[near], last.rows(near), lag[near])
 
 
-def in_families(maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section) -> Bool[np.ndarray, " m"]:
+def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
     """Which motions are near periodic ones that are one of a family each: a second multiplier is 1, because oscillators without
     coupling may be shifted against each other in time.
     """
+    group = motions.group
     found = np.zeros(len(group), bool)
     if len(maps.structure.contacts) == 1:
         return found
-    near, closed = _nearly_closed(maps, group, at, CROSSINGS, False, NEARLY)
+    near, closed = _close_recurring(maps, motions, AT_FIRST)
     rows = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
     multipliers = np.linalg.eigvals(closed.jacobian[rows])
     found[near[rows]] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)
     return found
 
 
-def is_new(maps: ReturnMaps, cycle: Cycle, known: list[Cycle]) -> bool:
+def is_new(maps: ReturnMaps, cycle: StableCycle, known: list[StableCycle]) -> bool:
     """Whether a cycle is none of the known ones of its group."""
-    return _passing(maps, cycle.points[0], known) is None
+    return _cycle_through(maps, cycle.points[0], known) is None
 
 
-def _passing(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[Cycle]) -> Cycle | None:
+def _cycle_through(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[StableCycle]) -> StableCycle | None:
     """The one of these cycles that has this state among its points."""
     return next((cycle for cycle in cycles if _passes(maps, y, cycle.points)), None)
 
 
 def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndarray, "k 2n"]) -> bool:
-    """Whether this state is among those points."""
+    """Whether this state is among those points, but for a share of its size by which two computations of a cycle may differ."""
     apart = np.min(np.linalg.norm(maps.weights * (points - y), axis=1))
-    return bool(apart < SAME * np.linalg.norm(maps.weights * y))
+    return bool(apart < 1e-6 * np.linalg.norm(maps.weights * y))
 
 
-def _trial(maps: ReturnMaps, closed: Closed, row: int, crossings: int, many: bool) -> Trial | None:
+def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> Trial | None:
     y, status, direction = closed.at.rows(row)
     found = trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status))
-    if found is not None and many:
-        found = found._replace(smallest=SMALLEST_OF_MANY / LARGEST * found.largest)
-    if found is not None and crossings > CROSSINGS:
-        # Their points lie close together.
-        found = found._replace(largest=found.largest / 8)
-    return found
+    if found is None or closed.crossings[row] <= CROSSINGS:
+        return found
+    # A cycle of many crossings that captures only what is nearer than this lies on a torus that is locked weakly.
+    smallest = found.smallest if recurrence.settled else 1e-3 / LARGEST * found.largest
+    # Its points lie close together.
+    return found._replace(smallest=smallest, largest=found.largest / 8)
 
 
 def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
@@ -182,20 +190,19 @@ def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
     return returned
 
 
-def captured(
+def capturing_cycles(
     maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
+    motions: Motions,
     latest: Float[np.ndarray, "m 2n"],
-    known: list[tuple[Int[np.ndarray, " r"], Cycle]],
+    known: list[tuple[Int[np.ndarray, " r"], StableCycle]],
 ) -> Int[np.ndarray, " m"]:
-    """Which cycle each trajectory has entered the neighbourhood of, by its place in `known`; -1 where none.
+    """Which cycle each motion has entered the neighbourhood of, by its place in `known`; -1 where none.
 
-    `known` are cycles, each with the rows of the trajectories that it may have captured; `latest` their last crossings as
-    far as their stepper knows them, good enough to tell which ones to ask. What counts is where the exact return map leads
-    from where they are now (`at`).
+    `known` are cycles, each with the rows of the motions that it may have captured; `latest` are the motions' last crossings as
+    far as their stepper knows them, good enough to tell which ones to ask. What counts is where the exact return map leads from
+    where they are now.
     """
-    which = np.full(len(group), -1)
+    which = np.full(len(motions.group), -1)
     if not known:
         return which
     weights, cycles = maps.weights, [cycle for _, cycle in known]
@@ -213,23 +220,7 @@ def captured(
             near[own] = np.min(apart, axis=1) <= within[place[own]]
         crossings[own] = count - np.argmin(apart, axis=1)
     row, place, crossings = row[near], place[near], crossings[near]
-    image = maps.returns(group[row], at.rows(row), crossings).at
+    image = maps.returns(*motions.rows(row), crossings).at
     inside = Neighbourhood(*(part[place] for part in about)).contains(*image)
     which[row[inside]] = place[inside]
     return which
-
-
-def distinct(
-    states: Float[np.ndarray, "m 2n"], group, chosen: Bool[np.ndarray, " m"], most: int = NOMINATED
-) -> Int[np.ndarray, " r"]:
-    """A few of the chosen rows of each group, far from each other."""
-    picked: list[int] = []
-    for g in np.unique(group[chosen]):
-        rows = np.flatnonzero(chosen & (group == g))
-        mine = [rows[0]]
-        away = np.linalg.norm(states[rows] - states[rows[0]], axis=1)
-        while len(mine) < min(most, len(rows)):
-            mine.append(rows[np.argmax(away)])
-            away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
-        picked += mine
-    return np.array(picked, int)

@@ -12,15 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
-from .creeping import crept
-from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Cycle, distinct
-from .known import Attractors, add_cycles, add_tori, come_to
-from .parting import followed_on
+from .catalogue import Catalogue
+from .creeping import creep
+from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle
+from .divergence import long_divergence
+from .motions import Motions, far_apart
 from .tori import AT_A_TIME, TUBES, Torus, is_drifting
 from .tube import HOME
 
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
 TIMES, ONWARD = 4, 8192
+# Which motions are certain to slide for ever.
+Slides = Callable[[Motions], Bool[np.ndarray, " r"]]
 
 
 class Fates(NamedTuple):
@@ -29,37 +32,29 @@ class Fates(NamedTuple):
     """
 
     chaotic: Bool[np.ndarray, " m"]
-    attractor: dict[int, Cycle | Torus]
+    attractor: dict[int, StableCycle | Torus]
     without_events: Bool[np.ndarray, " m"]
     at: Section
     time: Float[np.ndarray, " m"]  # s
     events: Int[np.ndarray, " m"]
 
 
-def fates(
-    maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
-    of_group: dict[int, Attractors],
-    report,
-    slides: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]] | None = None,
-) -> Fates:
-    """What becomes of motions from these states; their loads are final. `of_group` are the attractors known of each group, and
-    gets those that are found. `slides` tells, by groups and states, which motions are certain to slide for ever.
-    """
-    at, events, time, *_ = maps.returns(group, at, 1)
-    attractor: dict[int, Cycle | Torus] = {}
+def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) -> Fates:
+    """What becomes of these motions; their loads are final. The catalogue gets the attractors that are found."""
+    maps, group = catalogue.maps, motions.group
+    at, events, time, *_ = maps.returns(*motions, 1)
+    attractor: dict[int, StableCycle | Torus] = {}
     chaotic, quiet = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
-    for rows in (distinct(maps.weights * at.y, group, left), np.arange(len(group))):
+    for rows in (far_apart(maps.weights * at.y, group, left), np.arange(len(group))):
         rows = rows[left[rows]]
         left[rows] = False
-        captured = come_to(maps, group[rows], at.rows(rows), at.y[rows], np.ones(len(rows), bool), of_group)
+        captured = catalogue.captures(Motions(group, at).rows(rows), np.ones(len(rows), bool))
         attractor |= {int(rows[row]): one for row, one in captured.items()}
         rows = np.delete(rows, list(captured))
         if len(rows):
-            found = _followed(maps, group[rows], at.rows(rows), onward[rows], of_group, report, slides)
+            found = _long_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
             chaotic[rows], quiet[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
             time[rows] += found.time
@@ -72,107 +67,99 @@ def fates(
     return Fates(chaotic, attractor, quiet, at, time, events)
 
 
-def _followed(
-    maps: ReturnMaps,
-    group,
-    at: Section,
-    onward: Bool[np.ndarray, " m"],
-    of_group: dict[int, Attractors],
-    report,
-    slides,
-) -> Fates:
+class _Underway(NamedTuple):
+    """Motions that are followed on: where they are by now, how much later that is (s), and their contact events on the way.
+    All change in place.
+    """
+
+    motions: Motions
+    time: Float[np.ndarray, " m"]
+    events: Int[np.ndarray, " m"]
+
+    def move(self, rows, at: Section, time, events) -> None:
+        """These are further, after so much more time and so many more events."""
+        self.motions.at.put(rows, at)
+        self.time[rows] += time
+        self.events[rows] += events
+
+
+def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
     """The same of motions each of which is followed for thousands of returns, and those to be followed `onward`, if they drift,
     for tens of thousands.
     """
-    followed = followed_on(maps, group, at)
+    maps, group = catalogue.maps, motions.group
+    followed = long_divergence(maps, motions)
     now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
-    attractor: dict[int, Cycle | Torus] = {}
+    run = _Underway(Motions(group, now), time, events)
+    attractor: dict[int, StableCycle | Torus] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
     for turn in range(TIMES + 1):
-        new = come_to(maps, group, now, now.y, left, of_group)
+        new = catalogue.captures(run.motions, left)
         attractor |= new
         left[list(new)] = False
         if turn == TIMES or not np.any(left):
             break
-        report(0)
-        picked = distinct(maps.weights * now.y, group, asks & left)
+        catalogue.report(0)
+        picked = far_apart(maps.weights * now.y, group, asks & left)
         if len(picked):
-            _search(maps, group, now, followed.closing_in, picked, of_group, report)
+            _search(catalogue, run.motions.rows(picked), followed.closing_in[picked])
         asks[picked] = False
-        creeping = _crept(maps, group, now, time, events, left & onward, of_group, slides)
-        drifting = creeping | _drifted(maps, group, now, time, events, left & onward & ~creeping)
+        creeping = _creep(catalogue, run, left & onward, slides)
+        drifting = creeping | _drift(maps, run, left & onward & ~creeping)
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
-    quiet[rows] = maps.returns(group[rows], now.rows(rows), HOME).events == 0
+    quiet[rows] = maps.returns(*run.motions.rows(rows), HOME).events == 0
     rows = np.flatnonzero(left & further & ~quiet)
     if len(rows):
-        chaotic[rows] = followed_on(maps, group[rows], now.rows(rows)).chaotic
+        chaotic[rows] = long_divergence(maps, run.motions.rows(rows)).chaotic
     return Fates(chaotic, attractor, quiet, now, time, events)
 
 
-def _crept(
-    maps: ReturnMaps, group, now: Section, time, events, asked: Bool[np.ndarray, " m"], of_group, slides
+def _creep(
+    catalogue: Catalogue, run: _Underway, asked: Bool[np.ndarray, " m"], slides: Slides | None
 ) -> Bool[np.ndarray, " m"]:
-    """Which of these motions creep along a line of states: `now` they are further, after that much more `time` and `events`,
-    where an attractor captures them, where they are certain to slide for ever, or where they creep no more.
+    """Which of these motions creep along a line of states: they are taken to where an attractor captures them, where they are
+    certain to slide for ever, or where they creep no more.
     """
     asked_rows = np.flatnonzero(asked)
 
     def arrived(rows, at: Section) -> Bool[np.ndarray, " r"]:
-        own = group[asked_rows[rows]]
-        done = ~maps.moves(own, at.y)
-        done[list(come_to(maps, own, at, at.y, ~done, of_group))] = True
-        return done if slides is None else done | slides(own, at)
+        motions = Motions(run.motions.group[asked_rows[rows]], at)
+        done = ~catalogue.maps.moves(motions.group, at.y)
+        done[list(catalogue.captures(motions, ~done))] = True
+        return done if slides is None else done | slides(motions)
 
     creeping = np.zeros(len(asked), bool)
     if len(asked_rows):
-        creeps, at, later, more = crept(maps, group[asked_rows], now.rows(asked_rows), arrived)
+        creeps, at, later, more = creep(catalogue.maps, run.motions.rows(asked_rows), arrived)
         rows = asked_rows[creeps]
         creeping[rows] = True
-        now.put(rows, at.rows(creeps))
-        time[rows] += later[creeps]
-        events[rows] += more[creeps]
+        run.move(rows, at.rows(creeps), later[creeps], more[creeps])
     return creeping
 
 
-def _drifted(
-    maps: ReturnMaps, group, now: Section, time, events, asked: Bool[np.ndarray, " m"]
-) -> Bool[np.ndarray, " m"]:
-    """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: `now` they are further,
-    after that much more `time` and `events`.
-    """
+def _drift(maps: ReturnMaps, run: _Underway, asked: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Which of these motions drift, as they do away from a cycle that repels weakly, or past a fold: they are taken further."""
     rows, drifting = np.flatnonzero(asked), np.zeros(len(asked), bool)
     if len(rows):
-        seen = maps.returns(group[rows], now.rows(rows), AT_A_TIME, AT_A_TIME)
+        seen = maps.returns(*run.motions.rows(rows), AT_A_TIME, AT_A_TIME)
         own = np.array([is_drifting(maps.weights * one) for one in seen.path])
         rows = rows[own]
-        later = maps.returns(group[rows], seen.at.rows(own), ONWARD)
-        now.put(rows, later.at)
-        time[rows] += seen.time[own] + later.time
-        events[rows] += seen.events[own] + later.events
+        later = maps.returns(run.motions.group[rows], seen.at.rows(own), ONWARD)
+        run.move(rows, later.at, seen.time[own] + later.time, seen.events[own] + later.events)
         drifting[rows] = True
     return drifting
 
 
-def _search(
-    maps: ReturnMaps,
-    group,
-    at: Section,
-    closing_in: Bool[np.ndarray, " m"],
-    picked: Int[np.ndarray, " r"],
-    of_group: dict[int, Attractors],
-    report,
-) -> None:
-    """Adds the attractors that the picked motions are on, where they are new. On some of them neighbours are `closing_in`."""
-    on_torus = ~closing_in[picked]
+def _search(catalogue: Catalogue, motions: Motions, closing_in: Bool[np.ndarray, " m"]) -> None:
+    """Adds the attractors that these motions are on, where they are new. On some of them neighbours are `closing_in`."""
+    on_torus = ~closing_in
     for closes_in, most in ((True, MOST_CROSSINGS), (False, MORE_CROSSINGS)):
-        here = np.flatnonzero(closing_in[picked] == closes_in)
-        if not len(here):
-            continue
-        rows = picked[here]
-        on_torus[here] &= ~add_cycles(maps, group[rows], at.rows(rows), of_group, most, settled=True)
-    rows = picked[on_torus]
+        here = np.flatnonzero(closing_in == closes_in)
+        if len(here):
+            on_torus[here] &= ~catalogue.add_cycles(motions.rows(here), Recurrence(most, settled=True))
+    rows = np.flatnonzero(on_torus)
     if len(rows):
-        add_tori(maps, group[rows], at.rows(rows), of_group, report, TUBES)
+        catalogue.add_tori(motions.rows(rows), TUBES)

@@ -46,15 +46,8 @@ from ..contact import same_mode
 
 # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
 MARGIN = 1e-6
-# Enough for the slowest decay within that margin: (1 - MARGIN / 2) to the power 2^DOUBLINGS is nothing.
-DOUBLINGS = 32
-# The largest and the smallest radius tried, relative to the cycle's size.
-LARGEST, SMALLEST = 0.5, 1e-8
-# Sizes of the ellipsoids on which the return map is checked, relative to the radius; and the number of directions on each.
-SHELLS = (1.0, 0.5, 0.25, 0.125)
-DIRECTIONS = 64
-# One in so many points of a radius is tried first, then one in so many.
-PROBED = (32, 8)
+# The largest radius tried, relative to the cycle's size.
+LARGEST = 0.5
 
 
 class Neighbourhood(NamedTuple):
@@ -104,7 +97,8 @@ def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray
     rate = 0.5 * (1 + largest)
     # The solution is a sum over all powers of the scaled derivative, whose number is doubled again and again.
     power, matrix = derivative / rate, np.eye(len(derivative))
-    for _ in range(DOUBLINGS):
+    # Enough for the slowest decay within the margin: (1 - MARGIN / 2) to the power 2^32 is nothing.
+    for _ in range(32):
         matrix, power = matrix + power.T @ matrix @ power, power @ power
         if np.max(np.abs(power), initial=0.0) < np.finfo(float).eps:
             break
@@ -142,14 +136,15 @@ def trial(
 
     **Arguments:** `centre`, the cycle's state on the section; `status` and `direction`, its contact mode; `jacobian`, the
     derivative of the return map there; `weights` of the state's coordinates; `basis`, the weighted directions that are free on
-    the section (`verdicts.free_directions`). States are deviations from the sliding equilibrium.
+    the section (`ReturnMaps.free_directions`). States are deviations from the sliding equilibrium.
     """
     found = adapted_norm(basis.T @ (weights[:, None] * jacobian / weights) @ basis)
     size = float(np.linalg.norm(weights * centre))
     if found is None or size == 0:
         return None
     root, rate = found
-    shells = np.concatenate([share * directions(basis.shape[1], len(weights)) for share in SHELLS])
+    # On ellipsoids of these sizes, relative to the radius, the return map is checked.
+    shells = np.concatenate([share * directions(basis.shape[1], len(weights)) for share in (1.0, 0.5, 0.25, 0.125)])
     return Trial(
         centre,
         status,
@@ -160,7 +155,7 @@ def trial(
         np.linalg.norm(shells, axis=1),
         0.5 * (1 + rate),
         LARGEST * size,
-        SMALLEST * size,
+        1e-8 * size,
     )
 
 
@@ -176,7 +171,8 @@ def neighbourhoods(trials: list[Trial], returned: ReturnMap) -> list[Neighbourho
     radius, open_ = np.array(every.largest), np.arange(len(trials))
     while len(open_):
         passed = open_
-        for one_in in (*PROBED, 1):
+        # A few of the points are tried first.
+        for one_in in (32, 8, 1):
             ratios = _contraction(every, passed, one_in, radius[passed], returned)
             # NaN is not below anything, so it fails.
             passes = ratios <= every.allowed[passed]
@@ -223,13 +219,13 @@ def _same_mode(y, status, direction, other, other_direction):
 
 @functools.cache
 def directions(dimension: int, size: int) -> Float[np.ndarray, "d f"]:
-    """Directions that fill the unit sphere evenly, in opposite pairs, including the axes: as many for all cycles with states of
-    this size, however many dimensions their contact modes leave free.
+    """Directions that fill the unit sphere evenly, in opposite pairs, including the axes: 64, or as many as large states need;
+    as many for all cycles with states of this size, however many dimensions their contact modes leave free.
     """
     from scipy.special import ndtri
 
     axes = np.eye(dimension)
-    count = max(DIRECTIONS // 2, size) - dimension
+    count = max(32, size) - dimension
     inside = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in _primes(dimension)], axis=1)
     spread = ndtri(inside)
     lengths = np.linalg.norm(spread, axis=1, keepdims=True)

@@ -1,5 +1,10 @@
 """Tori of many groups: the sets that long motions trace on the section, whether these attract, whether neighbours part on them,
-how high they go.
+and how high they go.
+
+A set counts as a torus by these checks, each with its tolerance beside it: the motion goes on and repeats nothing
+(`goes_on`), drifts no more (`is_drifting`), and its amplitude has settled (`_settled_amplitude`); whatever starts on the
+edge of a tube about the set comes back (`_tubes_returned_to`); and motions that start there go about the same set without
+parting (`_attracting_tubes`, `_on_one_torus`).
 """
 
 from typing import NamedTuple
@@ -7,48 +12,27 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status
 from ..section.return_maps import ReturnMaps, Section
 from . import tube
-from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, NOMINATED, Cycle, stable_cycles
-from .parting import parting_rates
-from .tube import Tube, thinned, tree_of
+from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
+from .divergence import growth_rates
+from .motions import NOMINATED, Motions, section_at
+from .tube import Tube, thin, tree_of
 
 # Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
 TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
-# States on the section in a row that make the set: so many, and twice as many of a motion that beats slowly; and how many at a
-# time: after each, motions that have come to a torus that is known are left out, and those whose extent changes by this factor,
-# as on the way to a cycle. Near a resonance beats are so slow that it takes more states to tell them from a drift.
-TRACED, LONGER, LONGEST, AT_A_TIME, CHANGES = 2048, 4096, 12288, 512, 1.5
-# The mean of the states may change with time by so much of their extent, and their extent by this share. A fade that takes
-# thousands of periods is such a set, too, and starts further in are home while they pass it.
-DRIFT, SHRINKS = 5e-3, 0.05
-# A motion that comes back this close, relative to the extent of its states, within `CROSSINGS`, is on a cycle. One that is
-# locked weakly to a cycle of more crossings is better taken as on a torus: motions from about it trace the rest of that, once
-# they have come to it, after so many returns. Its states are in clusters: distances between neighbours are mostly smaller than
-# this share of those on a curve.
-REPEATS, COME_AFTER, CLUSTERED = 1e-5, 48, 0.05
-# Locked more strongly, it comes back this close, in the end, within `MOST_CROSSINGS`: hardly any motion on a torus does.
-NEARLY_REPEATS = 1e-4
-# Crossings in which starts on the tube's edge have to be back in this share of it, which is less than what captures: next to a
-# slow fade there is a direction in which they come back hardly at all. The first few starts tell most sets that do not attract.
-BACK_WITHIN, BACK_TO, FIRST = 1536, 0.25, 4
-# Starts about a torus that are followed further. In chaos neighbours part by so much per return, and more.
-FURTHER, PARTING = 4, 0.05
-# Neighbours that close in on each other by so much per return are on a torus that is locked: on a cycle of many crossings.
-LOCKED = -0.01
-# On the way, motions that are on one torus have the same mean, but for so much of its extent, and come to where others were, to
-# within so many distances between neighbours. A slow fade is a line of states: each motion is at a place of its own.
-SAME_MEAN, NEAR_OTHERS, ROUNDING = 0.2, 8.0, 1e-7
-# The largest speed in the later half of the states is the torus' amplitude if that in the earlier half differs by no more than
-# this share. Else the motion is followed further, for so many returns at most: a set whose amplitude still drifts is not
-# accepted. (What shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats
-# may be rare.)
-SETTLED, SETTLED_WITHIN = 7.5e-4, 24576
-# Returns that starts about a torus take from the edge of the tube to the torus, once they are back.
-COME_NEARER = 128
-# The same from there to a cycle of many crossings on the torus, on which neighbours close in.
-CLOSE_IN = 2048
+# States on the section in a row that make the set: so many, and twice as many of a motion that beats slowly. Near a resonance
+# beats are so slow that it takes more states to tell them from a drift.
+TRACED, LONGER, LONGEST = 2048, 4096, 12288
+# So many states at a time: after each, motions that have come to a torus that is known are left out.
+AT_A_TIME = 512
+# Starts on a tube's edge are back when they are in this share of it, which is less than what captures: next to a slow fade
+# there is a direction in which they come back hardly at all.
+BACK_TO = 0.25
+# In chaos neighbours part by so much per return, and more.
+CHAOTIC_FROM = 0.05
+# Motions whose extent, or whose distance from others, is below this share of their size differ by rounding only.
+ROUNDING = 1e-7
 
 
 class Traced(NamedTuple):
@@ -79,32 +63,32 @@ class Torus(NamedTuple):
 
 def tori_from(
     maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
-    cycles: list[list[Cycle]],
+    motions: Motions,
+    cycles: list[list[StableCycle]],
     tori: list[list[Torus]],
     report,
     tubes=TUBES,
-) -> tuple[dict[int, Torus], list[tuple[int, Cycle]]]:
-    """The tori that motions from these states are on, by row; and the cycles of locked ones, with their rows. `cycles` and
-    `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
+) -> tuple[dict[int, Torus], list[tuple[int, StableCycle]]]:
+    """The tori that these motions are on, by row; and the cycles of locked ones, with their rows. `cycles` and `tori` are those
+    known of each row's group. Of the `tubes` the first that attracts counts.
     """
-    traced = _traced(maps, group, at, tori, max(TRACED, tubes[-1][1]))
+    group = motions.group
+    traced = _trace(maps, motions, tori, max(TRACED, tubes[-1][1]))
     found: dict[int, Torus] = {}
-    locked = _repeating(maps, group, traced, cycles)
+    locked = _cycles_repeated(maps, group, traced, cycles)
     for row, _ in locked:
         del traced[row]
-    around = _traced_around(maps, group, traced)
+    around = _trace_around(maps, group, traced)
     # A tube that is wider says more, where everything in it comes back.
     for radius, count in tubes:
         # Where narrow tubes are tried, a locked motion has come so near to its cycle that its own states may do, too.
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
-            tried = [(row, Tube(thinned(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
+            tried = [(row, Tube(thin(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
             tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
             if not tried:
                 continue
-            new, of_locked = _attracting(maps, group, tried, cycles, report)
+            new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
             found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
@@ -113,33 +97,33 @@ def tori_from(
     return found, locked
 
 
-def _repeating(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], cycles: list[list[Cycle]]
-) -> list[tuple[int, Cycle]]:
+def _cycles_repeated(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], cycles: list[list[StableCycle]]
+) -> list[tuple[int, StableCycle]]:
     """The cycles of motions that have nearly come to one of many crossings by the end of what they trace, with their rows."""
     rows = []
     for row, one in traced.items():
         back = np.linalg.norm(one.states[-1 - MOST_CROSSINGS : -1] - one.states[-1], axis=1)
-        if np.min(back) <= NEARLY_REPEATS * extent(one.states):
+        # Hardly any motion on a torus comes back as close as this.
+        if np.min(back) <= 1e-4 * extent(one.states):
             rows.append(row)
     if not rows:
         return []
     own, last = group[rows], np.array([traced[row].states[-1] for row in rows]) / maps.weights
     at = section_at(last, maps.normal, maps.sliding[own])
     known = {int(group[row]): cycles[row] for row in rows}
-    near = stable_cycles(maps, own, at, known, MOST_CROSSINGS, settled=True)
+    near = stable_cycles(maps, Motions(own, at), known, Recurrence(MOST_CROSSINGS, settled=True))
     return [(rows[k], cycle) for _, which, cycle in near for k in which]
 
 
-def reached(
+def capturing_tori(
     maps: ReturnMaps,
-    group: Int[np.ndarray, " m"],
-    at: Section,
+    motions: Motions,
     latest: Float[np.ndarray, "m 2n"],
     known: list[tuple[Int[np.ndarray, " r"], Torus]],
 ) -> dict[int, Torus]:
     """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
-    `cycles.captured`, `latest` tells which to ask, and their next crossings decide.
+    `cycles.capturing_cycles`, `latest` tells which to ask, and their next crossings decide.
     """
     near = []
     for rows, torus in known:
@@ -148,7 +132,7 @@ def reached(
     asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
     if not len(asked):
         return {}
-    _, paths = maps.path(group[asked], at.rows(asked), tube.HOME)
+    _, paths = maps.path(*motions.rows(asked), tube.HOME)
     found: dict[int, Torus] = {}
     for (_, torus), rows in zip(known, near, strict=True):
         open_ = np.array([row for row in rows if row not in found], int)
@@ -158,14 +142,14 @@ def reached(
     return found
 
 
-def _traced(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], at: Section, tori: list[list[Torus]], count: int
-) -> dict[int, Traced]:
+def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: int) -> dict[int, Traced]:
     """At least so many states of those motions, by row, that may be on a torus that is none of the known ones."""
+    group, at = motions
     running, paths = np.arange(len(group)), np.zeros((len(group), 0, at.y.shape[1]))
     peaks, times = np.zeros((2, len(group), 0))
     traced: dict[int, Traced] = {}
-    for length in range(AT_A_TIME, SETTLED_WITHIN + 1, AT_A_TIME):
+    # A set whose amplitude still drifts in the end is not accepted.
+    for length in range(AT_A_TIME, 24576 + 1, AT_A_TIME):
         if not len(running):
             break
         if length == AT_A_TIME:
@@ -180,7 +164,8 @@ def _traced(
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGEST:]
         ends = np.moveaxis(more, 1, 0)
-        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(CHANGES)) & maps.moves(group[running], at.y)
+        # An extent that changes so much is that of a motion on the way to a cycle.
+        left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(1.5)) & maps.moves(group[running], at.y)
         for k in np.flatnonzero(left):
             left[k] = not any(one.tube.home(ends[-tube.HOME :, k : k + 1]).item() for one in tori[running[k]])
         if length >= count:
@@ -188,7 +173,7 @@ def _traced(
             drifting = is_drifting(whole) & is_drifting(np.moveaxis(paths, 1, 0))
             left &= goes_on(whole)
             for k in np.flatnonzero(left):
-                amplitude = _settled(peaks[k])
+                amplitude = _settled_amplitude(peaks[k])
                 if amplitude is not None and not drifting[k]:
                     traced[int(running[k])] = Traced(
                         paths[k, -LONGER:].copy(), amplitude, float(np.mean(times[k])) / AT_A_TIME
@@ -197,8 +182,8 @@ def _traced(
                 left[k] &= length < LONGER or (not drifting[k] if amplitude is None else length < LONGEST)
         if length == LONGER and np.any(left):
             # What never settles is chaos, mostly.
-            growth, *_ = parting_rates(maps, group[running[left]], at.rows(left))
-            left[left] = growth < PARTING
+            growth, *_ = growth_rates(maps, Motions(group[running[left]], at.rows(left)))
+            left[left] = growth < CHAOTIC_FROM
         running, at, paths, peaks, times = running[left], at.rows(left), paths[left], peaks[left], times[left]
     return traced
 
@@ -216,10 +201,12 @@ def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*st
     return np.tensordot(weights / np.sum(weights), values, axes=1)
 
 
-def _settled(peaks: Float[np.ndarray, " k"]) -> float | None:
-    """The largest of successive peaks (m/s), unless it differs much from half of them to the other."""
+def _settled_amplitude(peaks: Float[np.ndarray, " k"]) -> float | None:
+    """The largest of the later half of successive peaks (m/s): the amplitude, if that of the earlier half differs little. What
+    shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats may be rare.
+    """
     earlier, later = np.max(peaks[: len(peaks) // 2]), np.max(peaks[len(peaks) // 2 :])
-    return float(later) if abs(later / earlier - 1) <= SETTLED else None
+    return float(later) if abs(later / earlier - 1) <= 7.5e-4 else None
 
 
 def _growth(paths: Float[np.ndarray, "k *m 2n"]) -> Float[np.ndarray, "*m"]:
@@ -230,29 +217,33 @@ def _growth(paths: Float[np.ndarray, "k *m 2n"]) -> Float[np.ndarray, "*m"]:
 
 
 def is_drifting(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
-    """Whether the mean or the extent of weighted states on the section changes with time."""
+    """Whether the mean or the extent of weighted states on the section changes with time: by more than these shares of the
+    extent. A fade that takes thousands of periods traces a set, too, and starts further in are home while they pass it.
+    """
     third = len(paths) // 3
     with np.errstate(invalid="ignore"):
         early, late = (smooth_mean(part) for part in (paths[:third], paths[-third:]))
-        moved = np.linalg.norm(late - early, axis=-1) > DRIFT * extent(paths)
-        return moved | ~(np.abs(_growth(paths)) <= SHRINKS)
+        moved = np.linalg.norm(late - early, axis=-1) > 5e-3 * extent(paths)
+        return moved | ~(np.abs(_growth(paths)) <= 0.05)
 
 
 def goes_on(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
     """Whether a motion goes on, by its weighted states on the section, and the last of them is none of those up to `CROSSINGS`
-    before.
+    before: else it is on a cycle. One that is locked weakly to a cycle of more crossings is better taken as on a torus.
     """
     with np.errstate(invalid="ignore"):
         width = extent(paths)
         moving = width > ROUNDING * np.mean(np.linalg.norm(paths, axis=-1), axis=0)
         apart = np.linalg.norm(paths[-1 - CROSSINGS : -1] - paths[-1], axis=-1)
-        return moving & (np.min(apart, axis=0) > REPEATS * width)
+        return moving & (np.min(apart, axis=0) > 1e-5 * width)
 
 
 def _in_clusters(path: Float[np.ndarray, "k 2n"]) -> bool:
-    """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will."""
-    states = thinned(path, TUBES[0][1])
-    return bool(np.median(_spacing(states)) <= CLUSTERED * 2 * np.pi * extent(states) / len(states))
+    """Whether states are in a few places of their curve, as those of a motion that repeats, or soon will: distances between
+    neighbours are mostly smaller than this share of those of states that are spread over a curve.
+    """
+    states = thin(path, TUBES[0][1])
+    return bool(np.median(_spacing(states)) <= 0.05 * 2 * np.pi * extent(states) / len(states))
 
 
 def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
@@ -260,13 +251,15 @@ def _spacing(states: Float[np.ndarray, "k 2n"]) -> Float[np.ndarray, " k"]:
     return tree_of(states).query(states, k=2)[0][:, 1]
 
 
-def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
-    """The motions that are in clusters, with the states that others about them trace; their amplitudes are their own."""
+def _trace_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced]) -> dict[int, Traced]:
+    """The motions that are in clusters, with the states that others about them trace once they have come to the torus; their
+    amplitudes are their own.
+    """
     rows = [row for row, one in traced.items() if _in_clusters(one.states)]
     if not rows:
         return {}
     own, at = _starts(maps, group[rows], [Tube(traced[row].states, tube.RADIUS) for row in rows])
-    _, paths = maps.path(own, maps.returns(own, at, COME_AFTER).at, TRACED // tube.STARTS)
+    _, paths = maps.path(own, maps.returns(own, at, 48).at, TRACED // tube.STARTS)
     states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
     return {
         row: traced[row]._replace(states=whole)
@@ -275,69 +268,74 @@ def _traced_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[
     }
 
 
-def _attracting(
+def _attracting_tubes(
     maps: ReturnMaps,
     groups: Int[np.ndarray, " g"],
     tubes: list[tuple[int, Tube]],
-    known: list[list[Cycle]],
+    known: list[list[StableCycle]],
     report,
-) -> tuple[dict[int, Tube], list[tuple[int, Cycle]]]:
+) -> tuple[dict[int, Tube], list[tuple[int, StableCycle]]]:
     """Which of these tubes, each with its row, are about tori; and the cycles of tori that are locked."""
     own = np.array([groups[row] for row, _ in tubes])
-    back, last = _back(maps, own, [one for _, one in tubes], report)
+    back, last = _tubes_returned_to(maps, own, [one for _, one in tubes], report)
     if not len(back):
         return {}, []
-    chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // FURTHER)).ravel()
+    # So many of the starts are followed further: first from the edge of the tube to the torus.
+    further = 4
+    chosen = (tube.STARTS * back[:, None] + np.arange(0, tube.STARTS, tube.STARTS // further)).ravel()
     group = own[chosen // tube.STARTS]
-    at = maps.returns(group, last.rows(chosen), COME_NEARER).at
-    growth, later, path = parting_rates(maps, group, at)
-    growth = np.mean(growth.reshape(-1, FURTHER), axis=1)
-    lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, FURTHER, *path.shape[1:])])
-    closing_in = np.flatnonzero(growth < LOCKED)
-    cycles: list[tuple[int, Cycle]] = []
+    at = maps.returns(group, last.rows(chosen), 128).at
+    growth, later, path = growth_rates(maps, Motions(group, at))
+    growth = np.mean(growth.reshape(-1, further), axis=1)
+    lasting = np.array([_on_one_torus(part) for part in path.reshape(-1, further, *path.shape[1:])])
+    # Neighbours that close in by so much per return are on a torus that is locked: on a cycle of many crossings.
+    closing_in = np.flatnonzero(growth < -0.01)
+    cycles: list[tuple[int, StableCycle]] = []
     locked: list[int] = []
     of_group = {int(groups[row]): known[row] for row, _ in tubes}
     # One motion of each after the other, because most lead to the same cycle. Only then a cycle of many crossings, or with a
     # narrow neighbourhood.
-    nominees = ((k, MORE_CROSSINGS, False) for k in range(0, FURTHER, FURTHER // NOMINATED))
-    for nominee, crossings, settled in (*nominees, (0, MOST_CROSSINGS, True)):
+    nominees = ((k, Recurrence(MORE_CROSSINGS)) for k in range(0, further, further // NOMINATED))
+    for nominee, recurrence in (*nominees, (0, Recurrence(MOST_CROSSINGS, settled=True))):
         left = closing_in[~np.isin(closing_in, locked)]
-        asks = FURTHER * left + nominee
+        asks = further * left + nominee
         if not len(asks):
             continue
         at = later.rows(asks)
-        if settled:
-            at = maps.returns(group[asks], at, CLOSE_IN).at
-        for _, rows, cycle in stable_cycles(maps, group[asks], at, of_group, crossings, settled):
-            of_torus = asks[rows] // FURTHER
+        if recurrence.settled:
+            at = maps.returns(group[asks], at, 2048).at
+        for _, rows, cycle in stable_cycles(maps, Motions(group[asks], at), of_group, recurrence):
+            of_torus = asks[rows] // further
             cycles.append((tubes[back[of_torus[0]]][0], cycle))
             locked += list(of_torus)
     with np.errstate(invalid="ignore"):
-        kept = np.flatnonzero((growth < PARTING) & lasting & ~np.isin(np.arange(len(back)), locked))
+        kept = np.flatnonzero((growth < CHAOTIC_FROM) & lasting & ~np.isin(np.arange(len(back)), locked))
     return dict(tubes[back[k]] for k in kept), cycles
 
 
-def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[Cycle]) -> bool:
+def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
     """Whether a stable cycle lies in the inner half of a tube: motions there may come to that instead."""
     return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
 
 
-def _back(
+def _tubes_returned_to(
     maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube], report
 ) -> tuple[Int[np.ndarray, " t"], Section]:
-    """From the edges of which tubes all starts come back; and where the starts are then, tube by tube."""
-    weights, count = maps.weights, tube.STARTS
+    """From the edges of which tubes all starts come back, within so many crossings; and where the starts are then, tube by
+    tube. The first few starts tell most sets that do not attract.
+    """
+    weights, count, first, within = maps.weights, tube.STARTS, 4, 1536
     own, last = _starts(maps, group, tubes)
     back, ok = np.zeros(len(own), bool), np.ones(len(tubes), bool)
     smallest = np.array([np.min(np.linalg.norm(one.states, axis=1)) for one in tubes])
     place, of_tube = np.arange(len(own)) % count, np.arange(len(own)) // count
-    for among in (place < FIRST, place >= FIRST):
+    for among in (place < first, place >= first):
         running = np.flatnonzero(among & ok[of_tube])
         crossed = 0
-        while crossed < BACK_WITHIN and len(running):
+        while crossed < within and len(running):
             report(0)
             # Most are back soon; the others are looked at in growing steps.
-            further = min(max(tube.HOME, crossed // 2), BACK_WITHIN - crossed)
+            further = min(max(tube.HOME, crossed // 2), within - crossed)
             crossed += further
             image = maps.returns(own[running], last.rows(running), further, tube.HOME)
             last.put(running, image.at)
@@ -355,7 +353,10 @@ def _back(
 
 
 def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
-    """Whether motions, by their weighted states on the section in order, go about the same set again and again."""
+    """Whether motions, by their weighted states on the section in order, go about the same set again and again: they have the
+    same mean, but for so much of its extent, and come to where others were, to within so many distances between neighbours. A
+    slow fade is a line of states: each motion is at a place of its own.
+    """
     if not np.all(np.isfinite(paths)):
         return False
     whole = paths.reshape(-1, paths.shape[-1])
@@ -367,9 +368,7 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
     steps = [np.median(_spacing(part)) for part in late]
     missed = np.median(tree_of(early).query(late)[0], axis=1)
     rounding = ROUNDING * tube.mean_size(whole)
-    return bool(
-        np.max(apart) <= SAME_MEAN * extent(whole) and np.all(missed <= NEAR_OTHERS * np.array(steps) + rounding)
-    )
+    return bool(np.max(apart) <= 0.2 * extent(whole) and np.all(missed <= 8.0 * np.array(steps) + rounding))
 
 
 def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -> tuple[Int[np.ndarray, " m"], Section]:
@@ -378,11 +377,3 @@ def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -
     section, gaps = maps.section / maps.weights[size:], np.atleast_1d(maps.normal)
     starts = np.concatenate([one.starts(section, gaps) for one in tubes])
     return own, section_at(starts / maps.weights, maps.normal, maps.sliding[own])
-
-
-def section_at(
-    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
-) -> Section:
-    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
-    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
-    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))

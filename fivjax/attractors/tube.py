@@ -52,7 +52,7 @@ class Tube:
         `section` has the section's weights of velocities, in weighted coordinates; `gaps` are the indices of the normal
         displacements, which are zero in contact, as are their velocities.
         """
-        chosen = thinned(self.states, STARTS)[:STARTS]
+        chosen = thin(self.states, STARTS)[:STARTS]
         random = np.random.default_rng(0).normal(size=chosen.shape)
         kind = np.arange(STARTS) % 4
         away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
@@ -77,7 +77,7 @@ class Tube:
         return np.all(self.holds(ends, within), axis=0)
 
 
-def thinned(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
+def thin(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
     """Each so-many-th of the states: `count` of them, or some more."""
     return states[:: max(len(states) // count, 1)]
 

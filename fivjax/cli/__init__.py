@@ -1,7 +1,8 @@
 """The command line, `fivjax …`: the public API with sensible defaults; each command writes data and a picture.
 
-Heavy packages are imported only when a command runs, so that `--help`, `--version` and errors in options come at once; and
-nothing at all before signals are handled (`program`).
+Read first: `command_line`, which command is which; `options` and `structure_options`, what they share; `map_command` as one
+of them. Heavy packages are imported only when a command runs, so that `--help`, `--version` and errors in options come at
+once; and nothing at all before signals are handled (`program`).
 """
 
 from .ending import program as program

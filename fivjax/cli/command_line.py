@@ -14,9 +14,8 @@ import fivjax as fj
 from ..foundation.progress import in_lines
 from ..foundation.signals import exit_code, handled, handled_as_before
 from .analysis_commands import Calibrate, Cea
-from .branch_command import Branch
 from .compiled_code import keep_compiled_code
-from .cycle_command import Cycle
+from .cycle_commands import Branch, CycleCommand
 from .map_command import Map
 from .outputs import Failure, Interrupted
 from .parsing import numbers
@@ -27,7 +26,7 @@ COMMANDS = {
     "map": Map,
     "simulate": Simulate,
     "cea": Cea,
-    "cycle": Cycle,
+    "cycle": CycleCommand,
     "branch": Branch,
     "calibrate": Calibrate,
     "tradeoff": Tradeoff,

@@ -7,15 +7,12 @@ import tyro
 
 from ..foundation.digits import apart
 
-# The most values of an axis.
-MOST_VALUES = 10**7
-
 
 def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     """The name and values of an axis from `NAME=FROM:TO:COUNT`.
 
     **Raises:** `ValueError` for anything else, ends that are not finite or not increasing, and fewer than `least` values or
-    more than `MOST_VALUES`.
+    more than ten million.
     """
     try:
         name, values = text.split("=")
@@ -27,9 +24,10 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
         ) from None
     if points < least:
         raise ValueError(f"Axis `{name}` must have at least {number(least, 'value')}, but its COUNT is {points}.")
-    if points > MOST_VALUES:
+    most_values = 10**7
+    if points > most_values:
         raise ValueError(
-            f"Axis `{name}` must have at most {MOST_VALUES:,} values, but asks for {points:,}: {8 * points:,} bytes, before "
+            f"Axis `{name}` must have at most {most_values:,} values, but asks for {points:,}: {8 * points:,} bytes, before "
             f"anything is computed for them."
         )
     if not (math.isfinite(low) and math.isfinite(high)):

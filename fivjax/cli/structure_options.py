@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
     from ..model.structure import Structure
 
-AXES = {"x": 1, "y": 2, "z": 3}
-# What describes the oscillator.
-OSCILLATOR = ("m1", "m2", "c1", "c2", "k1", "k2", "theta")
-
 
 @dataclasses.dataclass(frozen=True)
 class StructureOptions(SceneOptions):
@@ -80,7 +76,9 @@ class StructureOptions(SceneOptions):
 
         **Raises:** `ValueError`, which names options in place of arguments.
         """
-        self._refuse_given(OSCILLATOR, "belongs to the oscillator, which `--structure` replaces; leave it out")
+        # What describes the oscillator.
+        oscillator = ("m1", "m2", "c1", "c2", "k1", "k2", "theta")
+        self._refuse_given(oscillator, "belongs to the oscillator, which `--structure` replaces; leave it out")
         contacts: Path | list = [node_contact(text) for text in self.contact]
         if self.contacts is not None:
             if contacts:
@@ -159,8 +157,9 @@ def _share(text: str) -> tuple[tuple[int, str | int], float]:
 
 def _coordinate(text: str, option: str) -> tuple[int, int]:
     node, _, direction = text.partition(":")
-    if node.isdecimal() and (direction in AXES or direction.isdecimal()):
-        return int(node), AXES.get(direction) or int(direction)
+    axes = {"x": 1, "y": 2, "z": 3}
+    if node.isdecimal() and (direction in axes or direction.isdecimal()):
+        return int(node), axes.get(direction) or int(direction)
     raise ValueError(f"Option `{option}` must be NODE:DIRECTION, such as `5:x` or `5:1`, but is {text!r}.")
 
 

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..attractors.catalogue import Attractors, Catalogue
 from ..attractors.closing import close_near, closed_at
-from ..attractors.cycles import Cycle, in_families
-from ..attractors.known import Attractors
+from ..attractors.cycles import StableCycle, in_families
 from ..attractors.long_run import fates
+from ..attractors.motions import Motions
 from ..attractors.search import search_from
 from ..contact import Contact, State, Status
 from ..foundation import arguments
@@ -189,22 +190,21 @@ def attractors_met(maps: ReturnMaps, scene: Scene, states: Float[np.ndarray, "m 
 
     stage("releasing motions")
     found = Attractors([], [])
-    group = np.zeros(len(states), int)
-    rows, at = search_from(maps, group, maps.in_contact(group, states), {0: found}, report)
-    families = in_families(maps, group[rows], at)
-    rows, at = rows[~families], at.rows(~families)
-    left = 0
-    if len(rows):
-        stage(f"following {len(rows)} motions")
-        fate = fates(maps, group[rows], at, {0: found}, report)
-        left = len(rows) - len(fate.attractor) - int(np.sum(fate.without_events))
+    catalogue, group = Catalogue(maps, {0: found}, report), np.zeros(len(states), int)
+    motions = search_from(catalogue, Motions(group, maps.in_contact(group, states)))
+    families = in_families(maps, motions)
+    motions, left = motions.rows(~families), 0
+    if len(motions.group):
+        stage(f"following {len(motions.group)} motions")
+        fate = fates(catalogue, motions)
+        left = len(motions.group) - len(fate.attractor) - int(np.sum(fate.without_events))
     stage("describing what was found")
     cycles = [_described(maps, scene, one) for one in found.cycles]
     cycles += [limit_cycle_of_torus(maps, scene, one) for one in found.tori]
     return Met(sorted(cycles, key=lambda one: -one.amplitude), int(np.sum(families)), left)
 
 
-def _described(maps: ReturnMaps, scene: Scene, cycle: Cycle) -> LimitCycle:
+def _described(maps: ReturnMaps, scene: Scene, cycle: StableCycle) -> LimitCycle:
     about = cycle.neighbourhood
     point = Point(np.asarray(cycle.points[0]), Contact(np.asarray(about.status), np.asarray(about.direction)))
     found = limit_cycle_of(maps, scene, closed_at(maps, point, len(cycle.points)))

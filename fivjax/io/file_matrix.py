@@ -8,9 +8,6 @@ from scipy import sparse
 
 from .reading_limits import check_length
 
-# Of a node or direction: finite-element codes number with 32 bits.
-LARGEST_LABEL = 2**31 - 1
-
 
 class Label(NamedTuple):
     """A degree of freedom of a finite-element model: a node and a direction, 1–3 along x, y, z and 4–6 about them."""
@@ -105,9 +102,11 @@ def from_entries(
 def _labels(place: str, labels) -> np.ndarray:
     # As floating-point numbers first: too large ones cannot be kept as whole ones, and wrap around.
     table = np.asarray(labels, np.float64).reshape(-1, 2)
-    if np.any(np.abs(table) > LARGEST_LABEL):
+    # Of a node or direction: finite-element codes number with 32 bits.
+    largest_label = 2**31 - 1
+    if np.any(np.abs(table) > largest_label):
         raise ValueError(
-            f"{place}: nodes and directions must be at most {LARGEST_LABEL}, but {np.abs(table).max():.17g} is there. Write "
+            f"{place}: nodes and directions must be at most {largest_label}, but {np.abs(table).max():.17g} is there. Write "
             f"the file again."
         )
     return table.astype(np.int64)

@@ -7,15 +7,6 @@ from pathlib import Path
 
 from ..foundation.whole_files import try_to_write, write_whole
 
-# What a path may lead to that is no file, and is never replaced by one.
-NO_FILES = {
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFLNK: "a symbolic link that leads back to itself",
-}
-
 
 def check_writable(path: str | Path) -> Path:
     """Refuse a path that could not be written, before any work is done.
@@ -35,8 +26,16 @@ def _check(path: Path, place: Path) -> None:
     there = _status(place)
     if there is not None and stat.S_ISDIR(there.st_mode):
         raise ValueError(f"Output path `{path}` is a folder; give the name of a file in it.")
+    # What a path may lead to that is no file, and is never replaced by one.
+    no_files = {
+        stat.S_IFIFO: "a FIFO",
+        stat.S_IFSOCK: "a socket",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+        stat.S_IFLNK: "a symbolic link that leads back to itself",
+    }
     if there is not None and not stat.S_ISREG(there.st_mode):
-        kind = NO_FILES.get(stat.S_IFMT(there.st_mode), "something else")
+        kind = no_files.get(stat.S_IFMT(there.st_mode), "something else")
         raise ValueError(f"Output path `{path}` is no file but {kind}; give another.")
     if place.parent.exists() and not place.parent.is_dir():
         raise ValueError(f"Output folder `{place.parent}` is not a folder but a file; give another.")

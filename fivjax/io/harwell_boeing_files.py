@@ -51,8 +51,8 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
         raise ValueError(f"{place} must have {ends[-1]} lines by its header, but has {len(lines)}. Write it again.")
     wanted = (columns + 1, header.entries, header.entries)
     positions, places, values = (
-        _numbers(place, lines, ends[part], ends[part + 1], *header.formats[part], kind, wanted[part])
-        for part, kind in enumerate((int, int, float))
+        _numbers(f"{place}, lines {a + 1} to {b}", lines[a:b], header.formats[part], kind, wanted[part])
+        for part, (a, b, kind) in enumerate(zip(ends[:3], ends[1:], (int, int, float), strict=False))
     )
     check_rows(path, "Harwell-Boeing", max(header.shape), header.entries)
     starts = positions - 1
@@ -102,23 +102,19 @@ def _header(place: str, lines: list[str]) -> _Header:
     )
 
 
-def _numbers(
-    place, lines: list[str], first: int, last: int, count: int, width: int, kind: type, wanted: int
-) -> np.ndarray:
-    """The numbers of some lines, in `count` fields of one width."""
+def _numbers(place: str, lines: list[str], fields: tuple[int, int], kind: type, wanted: int) -> np.ndarray:
+    """The numbers of some lines at this place, in `fields`: so many of one width."""
     # No line has more fields than characters.
-    count = min(count, max(map(len, lines[first:last]), default=0))
-    words = " ".join(lines[first:last]).upper().replace("D", "E").split()
+    count, width = min(fields[0], max(map(len, lines), default=0)), fields[1]
+    words = " ".join(lines).upper().replace("D", "E").split()
     if len(words) != wanted:  # fields that touch each other
-        fields = (line[k * width : (k + 1) * width] for line in lines[first:last] for k in range(count))
-        words = [field.upper().replace("D", "E").strip() for field in fields if field.strip()]
+        fields_read = (line[k * width : (k + 1) * width] for line in lines for k in range(count))
+        words = [field.upper().replace("D", "E").strip() for field in fields_read if field.strip()]
     if len(words) != wanted:
-        raise ValueError(
-            f"{place}, lines {first + 1} to {last}: {wanted} numbers expected, {len(words)} found. Write it again."
-        )
+        raise ValueError(f"{place}: {wanted} numbers expected, {len(words)} found. Write it again.")
     # Fortran leaves out the E before an exponent of three digits.
     words = words if kind is int else [re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", word) for word in words]
     try:
         return np.array([kind(word) for word in words], np.int64 if kind is int else np.float64)
     except (ValueError, OverflowError) as error:
-        raise ValueError(f"{place}, lines {first + 1} to {last}: {error}. Write it again.") from None
+        raise ValueError(f"{place}: {error}. Write it again.") from None

@@ -8,17 +8,16 @@ from . import sparse_parts
 from .reading_limits import unreadable
 from .separate_reading import parts_of
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-# Where the signature may stand: after a block of the user's own.
-PLACES = (0, 512, 1024, 2048)
-
 
 def is_hdf5(path: Path) -> bool:
     """Whether a file has HDF5's signature."""
+    # Where the signature may stand: after a block of the user's own.
+    places = (0, 512, 1024, 2048)
+    signature = b"\x89HDF\r\n\x1a\n"
     with path.open("rb") as file:
-        for place in PLACES:
+        for place in places:
             file.seek(place)
-            if file.read(len(SIGNATURE)) == SIGNATURE:
+            if file.read(len(signature)) == signature:
                 return True
     return False
 

@@ -21,11 +21,9 @@ NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 MATRIX, PACKED_ELEMENT = 14, 15
 # Classes of variables that hold numbers.
 SPARSE = 5
-CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 COMPLEX, LOGICAL = 0x08, 0x02
 # Numbers of version 4, by the tens digit of a variable's type; and its byte orders, by the thousands digit.
 OLD_NUMBERS = {0: "f8", 1: "f4", 2: "i4", 3: "i2", 4: "u2", 5: "u1"}
-OLD_ORDERS = {0: "<", 1: ">"}
 
 
 def read_matlab(path: Path) -> dict:
@@ -119,7 +117,8 @@ def _variable(path: Path, content: memoryview, order: str) -> tuple[str, object]
     if parts[0].kind not in (5, 6) or len(flags) != 2:
         raise unreadable(path, KIND, "a variable does not begin with its class")
     kind, is_complex = int(flags[0]) & 0xFF, bool(int(flags[0]) >> 8 & COMPLEX)
-    if kind not in (SPARSE, *CLASSES):
+    classes = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+    if kind not in (SPARSE, *classes):
         # An opaque object has its name in the place of its sizes.
         name = parts[2] if len(parts) > 2 and parts[1].kind in (5, 6) else parts[1]
         return _name(path, name), None
@@ -146,7 +145,7 @@ def _variable(path: Path, content: memoryview, order: str) -> tuple[str, object]
         where = sparse_parts.shape_of(path, KIND, np.array(shape))
         return name, sparse_parts.compressed(path, KIND, "csc", values, numbers[0], numbers[1], where)
     # Whole numbers may be kept in a smaller type.
-    wanted_type = np.dtype(CLASSES[kind])
+    wanted_type = np.dtype(classes[kind])
     return name, _shaped(path, name, values if is_complex else values.astype(wanted_type, copy=False), shape)
 
 
@@ -178,6 +177,7 @@ def _shaped(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -
 def _old_variables(path: Path, content: bytes) -> dict:
     """The variables of version 4: of each, five whole numbers (type, rows, columns, complex or not, length of name) first."""
     found, at = {}, 0
+    old_orders = {0: "<", 1: ">"}
     while at < len(content):
         if at + 20 > len(content):
             raise unreadable(path, KIND, "it is cut off")
@@ -185,7 +185,7 @@ def _old_variables(path: Path, content: bytes) -> dict:
         # Types are small numbers. In the other byte order they would be very large.
         mark = "<" if kind < 10_000 else ">"
         kind, rows, columns, is_complex, length = (int(x) for x in np.frombuffer(content, f"{mark}u4", 5, at))
-        order, numbers, what = OLD_ORDERS.get(kind // 1000), OLD_NUMBERS.get(kind // 10 % 10), kind % 10
+        order, numbers, what = old_orders.get(kind // 1000), OLD_NUMBERS.get(kind // 10 % 10), kind % 10
         if kind >= 10_000 or order != mark or kind // 100 % 10 or numbers is None or what > 2 or is_complex > 1:
             raise unreadable(path, KIND, f"no variable begins at byte {at}")
         dtype, at = np.dtype(mark + numbers), at + 20

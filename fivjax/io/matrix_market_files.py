@@ -14,8 +14,6 @@ from .reading_limits import check_length, check_rows, unreadable
 from .sparse_parts import listed
 
 KIND = "Matrix Market"
-FIELDS = ("real", "double", "integer", "complex", "pattern")
-SYMMETRIES = ("general", "symmetric", "skew-symmetric", "hermitian")
 
 
 def read_matrix_market(path: Path) -> sparse.csr_array:
@@ -29,7 +27,9 @@ def read_matrix_market(path: Path) -> sparse.csr_array:
     if len(words) != 5 or words[0] != "%%matrixmarket" or words[1] != "matrix":
         raise unreadable(path, KIND, "its first line must be `%%MatrixMarket matrix`, a layout, a field and a symmetry")
     layout, field, symmetry = words[2:]
-    if layout not in ("coordinate", "array") or field not in FIELDS or symmetry not in SYMMETRIES:
+    fields = ("real", "double", "integer", "complex", "pattern")
+    symmetries = ("general", "symmetric", "skew-symmetric", "hermitian")
+    if layout not in ("coordinate", "array") or field not in fields or symmetry not in symmetries:
         raise unreadable(path, KIND, f"its first line ends in {' '.join(words[2:])!r}, which is not known")
     if (layout, field) == ("array", "pattern") or (symmetry == "hermitian") > (field == "complex"):
         raise unreadable(path, KIND, f"its first line ends in {' '.join(words[2:])!r}, which cannot be")

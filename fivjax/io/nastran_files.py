@@ -8,14 +8,16 @@ G2 C2 A2 B2 …`, G being nodes and C directions; A is real where TIN is 1 or 2 
 A matrix that is neither mass nor damping nor stiffness, such as loads, is not read: in its place stands the reason.
 """
 
+import importlib.util
 import re
 from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 
+from . import sparse_parts
 from .file_matrix import FileMatrix, Label, from_entries, text_of
-from .output4_files import output4_matrices
+from .separate_reading import parts_of
 
 SQUARE, SYMMETRIC = 1, 6
 
@@ -157,3 +159,26 @@ def output4(path: Path) -> dict[str, FileMatrix]:
     if not found:
         raise ValueError(f"File `{path}` holds no matrix. Write it again.")
     return found
+
+
+def output4_matrices(path: Path) -> dict:
+    """The matrices of a file by name, sparse, of whatever shape.
+
+    **Raises:** `ImportError` without pyyeti, `ValueError` for a file that is damaged.
+    """
+    if importlib.util.find_spec("pyyeti") is None:
+        raise ImportError(
+            f'File `{path}` needs pyyeti to be read. Install it with `pip install "fivjax[fe]"`, or give the '
+            f"matrices as DMIG in a `.pch` file."
+        )
+    shapes, parts = {}, {}
+    kind = "OUTPUT4"
+    for about, values in parts_of(path, "output4", kind):
+        if values is None:
+            shapes[about["name"]] = tuple(about["shape"])
+        else:
+            parts[about["name"]] = values
+    return {
+        name: sparse_parts.listed(path, kind, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape)
+        for name, shape in shapes.items()
+    }

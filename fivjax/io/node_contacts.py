@@ -12,7 +12,6 @@ from .file_matrix import Label, text_of
 
 # Columns of a file of contacts; the last one may be missing.
 COLUMNS = ("node", "along", "away", "against")
-AXES = {"x": 1, "y": 2, "z": 3}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,10 +145,11 @@ def _along(node: int, direction, order, size: int) -> np.ndarray:
 
 
 def _components(direction) -> dict[int, float]:
+    axes = {"x": 1, "y": 2, "z": 3}
     if isinstance(direction, str):
         name, sign = direction.strip().lstrip("+-").lower(), -1.0 if direction.strip().startswith("-") else 1.0
-        if name in AXES:
-            return {AXES[name]: sign}
+        if name in axes:
+            return {axes[name]: sign}
     elif isinstance(direction, int | np.integer) and not isinstance(direction, bool):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}

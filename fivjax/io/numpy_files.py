@@ -17,22 +17,8 @@ import numpy as np
 from .reading_limits import check_declared, check_length, unreadable
 
 KIND = "NumPy"
-MAGIC = b"\x93NUMPY"
 # Longest header, and how deep its brackets may go.
 HEADER, DEPTH = 100_000, 8
-# What `zipfile` raises for damaged archives. (`RuntimeError`: encrypted; `NotImplementedError`: other ways of packing.)
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    OSError,
-    EOFError,
-    RuntimeError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    UnicodeError,
-    MemoryError,
-)
 
 
 def load_array(path: Path) -> np.ndarray:
@@ -50,6 +36,19 @@ def load_archive(path: Path) -> dict[str, np.ndarray]:
     **Raises:** `ValueError` for a file that is damaged, or that holds Python objects.
     """
     found = {}
+    # What `zipfile` raises for damaged archives. (`RuntimeError`: encrypted; `NotImplementedError`: other ways of packing.)
+    damage = (
+        zipfile.BadZipFile,
+        zlib.error,
+        OSError,
+        EOFError,
+        RuntimeError,
+        KeyError,
+        IndexError,
+        OverflowError,
+        UnicodeError,
+        MemoryError,
+    )
     try:
         with zipfile.ZipFile(path) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
@@ -59,7 +58,7 @@ def load_archive(path: Path) -> dict[str, np.ndarray]:
                 if name in found:
                     raise unreadable(path, KIND, f"array `{name}` is there twice")
                 found[name] = _array(path, f"array `{name}`: ", _unpacked(path, archive, member))
-    except _DAMAGE as error:
+    except damage as error:
         if isinstance(error, zipfile.BadZipFile) and path.read_bytes()[:1] == b"\x80":
             error = "it holds no arrays of numbers"
         raise unreadable(path, KIND, error) from None
@@ -95,7 +94,8 @@ def _array(path: Path, where: str, content: bytes) -> np.ndarray:
 
 def _header(content: bytes) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
     """Type, shape and order of the numbers, and where they begin."""
-    if not content.startswith(MAGIC):
+    magic = b"\x93NUMPY"
+    if not content.startswith(magic):
         raise ValueError("it holds no arrays of numbers")
     width = {1: 2, 2: 4, 3: 4}[content[6]]
     begin = 8 + width + int.from_bytes(content[8 : 8 + width], "little")

@@ -9,8 +9,6 @@ from pathlib import Path
 # A file may unpack to this many bytes whatever its length; above, to so many times its length. Measured signals and matrices
 # pack to a tenth at best.
 SMALL, PACKED = 2**28, 200
-# Rows of a sparse matrix that may be empty: each costs memory, but no byte in the file.
-EMPTY_ROWS = 1_000_000
 # While a file is read, its data are there up to three times: packed, unpacked, and in the form that is wanted.
 COPIES = 3
 
@@ -54,7 +52,9 @@ def check_rows(path: Path, kind: str, rows: int, entries: int) -> None:
 
     **Raises:** `ValueError`.
     """
-    if rows > max(entries, EMPTY_ROWS):
+    # Rows of a sparse matrix that may be empty: each costs memory, but no byte in the file.
+    empty_rows = 1_000_000
+    if rows > max(entries, empty_rows):
         raise unreadable(path, kind, f"it declares {rows} rows or columns, but has {entries} entries")
 
 

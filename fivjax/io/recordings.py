@@ -18,11 +18,8 @@ from ..foundation import arguments
 from ..foundation.digits import apart
 from .low_pass import FrequencyResponse, frequency_response
 
-REGIMES = ("sliding", "kick", "limit cycle")
-SAMPLINGS = ("points", "averages")
 # Quantities of a channel, in the order of their derivatives by time; and how a channel's name may begin.
 QUANTITIES = ("displacement", "velocity", "acceleration")
-SHORT = {"d": "displacement", "v": "velocity", "a": "acceleration"}
 # Time stamps are often rounded to few digits; steps that differ by more than this share of a step are uneven.
 UNEVEN = 0.05
 SHORTEST = 16
@@ -112,8 +109,10 @@ class Recording(eqx.Module):
         detached: tuple[float, float] | None = None,
         **known,
     ):
-        arguments.one_of("regime", regime, REGIMES)
-        arguments.one_of("sampling", sampling, SAMPLINGS)
+        regimes = ("sliding", "kick", "limit cycle")
+        arguments.one_of("regime", regime, regimes)
+        samplings = ("points", "averages")
+        arguments.one_of("sampling", sampling, samplings)
         if not isinstance(signals, Mapping) or not signals:
             raise TypeError(
                 f"Argument `signals` must map channels to arrays, such as {{'acceleration 0': a}}, but is "
@@ -198,7 +197,8 @@ def channel(name) -> Channel:
             f"A channel must read `acceleration i`, `velocity i` or `displacement i` with the coordinate's number, such as "
             f"`acceleration 0`, but reads {str(name)!r}."
         )
-    return Channel(SHORT[match[1][0].lower()], int(match[2]))
+    short = {"d": "displacement", "v": "velocity", "a": "acceleration"}
+    return Channel(short[match[1][0].lower()], int(match[2]))
 
 
 def _signal(name: str, values) -> np.ndarray:

@@ -21,7 +21,6 @@ from .reading_limits import COPIES, PACKED, SMALL, check_declared, free_memory, 
 # so many bytes in one; how long it may take by the clock, s, beside four times as long, because others use the machine. A small
 # file is then done with within eight seconds of the start of the process, which a slow disk delays, but no file.
 BESIDE, SECONDS, PATIENCE, START = 2**28, 3, 4, 60
-RATES = {"netcdf": 10_000_000, "matlab": 10_000_000, "output4": 500_000}
 
 
 def parts_of(path: Path, what: str, kind: str) -> Iterator[tuple[dict, np.ndarray | None]]:
@@ -72,7 +71,8 @@ def _reading(path: Path, what: str, length: int) -> Iterator[IO[bytes]]:
     free = free_memory()
     memory = COPIES * max(SMALL, PACKED * length)
     memory = BESIDE + (memory if free is None else min(memory, free))
-    needed = math.ceil(length / RATES[what])
+    rates = {"netcdf": 10_000_000, "matlab": 10_000_000, "output4": 500_000}
+    needed = math.ceil(length / rates[what])
     command = [
         sys.executable,
         "-P",

@@ -12,7 +12,6 @@ from ..model.sparse_structure import SparseStructure
 from ..model.structure_checks import check_matrices
 from .file_matrix import FileMatrix, Label
 from .matrix_files import FileMatrices, read_matrices
-from .model_units import SYSTEMS, in_si
 from .node_contacts import NodeContact, contact_directions, load_direction, read_contacts
 
 # Common names of the matrices in files that hold several, in capitals.
@@ -281,3 +280,26 @@ def _in_order(parts: dict[str, FileMatrix], order: Sequence, keys: Callable) -> 
             (entries.data, (place[entries.row], place[entries.col])), shape=(len(places), len(places))
         )
     return found
+
+
+# The units of length in m, of mass in kg and of time in s; force and pressure (in the comments) follow.
+SYSTEMS = {
+    "SI": (1.0, 1.0, 1.0),  # N
+    "mm-t-s": (1e-3, 1e3, 1.0),  # N, MPa
+    "mm-kg-ms": (1e-3, 1.0, 1e-3),  # kN, GPa
+    "mm-g-ms": (1e-3, 1e-3, 1e-3),  # N, MPa
+    "mm-kg-s": (1e-3, 1.0, 1.0),  # mN, kPa
+    "in-lbf-s": (0.0254, 175.12683524647636, 1.0),  # lbf, psi; mass in lbf·s²/in
+}
+
+
+def in_si(matrices: dict[str, sparse.csr_array], directions: np.ndarray, units: str) -> dict[str, sparse.csr_array]:
+    """Mass, damping and stiffness in SI units: displacements in directions 1 to 3 in metres, all others unchanged."""
+    length, mass, time = SYSTEMS[units]
+    # A quadratic form of displacements is an energy; a displacement in m is that in the file's units times their length.
+    energy = mass * (length / time) ** 2
+    scale = sparse.diags_array(np.where((directions >= 1) & (directions <= 3), 1 / length, 1.0))
+    powers = {"stiffness": 0, "damping": 1, "mass": 2}
+    return {
+        name: (energy * time ** powers[name] * (scale @ matrix @ scale)).tocsr() for name, matrix in matrices.items()
+    }

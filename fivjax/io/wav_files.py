@@ -12,8 +12,6 @@ from .reading_limits import check_length, unreadable
 
 KIND = "WAV"
 PCM, FLOAT, EXTENSIBLE = 1, 3, 0xFFFE
-# A length that stands for "to the end of the file", or, in RF64, for one that the chunk `ds64` holds.
-UNKNOWN = 0xFFFFFFFF
 
 
 def read_wav(path: Path) -> tuple[float, np.ndarray]:
@@ -34,9 +32,11 @@ def read_wav(path: Path) -> tuple[float, np.ndarray]:
 
     form = data = long_data = None
     at = 12
+    # A length that stands for "to the end of the file", or, in RF64, for one that the chunk `ds64` holds.
+    unknown = 0xFFFFFFFF
     while data is None and at < len(content):
         name, size, begin = content[at : at + 4], number(at + 4, 4), at + 8
-        if name == b"data" and size == UNKNOWN:
+        if name == b"data" and size == unknown:
             size = len(content) - begin if long_data is None else long_data
         if begin + size > len(content):
             raise unreadable(

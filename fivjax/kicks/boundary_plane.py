@@ -16,7 +16,7 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..io.datasets import labelled
-from ..maps.states import verdicts_from
+from ..maps.basin_map import verdicts_from
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state

@@ -13,10 +13,12 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
-from ..maps.crossing import NO_KICK, Crossing, first_crossings, with_ends
+from ..maps.crossing import NO_KICK, FirstCrossing, first_crossings, with_ends
 from ..maps.datasets import time_limit
-from ..maps.engine import run_to_verdict
+from ..maps.engine import Means, run_to_verdict
 from ..maps.executors import with_workers
+from ..maps.groups import Limits
+from ..maps.plan import Listed
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
@@ -131,10 +133,13 @@ def critical_perturbation(
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)
     }
 
-    # Attractors of the rows, which are the same in the scan and in all later runs.
-    run = functools.partial(
-        run_to_verdict, scene, t_max=t_max, memory=memory, progress=progress, attractors={}, executor=executor
-    )
+    known: dict = {}  # attractors of the rows, which are the same in the scan and in all later runs
+
+    def run(values, method, label: str, limits: Limits | None = None):
+        limits = Limits(t_max) if limits is None else limits
+        means = Means(label, memory, progress, executor)
+        return run_to_verdict(scene, Listed(values), method, limits, means, attractors=known)
+
     scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)
@@ -191,9 +196,8 @@ def _energies_of_the_kick(run, method, scene: Scene, columns: dict[str, np.ndarr
         outcome = run(
             values={name: column[known] for name, column in columns.items()},
             method=method,
-            t_max=float(np.max(start + duration)),
+            limits=Limits(float(np.max(start + duration)), energy=True),
             label="energy",
-            energy=True,
         )
         energies["critical_energy"][known] = outcome.energy["kick_energy"]
         energies["kick_work"][known] = outcome.energy["kick_work"]
@@ -207,7 +211,7 @@ def _verdicts(run, method, columns: dict[str, np.ndarray], p: np.ndarray, label:
     return found.verdict.reshape(p.shape)
 
 
-def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> tuple[np.ndarray, np.ndarray]:
+def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> tuple[np.ndarray, np.ndarray]:
     """The brackets (rows, 2) to be narrowed, and the verdicts of the scan at their ends. If already the first kick leads to a
     limit cycle, the bracket is the first step.
     """
@@ -217,7 +221,7 @@ def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> tuple[
     return brackets, np.where(from_the_start[:, None], verdicts[:, :2], ends)
 
 
-def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> np.ndarray:
+def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> np.ndarray:
     """Whether undecided kicks outside the bracket might hide another change."""
     inside = (scan > seen.low[:, None]) & (scan < seen.high[:, None])
     return np.any((verdicts < 0) & ~inside & (scan != NO_KICK), axis=1)
@@ -225,7 +229,7 @@ def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: Crossing) -> np.ndarra
 
 def _narrowed(
     run, method, columns: dict[str, np.ndarray], brackets: np.ndarray, at_ends: np.ndarray, tolerance: float
-) -> tuple[Crossing, np.ndarray]:
+) -> tuple[FirstCrossing, np.ndarray]:
     """The crossings inside brackets, narrowed to the tolerance or to where undecided trajectories stop the narrowing.
 
     The first ends of each bracket are run again, so that both ends of the returned crossing are verdicts of trajectories from
@@ -233,7 +237,7 @@ def _narrowed(
     the same kick one is false, so no crossing is stated there.
     """
     nothing = np.full(len(brackets), np.nan)
-    found = Crossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))
+    found = FirstCrossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))
     contradicted = np.zeros(len(brackets), bool)
     brackets = brackets.copy()
     open_ = np.flatnonzero(np.isfinite(brackets).all(axis=1))

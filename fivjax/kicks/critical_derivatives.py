@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..maps.crossing import Crossing
+from ..maps.crossing import FirstCrossing
 from ..model.scene import Scene
 from ..verdicts.verdict import Verdict
 from .stable_manifold import Critical, critical_kick
@@ -26,8 +26,8 @@ def differentiable(scene: Scene) -> tuple[str, ...]:
 
 
 def with_derivatives(
-    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: Crossing
-) -> tuple[Crossing, dict[str, np.ndarray]]:
+    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: FirstCrossing
+) -> tuple[FirstCrossing, dict[str, np.ndarray]]:
     """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
 
     `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p.

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..attractors.known import Attractors
-from ..maps.crossing import Crossing, first_crossings, with_ends
-from ..maps.states import verdicts_from
+from ..attractors.catalogue import Attractors
+from ..maps.basin_map import verdicts_from
+from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..model.scene import Scene
 from .perturbations import Histories, InitialStates, Perturbation, Vectors
 from .stable_manifold import Saddle, manifold_normal
@@ -103,7 +103,7 @@ class _Rays:
         self.trajectories += len(u)
         return verdicts_from(self.scene, self.kind.states(u) + self.rest, "states", self.attractors)
 
-    def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> Crossing:
+    def first(self, shapes: Vectors, sizes: np.ndarray, width: float) -> FirstCrossing:
         """The first crossing along each ray among `sizes` (rays, sizes), narrowed down to the relative width `width`."""
         found = first_crossings(sizes, self._along(shapes, sizes))
         while True:

@@ -1,4 +1,9 @@
-"""The linear theory of steady sliding: modes, critical friction, charts, sensitivities, design."""
+"""The linear theory of steady sliding: eigenvalues, critical friction, what moves it, charts, design.
+
+Read first: `linearisation`, the matrices about steady sliding; `spectrum` and `critical`, modes and where they become
+unstable. `cea` and `design` are the public names. Large sparse models are in `pencil` and `mode_search`, proofs by
+polynomials in `routh_hurwitz`, derivatives in `sensitivities` and `gradients`.
+"""
 
 import lazy_loader
 

@@ -22,9 +22,6 @@ from .system import with_axes
 if TYPE_CHECKING:
     import xarray as xr
 
-# Points that are computed together, by polynomials and by eigenvalues: the latter need a matrix for each.
-POINTS_AT_ONCE, POINTS_WITH_MATRICES = 8192, 64
-
 
 @in_double_precision
 def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr.Dataset":
@@ -62,7 +59,9 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     columns = [values.ravel() for values in grid]
     points = columns[0].size
     expanded = scene.structure.size - 1 <= LARGEST_EXPANDED
-    batch = min(POINTS_AT_ONCE if expanded else POINTS_WITH_MATRICES, points)
+    # Points that are computed together, by polynomials and by eigenvalues: the latter need a matrix for each.
+    points_at_once, points_with_matrices = 8192, 64
+    batch = min(points_at_once if expanded else points_with_matrices, points)
     padding = -points % batch
     columns = [np.concatenate([c, np.repeat(c[-1:], padding)]).reshape(-1, batch) for c in columns]
     results = _chart(scene, tuple(axes), [real(c) for c in columns])

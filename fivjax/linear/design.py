@@ -5,7 +5,7 @@ The search for a critical friction by gradient, `search_critical_friction`, can 
 
 import enum
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -101,15 +101,13 @@ def raise_critical_friction(
     def quantity(candidate):
         return critical_friction(candidate, direction=direction)
 
-    def loss(limit):
-        return -limit if target is None else -jnp.minimum(limit, target)
-
     start = float(quantity(structure))
     if not np.isfinite(start) or start == 0:
         raise ValueError(
             f"There is no critical friction to raise: the structure is {'never' if start else 'always'} unstable."
         )
-    return _designed(structure, bounds, tied or {}, loss, quantity, "critical friction", target, True, steps, rate)
+    goal = _Goal("critical friction", quantity, target, larger_is_better=True)
+    return _design(structure, bounds, tied or {}, goal, steps, rate)
 
 
 @in_double_precision
@@ -142,16 +140,30 @@ def lower_growth_rate(
         values = real(frictions)
         return jnp.max(jax.vmap(lambda value: growth_rate(candidate, value, direction=direction))(values))
 
-    def loss(worst):
-        return worst if target is None else jnp.maximum(worst, target)
-
-    return _designed(structure, bounds, tied or {}, loss, quantity, "worst growth rate", target, False, steps, rate)
+    goal = _Goal("worst growth rate", quantity, target, larger_is_better=False)
+    return _design(structure, bounds, tied or {}, goal, steps, rate)
 
 
-def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_better, steps, rate) -> Design:
+class _Goal(NamedTuple):
+    """The quantity of a structure that a design changes, and the value that it shall reach."""
+
+    name: str
+    quantity: Callable
+    target: float | None
+    larger_is_better: bool
+
+    def loss(self, value):
+        """What is minimised: constant beyond the target."""
+        if self.larger_is_better:
+            return -value if self.target is None else -jnp.minimum(value, self.target)
+        return value if self.target is None else jnp.maximum(value, self.target)
+
+
+def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: float) -> Design:
     import optax
     import xarray as xr
 
+    name, quantity, target, larger_is_better = goal
     bounds, low, width = _checked_bounds(structure, bounds, tied)
     names = list(bounds)
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
@@ -163,7 +175,7 @@ def _designed(structure, bounds, tied, loss, quantity, name, target, larger_is_b
 
     def judged(shares):
         reached = quantity(structure.replace(**values(shares)))
-        return loss(reached), reached
+        return goal.loss(reached), reached
 
     optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps, 0.01))
 

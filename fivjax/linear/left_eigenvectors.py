@@ -12,12 +12,6 @@ from ..foundation import arguments
 from .mode_search import ComplexModes
 from .pencil import Pencil
 
-# The matrix is factorised at this relative distance from the eigenvalue: near enough for convergence in two steps, far enough
-# not to be singular.
-APART = 1e-8
-# Left and right eigenvectors that are this nearly orthogonal belong to equal eigenvalues, up to rounding.
-RIGHT_ANGLE = 1e-6
-
 
 def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], which=None) -> dict[str, np.ndarray]:
     """dλ/dp of modes by each parameter, from the derivatives of the matrices.
@@ -47,12 +41,14 @@ def eigenvalue_derivatives(modes: ComplexModes, changes: Mapping[str, Pencil], w
             )
     which = np.arange(modes.eigenvalues.size) if which is None else np.atleast_1d(which)
     found = {name: np.full(which.size, np.nan, complex) for name in changes}
+    # Left and right eigenvectors that are this nearly orthogonal belong to equal eigenvalues, up to rounding.
+    right_angle = 1e-6
     for k, place in enumerate(which):
         value = modes.eigenvalues[place]
         right, left = eigenvectors(modes.pencil, value)
         slope = left.conj() @ (modes.pencil.slope(value) @ right)
         size = np.linalg.norm(left) * np.linalg.norm(modes.pencil.slope(value) @ right)
-        if abs(slope) < RIGHT_ANGLE * size:
+        if abs(slope) < right_angle * size:
             continue
         for name, change in changes.items():
             found[name][k] = -(left.conj() @ (change.at(value) @ right)) / slope
@@ -65,7 +61,10 @@ def eigenvectors(pencil: Pencil, value: complex) -> tuple[np.ndarray, np.ndarray
 
     # Rigid-body motions, at zero, have no size of their own; that of the other eigenvalues is a measure.
     size = abs(value) or np.sqrt(abs(pencil.stiffness).sum() / abs(pencil.mass).sum())
-    factors = splu(pencil.at(value + APART * size), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
+    # The matrix is factorised at this relative distance from the eigenvalue: near enough for convergence in two steps, far
+    # enough not to be singular.
+    apart = 1e-8
+    factors = splu(pencil.at(value + apart * size), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
     found = []
     for transposition in ("N", "H"):
         vector = np.random.default_rng(0).standard_normal(pencil.size) + 0j

@@ -38,10 +38,6 @@ class Coalescence(eqx.Module):
         return f"two modes {meet} at μ = {self.mu:.8g}, {self.frequency:.6g} Hz, growth rate {self.growth_rate:.4g} 1/s"
 
 
-# Damping is increased from zero in this many steps, with this many Newton iterations at each.
-HOMOTOPY_STEPS, NEWTON_STEPS = 20, 4
-
-
 @kept
 def _coalescence(structure, direction):
     undamped = eqx.tree_at(lambda s: s.damping, structure, jnp.zeros_like(structure.damping))
@@ -49,8 +45,11 @@ def _coalescence(structure, direction):
     limit = first_limit(loop)
     full, _ = friction_loop(structure, direction)
 
+    # Damping is increased from zero in this many steps, with this many Newton iterations at each.
+    homotopy_steps, newton_steps = 20, 4
+
     def step(i, s):
-        share = (i // NEWTON_STEPS + 1) / HOMOTOPY_STEPS
+        share = (i // newton_steps + 1) / homotopy_steps
         partly = eqx.tree_at(
             lambda x: (x.damping, x.row_damping), full, (share * full.damping, share * full.row_damping)
         )
@@ -58,7 +57,7 @@ def _coalescence(structure, direction):
         return s - slope / curvature
 
     start = jax.lax.complex(jnp.zeros_like(limit.omega), limit.omega)
-    s = jax.lax.fori_loop(0, HOMOTOPY_STEPS * NEWTON_STEPS, step, start)
+    s = jax.lax.fori_loop(0, homotopy_steps * newton_steps, step, start)
     found = limit.code == COALESCENCE
     kept = found & jnp.isfinite(s) & (jnp.abs(s - start) < 0.5 * jnp.abs(start))
     return limit.gain, limit.omega * scale, 1 / full(s), s * scale, found, kept

@@ -28,13 +28,6 @@ AT_ONCE = 24
 MOST_SHIFTS = 40
 # Half the width of the strip of growth rates that is searched, as a share of a disc's radius.
 STRIP = 0.5
-# How far a shift lies off the imaginary axis, as a share of half the part of the band that it is for.
-BESIDE = 1e-3
-# Eigenvalues this near to the real axis, relative to the shift, are found again in real arithmetic; rounding moves even double
-# ones by less.
-NEAR_REAL = 1e-4
-# Real and imaginary parts of states that depend on each other up to this share are one; the rest is rounding.
-DEPENDENT = 1e-9
 # What is left of a sum of terms by rounding, as a share of the largest.
 ROUNDING = 64 * np.finfo(float).eps
 
@@ -209,6 +202,8 @@ def _unit(mass: np.ndarray, stiffness: np.ndarray) -> float:
 
 def _in_band(pencil: Pencil, band: float):
     found, gaps, strip, shifts = [], [(0.0, band)], np.inf, 0
+    # How far a shift lies off the imaginary axis, as a share of half the part of the band that it is for.
+    off_the_axis = 1e-3
     while gaps:
         low, high = gaps.pop()
         shifts += 1
@@ -219,7 +214,7 @@ def _in_band(pencil: Pencil, band: float):
             )
         middle, half = (low + high) / 2, (high - low) / 2
         # Not on the imaginary axis, where an undamped mode may lie, but on the side of the unstable modes.
-        beside = BESIDE * half
+        beside = off_the_axis * half
         shift = complex(beside, middle)
         values, shapes = near(pencil, shift, AT_ONCE)
         radius = np.max(np.abs(values - shift)) if values.size < 2 * pencil.size else np.inf
@@ -268,7 +263,10 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
     values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)  # pyright: ignore[reportAssignmentType]
     values = shift + unit / values
-    close = np.abs(values.imag) <= NEAR_REAL * unit
+    # Eigenvalues this near to the real axis, relative to the shift, are found again in real arithmetic; rounding moves even
+    # double ones by less.
+    near_real = 1e-4
+    close = np.abs(values.imag) <= near_real * unit
     if np.any(close):
         again, anew = _near_the_real_axis(inverted, shift, states[:, close])
         again = _without_rounding(pencil, again, anew[:n])
@@ -283,7 +281,9 @@ def _near_the_real_axis(inverted, shift: complex, states: np.ndarray) -> tuple[n
     space that the operator maps into itself, and in a real basis of it the problem is a small one with a real matrix.
     """
     columns, sizes, _ = np.linalg.svd(np.hstack([states.real, states.imag]), full_matrices=False)
-    basis = columns[:, sizes > DEPENDENT * sizes[0]]
+    # Real and imaginary parts of states that depend on each other up to this share are one; the rest is rounding.
+    dependent = 1e-9
+    basis = columns[:, sizes > dependent * sizes[0]]
     images = np.stack([inverted(column) for column in basis.T], axis=1)
     small = basis.T @ images  # ω(L - s)⁻¹ of the real matrix L that is sought
     found, shapes = np.linalg.eig((shift * np.eye(len(small)) + abs(shift) * np.linalg.inv(small)).real)

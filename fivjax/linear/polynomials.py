@@ -5,9 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-# Simple roots need some fifteen iterations; at a double root each iteration at least triples the precision.
-ITERATIONS = 60
-
 
 def determinant(rows) -> tuple[list, list[list]]:
     """Determinant and leading principal minors of a matrix of polynomials, by expansion along its rows.
@@ -73,9 +70,12 @@ def polynomial_roots(coefficients) -> Complex[Array, "n ..."]:
     finite = jnp.isfinite(sum(coefficients))
     coefficients = [jnp.where(finite, c, 0.0) for c in coefficients]
 
+    # Simple roots need some fifteen iterations; at a double root each iteration at least triples the precision.
+    iterations = 60
+
     def unsettled(carry):
         iteration, _, change = carry
-        return (iteration < ITERATIONS) & (jnp.max(change, initial=0.0) > 1e-26)
+        return (iteration < iterations) & (jnp.max(change, initial=0.0) > 1e-26)
 
     def improved(carry):
         iteration, roots, _ = carry

@@ -27,8 +27,6 @@ from .system import check_direction
 
 # Up to this number of coordinates the determinant is expanded (2ᵐ minors); larger ones are left to matrix routines.
 LARGEST_EXPANDED = 4
-# The bialternate sum has N(N-1)/2 rows for N eigenvalues.
-LARGEST_SIZE = 32
 
 
 def hurwitz_determinants(coefficients) -> list[Float[Array, ""]]:
@@ -73,9 +71,11 @@ def margin(structure: Structure, mu, *, direction: int = 1) -> Float[Array, ""]:
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     arguments.real_number("mu", mu, minimum=0)
     check_direction(direction)
-    if structure.size > LARGEST_SIZE:
+    # The bialternate sum has N(N-1)/2 rows for N eigenvalues.
+    largest_size = 32
+    if structure.size > largest_size:
         raise ValueError(
-            f"Argument `structure` must have at most {LARGEST_SIZE} coordinates here, but has {structure.size}. Use "
+            f"Argument `structure` must have at most {largest_size} coordinates here, but has {structure.size}. Use "
             f"`cea.growth_rate`, which has no such limit."
         )
     return _margin(in_contact_coordinates(structure), real(mu), real(direction))

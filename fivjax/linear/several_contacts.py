@@ -24,11 +24,6 @@ from .gradients import significant_growth
 from .linearisation import linear_sliding, state_matrix
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
 
-# The largest coefficient that is tried, larger than those of any common surfaces, and the number of coefficients tried.
-LARGEST, LOOKS = 2.0, 400
-# Halvings of the distance between two coefficients: to the last digit.
-HALVINGS = 50
-
 
 def one_contact(structure: Structure) -> bool:
     """Whether there is one contact, at two coordinates, for which there are better methods than for several."""
@@ -97,8 +92,10 @@ def _time_scale(structure: Structure) -> Float[Array, ""]:
 
 
 def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
-    """Friction, frequency (rad/s) and code of the first limit up to `LARGEST`; infinite friction where there is none."""
-    looks = jnp.linspace(0.0, LARGEST, LOOKS + 1)
+    """Friction, frequency (rad/s) and code of the first limit up to 2; infinite friction where there is none."""
+    # The largest coefficient that is tried, larger than those of any common surfaces, and the number of coefficients tried.
+    largest, count = 2.0, 400
+    looks = jnp.linspace(0.0, largest, count + 1)
     unstable = jax.lax.map(lambda mu: _growth(structure, mu, direction) > 0, looks, batch_size=50)
     place = jnp.argmax(unstable)
     found, always = jnp.any(unstable), unstable[0] | unstable[1] & _nearly_at_zero(structure, direction)
@@ -110,7 +107,9 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
         return jnp.where(above, low, middle), jnp.where(above, middle, high)
 
     ends = (looks[jnp.maximum(place - 1, 0)], looks[place])
-    low, high = jax.lax.fori_loop(0, HALVINGS, halved, ends)
+    # Halvings of the distance between two coefficients: to the last digit.
+    halvings = 50
+    low, high = jax.lax.fori_loop(0, halvings, halved, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
     values = eigenvalues(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
     omega = jnp.abs(values[jnp.argmax(values.real)].imag)

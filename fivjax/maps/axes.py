@@ -13,9 +13,6 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from .results import by_name, not_run
 
-# The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
-MOST_TRAJECTORIES = 10**8
-
 
 def linear_limit(scene: Scene, axes: Mapping[str, np.ndarray]) -> dict[str, float]:
     """The critical friction of linear theory, as an attribute: where friction is an axis and nothing else changes it."""
@@ -49,12 +46,14 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
     """
     counts = {name: (_count(values) - 1) * 2**halvings + 1 for name, values in axes.items()}
     total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
-    if total <= MOST_TRAJECTORIES and total * each <= _memory():
+    # The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
+    most_trajectories = 10**8
+    if total <= most_trajectories and total * each <= _memory():
         return
     listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())
     raise ValueError(
         f"The axes ask for {total:,} trajectories ({listed}), whose results alone take {total * each:,} bytes. The most is "
-        f"{MOST_TRAJECTORIES:,} trajectories, and what the memory of this machine holds. Give fewer values, or make several "
+        f"{most_trajectories:,} trajectories, and what the memory of this machine holds. Give fewer values, or make several "
         f"maps."
     )
 

@@ -5,24 +5,46 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from jaxtyping import Float, Int
 
+from ..attractors.catalogue import Attractors
 from ..cycles.cycle import under_final_load
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..model.scene import Scene, sliding_equilibrium
 from ..model.sliding import contact_coordinates
+from ..model.structure import Structure
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .axes import check_run, check_size, checked_axes, linear_limit
-from .datasets import map_dataset
-from .engine import run_to_verdict
+from .datasets import map_dataset, wilson
+from .engine import Means, run_to_verdict
 from .executors import with_workers
+from .groups import Limits
+from .plan import Grid, Listed
 from .resuming import keeper_at
-from .shares import wilson
-from .states import state_places
-from .trajectories import Grid
+
+
+def state_places(structure: Structure) -> dict[str, int]:
+    """The index in the state of each displacement and, with a `d` in front of its name, of each velocity."""
+    names = structure.coordinates
+    return {name: k for k, name in enumerate([*names, *(f"d{name}" for name in names)])}
+
+
+def verdicts_from(
+    scene: Scene, states: Float[np.ndarray, "k 2n"], label: str, attractors: dict[bytes, Attractors] | None = None
+) -> Int[np.ndarray, " k"]:
+    """The verdicts on motions that start in these states (displacements in m, velocities in m/s) under the final load.
+
+    `attractors` as in `run_to_verdict`.
+    """
+    places = state_places(scene.structure)
+    values = {name: np.ascontiguousarray(states[:, place]) for name, place in places.items()}
+    scene, means = under_final_load(scene), Means(label, progress=False)
+    listed = Listed(values, places)
+    return run_to_verdict(scene, listed, EventExact(), Limits(30.0), means, attractors=attractors).verdict
 
 
 @in_own_coordinates
@@ -51,7 +73,7 @@ def basins(
       velocities (m/s) by these names with a `d` in front; and any parameters of the scene, as in `bistability_map`.
       Displacements are totals, as in `y0` of `simulate`, not deviations from sliding.
     - `kick`: whether the load goes through its kick; else it has its final value from the start.
-    - `method`, `t_max`, `memory`, `progress`, `executor`, `resume`: as in `bistability_map`.
+    - `method`, `t_max`, `memory`, `one_trajectory`, `executor`, `resume`: as in `bistability_map`.
 
     **Returns:** a dataset like that of `bistability_map`, with `verdict`, `amplitude` and `attractor` over the axes and the
     table of attractors. Over the attractors there is also `share`, the share of states that lead there, with `share_low` and
@@ -82,21 +104,12 @@ def basins(
     check_size(axes)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
-    grid = Grid(axes, tuple(states))
+    grid = Grid(axes, states)
     _check_gap(scene, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         verdicts = run_to_verdict(
-            scene,
-            grid,
-            method,
-            t_max=t_max,
-            memory=memory,
-            progress=progress,
-            label="basins",
-            states=states,
-            executor=executor,
-            keeper=keeper,
+            scene, grid, method, Limits(t_max), Means("basins", memory, progress, executor, keeper)
         )
     dataset = map_dataset(scene, method, t_max, grid, verdicts, linear_limit(scene, axes))
     for name, place in states.items():

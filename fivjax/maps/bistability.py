@@ -1,7 +1,6 @@
 """Bi-stability maps: the verdicts of many trajectories over any parameters, as a labelled dataset."""
 
 import contextlib
-import functools
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,12 +15,13 @@ from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset
-from .engine import MOST_STEPS, run_to_verdict
+from .engine import Means, run_to_verdict
 from .executors import with_workers
-from .refinement import audit_note, finer, refined
+from .groups import Limits
+from .plan import Grid
+from .refinement import finer_axis, refine_grid
 from .results import Verdicts
 from .resuming import keeper_at
-from .trajectories import Grid
 
 
 @in_own_coordinates
@@ -33,7 +33,7 @@ def bistability_map(
     method: AbstractStepper | None = None,
     t_max: float | None = None,
     memory: float = 2e9,
-    max_steps: int = MOST_STEPS,
+    max_steps: int = Limits().max_steps,
     progress: bool | None = None,
     resume: str | Path | None = None,
     energy: bool = False,
@@ -59,7 +59,7 @@ def bistability_map(
       stepped through.
     - `memory`: the memory that all jobs running at a time in this process may take, in bytes; at least one job always runs.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
-    - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.
+    - `one_trajectory`: whether to show a progress bar; unless given, in terminals and notebooks.
     - `resume`: a file in which finished jobs are kept while the map runs, every few seconds; or a folder named `*.zarr`, for
       maps of many million trajectories, in which each job is kept at once and which `xarray.open_zarr` reads at any time (extra
       `fivjax[zarr]`). If it exists, the map goes on from there: after any interruption the same call, on this machine or
@@ -113,42 +113,28 @@ def bistability_map(
     arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
     check_size(axes, refine, bool(energy))
-    axes = {name: finer(values, refine) for name, values in checked_axes(scene, axes).items()}
+    axes = {name: finer_axis(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = Grid(axes)
-    limits = {"t_max": t_max, "max_steps": int(max_steps), "energy": bool(energy)}
-    limits |= {"refine": int(refine), "audit": float(audit)} if refine else {}
-    keeper = keeper_at(resume, scene, method, grid, limits, bool(energy))
-    run = functools.partial(
-        run_to_verdict,
-        scene,
-        grid,
-        method,
-        t_max=t_max,
-        memory=memory,
-        max_steps=max_steps,
-        progress=progress,
-        energy=bool(energy),
-        executor=executor,
-        keeper=keeper,
-    )
+    limits = Limits(t_max, int(max_steps), bool(energy))
+    refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
+    keeper = keeper_at(resume, scene, method, grid, limits._asdict() | refinement, limits.energy)
+    means = Means("map", memory, progress, executor, keeper)
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         # Compiled and computed while trajectories are followed.
         aside = ThreadPoolExecutor(1)
         limit = aside.submit(linear_limit, scene, axes)
         aside.shutdown(wait=False)
         if not refine:
-            verdicts = run(label="map")
+            verdicts = run_to_verdict(scene, grid, method, limits, means)
             return map_dataset(scene, method, t_max, grid, verdicts, _known_by_now(limit, verdicts))
         found: dict = {}  # attractors, which finer levels need not find again
 
         def level(places: np.ndarray, what: str) -> Verdicts:
-            return run(label=f"map, {what}", places=places, attractors=found)
+            return run_to_verdict(scene, grid, method, limits, means._replace(label=f"map, {what}"), places, found)
 
-        cells = refined(grid.shape, refine, audit, level)
+        cells = refine_grid(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
-    dataset = map_dataset(scene, method, t_max, grid, cells.verdicts, _known_by_now(limit, cells.verdicts), cells)
-    dataset.attrs.update(audit_note(cells.audit))
-    return dataset
+    return map_dataset(scene, method, t_max, grid, cells.verdicts, _known_by_now(limit, cells.verdicts), cells)
 
 
 def _known_by_now(limit: Future, verdicts: Verdicts) -> dict[str, float]:

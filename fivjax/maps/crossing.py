@@ -10,7 +10,7 @@ from ..verdicts.verdict import Verdict
 NO_KICK = 1.0
 
 
-class Crossing(NamedTuple):
+class FirstCrossing(NamedTuple):
     """The first change from sliding to limit cycle in each row of verdicts; arrays over rows, NaN where there is none."""
 
     low: np.ndarray  # largest kick proved to slide below it
@@ -29,7 +29,7 @@ def with_ends(inner: np.ndarray) -> np.ndarray:
     return np.concatenate([ends[:, :1], inner, ends[:, 1:]], axis=1)
 
 
-def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> Crossing:
+def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> FirstCrossing:
     """The first crossing of each row of `verdicts` (rows, kicks) at `kicks` (one row for all, or one for each).
 
     If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle. The same holds if only an
@@ -55,4 +55,4 @@ def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> Crossing:
             below, above = decided[upward[0]], decided[upward[0] + 1]
             low[row], high[row] = p[below], p[above]
             middle[row] = 0.5 * (low[row] + high[row]) if above == below + 1 else np.nan
-    return Crossing(low, high, middle, changes)
+    return FirstCrossing(low, high, middle, changes)

@@ -1,37 +1,31 @@
 """Many trajectories, each followed until its verdict is known: jobs, executors, progress, and results kept on disk.
 
-A trajectory (`progress`, `conclusion`) belongs to a group that shares its mechanics (`sharing`); several groups make a job
-(`plan`, `jobs`), whose trajectories are followed in blocks of one size, round by round (`rounds`).
+A trajectory (`one_trajectory`) belongs to a group that shares its mechanics (`groups`); several groups make a job (`plan`),
+whose trajectories are followed in blocks of one size, round by round (`jobs`).
 """
 
 import contextvars
 import functools
 import threading
 import warnings
-from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
 
-from ..attractors.known import Attractors
+from ..attractors.catalogue import Attractors
 from ..foundation.blocks import workers as cores
 from ..foundation.progress import Work, following
 from ..foundation.stopping import stop_requests, waited_for
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..verdicts.verdict import Verdict
-from .executors import Workers
-from .groups import grouped
-from .handing_out import hand_out
+from .executors import Workers, hand_out
+from .groups import Limits, groups_of
 from .jobs import Done, Job, run_job
-from .plan import Plan, planned
-from .results import Verdicts, counted, not_run
-from .trajectories import Places
-
-# The most steps of a trajectory: enough for 10⁵ cycles with their events; a map of such trajectories takes hours.
-MOST_STEPS = 2**21
+from .plan import Grid, Listed, Places, Plan, plan_of
+from .results import Verdicts, count_of, not_run
 
 
 class Keeper(Protocol):
@@ -39,7 +33,7 @@ class Keeper(Protocol):
 
     found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
 
-    def recalled(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Places | None) -> Verdicts:
         """The results of an earlier run of these trajectories (all, unless given), in their order."""
         ...
 
@@ -56,65 +50,50 @@ class Keeper(Protocol):
         ...
 
 
+class Means(NamedTuple):
+    """How a run is carried out: its results do not depend on this."""
+
+    label: str  # of its progress bar
+    memory: float = 2e9  # that the jobs may take which run at a time in this process, bytes
+    progress: bool | None = None  # whether there is a bar; unless given, in terminals and notebooks
+    executor: Workers | None = None  # runs the jobs; unless given, threads of this process do
+    # Gets the results of each job, and has those of an earlier run. A job with any missing result is run as a whole.
+    keeper: Keeper | None = None
+
+
 def run_to_verdict(
     scene: Scene,
-    values: Mapping[str, np.ndarray],
+    trajectories: Grid | Listed,
     method: AbstractStepper,
-    *,
-    t_max: float | None,
-    memory: float,
-    max_steps: int = MOST_STEPS,
-    progress: bool | None,
-    label: str,
-    energy: bool = False,
-    states: Mapping[str, int] | None = None,
-    attractors: dict[bytes, Attractors] | None = None,
-    executor: Workers | None = None,
+    limits: Limits,
+    means: Means,
     places: Places | None = None,
-    keeper: Keeper | None = None,
+    attractors: dict[bytes, Attractors] | None = None,
 ) -> Verdicts:
-    """Follow one trajectory for each row of `values` (a `Grid`, or equally long columns by name) until its verdict. Returns the
-    results of these trajectories, in their order.
+    """Follow trajectories (all, unless their indices `places` are given, in rising order) until their verdicts are known.
+    Returns their results in their order.
 
-    - `energy`: whether to keep the energy ledger of each trajectory.
-    - `states`: names in `values` that are initial displacements or velocities instead of parameters, with their indices in the
-      state; all other coordinates begin at the sliding equilibrium.
-    - `attractors`: those found in an earlier run over the same parameters; new ones are added.
-    - `executor`: runs the jobs; unless given, threads of this process do, as many at a time as `memory` (bytes) allows.
-    - `places`: indices of the trajectories to run, in rising order; all unless given.
-    - `keeper`: gets the results of each job, and has those of an earlier run; missing ones are added. A job with any missing
-      result is run as a whole.
+    `attractors` are those found in an earlier run over the same parameters; new ones are added.
 
     Interrupted by the user, it returns the verdicts known by then (of jobs in other processes, those of finished jobs); all
     other trajectories have `Verdict.NOT_RUN`.
     """
-    plan = planned(scene, values, method, t_max=t_max, max_steps=max_steps, energy=energy, states=states, places=places)
-    total = plan.trajectories.total if places is None else len(places)
-    verdicts = not_run(total, energy) if keeper is None else keeper.recalled(places)
-
-    def rows(number: int) -> Places:
-        own = plan.jobs[number]
-        return own if places is None else np.searchsorted(places, own)
-
-    attractors = {} if attractors is None else attractors
-    at_a_time = max(1, min(cores(), int(memory // plan.memory) if plan.memory else 1))
+    plan, keeper = plan_of(scene, trajectories, method, limits, places), means.keeper
+    total = trajectories.total if places is None else len(places)
+    verdicts = not_run(total, limits.energy) if keeper is None else keeper.recall(places)
     already, unit = total - int(verdicts.pending().sum()), " trajectories"
     with (
         stop_requests() as requested,
-        following(label, shown=progress, total=total, already=already, unit=unit) as work,
+        following(means.label, shown=means.progress, total=total, already=already, unit=unit) as work,
     ):
-        ended = _Ended(work)
+        run = _Run(plan, means, verdicts, places, {} if attractors is None else attractors, _Ended(work), requested)
         try:
-            # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
-            needed_later = places is not None or bool(plan.parts[-1])
             for part in plan.parts:
-                _follow(
-                    plan, part, rows, verdicts, attractors, executor, at_a_time, keeper, needed_later, ended, requested
-                )
+                run.follow(part)
         except KeyboardInterrupt:
             left = int(verdicts.pending().sum())
             warnings.warn(
-                f"Interrupted: of {counted(total, 'trajectory')}, {left} without a verdict, "
+                f"Interrupted: of {count_of(total, 'trajectory')}, {left} without a verdict, "
                 f"labelled {Verdict.NOT_RUN.value}.",
                 stacklevel=2,
             )
@@ -124,113 +103,108 @@ def run_to_verdict(
     return verdicts
 
 
-def _follow(
-    plan: Plan,
-    part: list[int],
-    rows: Callable[[int], Places],
-    verdicts: Verdicts,
-    attractors: dict[bytes, Attractors],
-    workers: Workers | None,
-    at_a_time: int,
-    keeper: Keeper | None,
-    needed_later: bool,
-    ended: "_Ended",
-    requested: list[int],
-) -> None:
-    """Run the jobs of one part of the plan whose results are missing in the `rows` of each, and add the attractors that they
-    find.
-    """
+class _Run(NamedTuple):
+    """A run under way: its plan and means, and the results by now."""
 
-    def is_missing(number: int) -> bool:
-        lost = needed_later and keeper is not None and int(plan.jobs[number][0]) not in keeper.found
-        return lost or bool(np.any(verdicts.pending(rows(number))))
+    plan: Plan
+    means: Means
+    verdicts: Verdicts
+    places: Places | None
+    attractors: dict[bytes, Attractors]
+    ended: "_Ended"
+    requested: list[int]  # signals that ask to stop
 
-    missing = [number for number in part if is_missing(number)]
-    found: dict[int, dict[bytes, Attractors]] = {}
-    if keeper is not None and keeper.found:
-        found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
+    def rows(self, number: int) -> Places:
+        """The rows of a job's trajectories among the results."""
+        own = self.plan.jobs[number]
+        return own if self.places is None else np.searchsorted(self.places, own)
 
-    def job(number: int) -> Job:
-        values = plan.trajectories.columns(plan.jobs[number])
-        seeding = plan.trajectories.seeding(plan.jobs[number])
-        own = grouped(values, tuple(plan.task.states))[0] if attractors else np.zeros((0, seeding.shape[1]))
-        keys = {row.tobytes() for row in (*own, *np.unique(seeding, axis=0))}
-        known = {key: attractors[key] for key in keys & attractors.keys()}
-        file = (None, "") if keeper is None else keeper.job_file(plan.jobs[number])
-        return Job(plan.task, values, seeding, known, *file)
+    def job(self, number: int) -> Job:
+        own, task = self.plan.jobs[number], self.plan.task
+        values, seeding = self.plan.trajectories.columns(own), self.plan.trajectories.seeding(own)
+        groups = groups_of(values, tuple(task.states))[0] if self.attractors else np.zeros((0, seeding.shape[1]))
+        keys = {row.tobytes() for row in (*groups, *np.unique(seeding, axis=0))}
+        known = {key: self.attractors[key] for key in keys & self.attractors.keys()}
+        file = (None, "") if self.means.keeper is None else self.means.keeper.job_file(own)
+        return Job(task, values, seeding, known, *file)
 
-    def write(number: int, results: Verdicts) -> None:
-        for whole, own in zip(jax.tree.leaves(verdicts), jax.tree.leaves(results), strict=True):
-            whole[rows(number)] = own
+    def write(self, number: int, results: Verdicts) -> None:
+        for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(results), strict=True):
+            whole[self.rows(number)] = own
 
-    def done(number: int, result: Done) -> None:
-        write(number, result.verdicts)
-        found[number] = result.found
-        if keeper is not None:
-            keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else None)
-        if workers is not None:
-            ended(len(plan.jobs[number]))
-
-    def given_up(number: int) -> None:
+    def given_up(self, number: int) -> None:
         # Not kept on disk: with more memory, or on another machine, the job may succeed.
-        verdicts.verdict[rows(number)] = Verdict.WORKER_LOST
-        ended(len(plan.jobs[number]))
+        self.verdicts.verdict[self.rows(number)] = Verdict.WORKER_LOST
+        self.ended(len(self.plan.jobs[number]))
 
-    if not missing:
-        pass
-    elif workers is None:
-        _run_here(missing, job, write, done, given_up, at_a_time, ended, requested)
-    else:
-        them = workers
-        hand_out(
-            missing, lambda number: them.submit(run_job, job(number)), them, done, given_up, lambda: bool(requested)
-        )
-    for number in part:
-        for key, one in found.get(number, {}).items():
-            attractors.setdefault(key, one)
+    def follow(self, part: list[int]) -> None:
+        """Run the jobs of one part of the plan whose results are missing, and add the attractors that they find."""
+        plan, keeper, workers = self.plan, self.means.keeper, self.means.executor
+        # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
+        needed_later = self.places is not None or bool(plan.parts[-1])
 
+        def is_missing(number: int) -> bool:
+            lost = needed_later and keeper is not None and int(plan.jobs[number][0]) not in keeper.found
+            return lost or bool(np.any(self.verdicts.pending(self.rows(number))))
 
-def _run_here(
-    missing: list[int],
-    job: Callable[[int], Job],
-    write: Callable[[int, Verdicts], None],
-    done: Callable[[int, Done], None],
-    given_up: Callable[[int], None],
-    at_a_time: int,
-    ended: "_Ended",
-    requested: list[int],
-) -> None:
-    """Run jobs in threads of this process. Those that are left behind (`waited_for`) end at their next report, and change
-    nothing any more.
-    """
-    failed, over = [], []
+        missing = [number for number in part if is_missing(number)]
+        found: dict[int, dict[bytes, Attractors]] = {}
+        if keeper is not None and keeper.found:
+            found = {number: keeper.found.get(int(plan.jobs[number][0]), {}) for number in set(part) - set(missing)}
 
-    def report(count: int) -> None:
-        if not over:
-            ended(count)
-        if requested or failed:
-            raise KeyboardInterrupt
+        def done(number: int, result: Done) -> None:
+            self.write(number, result.verdicts)
+            found[number] = result.found
+            if keeper is not None:
+                keeper.keep(plan.jobs[number], result.verdicts, result.found if needed_later else None)
+            if workers is not None:
+                self.ended(len(plan.jobs[number]))
 
-    def interrupted(number: int, results: Verdicts) -> None:
-        # Results of an interrupted job are returned but not kept with the others, which are of whole jobs.
-        if not over:
-            write(number, results)
+        if missing and workers is None:
+            self._follow_here(missing, done)
+        elif missing and workers is not None:
+            self._hand_out(missing, lambda number: workers.submit(run_job, self.job(number)), workers, done)
+        for number in part:
+            for key, one in found.get(number, {}).items():
+                self.attractors.setdefault(key, one)
 
-    try:
-        with waited_for(ThreadPoolExecutor(at_a_time), ThreadPoolExecutor(cores())) as (threads, blocks):
-            mine = Workers(threads)
+    def _hand_out(self, missing: list[int], submit, workers: Workers, done) -> None:
+        hand_out(missing, submit, workers, done, self.given_up, lambda: bool(self.requested))
 
-            def here(number: int):
-                then = functools.partial(interrupted, number)
-                return mine.submit(contextvars.copy_context().run, run_job, job(number), blocks, report, then)
+    def _follow_here(self, missing: list[int], done) -> None:
+        """Run jobs in threads of this process, as many at a time as memory allows. Those that are left behind (`waited_for`)
+        end at their next report, and change nothing any more.
+        """
+        failed, over = [], []
+        most = int(self.means.memory // self.plan.memory) if self.plan.memory else 1
 
-            try:
-                hand_out(missing, here, mine, done, given_up, lambda: bool(requested))
-            except BaseException:
-                failed.append(True)
-                raise
-    finally:
-        over.append(True)
+        def report(count: int) -> None:
+            if not over:
+                self.ended(count)
+            if self.requested or failed:
+                raise KeyboardInterrupt
+
+        def interrupted(number: int, results: Verdicts) -> None:
+            # Results of an interrupted job are returned but not kept with the others, which are of whole jobs.
+            if not over:
+                self.write(number, results)
+
+        try:
+            pools = ThreadPoolExecutor(max(1, min(cores(), most))), ThreadPoolExecutor(cores())
+            with waited_for(*pools) as (threads, blocks):
+                mine = Workers(threads)
+
+                def here(number: int):
+                    then = functools.partial(interrupted, number)
+                    return mine.submit(contextvars.copy_context().run, run_job, self.job(number), blocks, report, then)
+
+                try:
+                    self._hand_out(missing, here, mine, done)
+                except BaseException:
+                    failed.append(True)
+                    raise
+        finally:
+            over.append(True)
 
 
 class _Ended:

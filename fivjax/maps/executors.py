@@ -1,4 +1,5 @@
-"""Executors of jobs: any in the manner of `concurrent.futures`, and how a new one is made when its workers die.
+"""Executors of jobs: any in the manner of `concurrent.futures`; how jobs are handed out to one, and how a new one is made when
+its workers die.
 
 An executor is
 
@@ -13,7 +14,9 @@ A broken `concurrent.futures.ProcessPoolExecutor` is made anew with the same arg
 
 import contextlib
 import functools
-from collections.abc import Callable
+import queue
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,10 +24,6 @@ from ..foundation import arguments
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-# The most jobs handed out at a time, if the number of workers is not known.
-HANDED_OUT = 512
-MOST_BREAKS = 32
 
 
 def with_workers(function: Callable[P, R]) -> Callable[P, R]:
@@ -68,7 +67,7 @@ class Workers:
     def __init__(self, executor):
         self._made_here = _makes_one(executor)
         self._make: Callable[[], Any] | None = executor if self._made_here else None
-        self._executor = _adopted(executor() if self._made_here else executor)
+        self._executor = _with_submit(executor() if self._made_here else executor)
         self._breaks, self._left_running = 0, False
 
     @property
@@ -86,7 +85,7 @@ class Workers:
         **Raises:** `RuntimeError` if a new one cannot be made, or if executors keep breaking before any job is done.
         """
         self._breaks += 1
-        if self._breaks > MOST_BREAKS:
+        if self._breaks > 32:
             raise RuntimeError(
                 f"The workers of `executor` died {self._breaks} times without one finished job. If they are started from "
                 'a script, its own work must stand below `if __name__ == "__main__":`; else look at their memory.'
@@ -95,7 +94,7 @@ class Workers:
         with contextlib.suppress(Exception):
             broken.shutdown(wait=False)
         if self._make is not None:
-            self._executor = _adopted(self._make())
+            self._executor = _with_submit(self._make())
         elif isinstance(broken, ProcessPoolExecutor) and type(broken).__module__.startswith("concurrent."):
             self._executor, self._made_here = _like(broken), True
         else:
@@ -131,7 +130,7 @@ def _makes_one(executor) -> bool:
     return isinstance(executor, type) or not (hasattr(executor, "submit") or hasattr(executor, "get_executor"))
 
 
-def _adopted(executor):
+def _with_submit(executor):
     """The object to which jobs are submitted.
 
     **Raises:** `TypeError` or `ValueError` if a function has made an object that is no executor.
@@ -186,3 +185,96 @@ def is_proof(error: BaseException) -> bool:
 
 def _kinds(error: BaseException) -> set[str]:
     return {kind.__name__ for kind in type(error).__mro__}
+
+
+def hand_out(
+    jobs: Sequence[int],
+    submit: Callable[[int], Any],
+    workers: Workers,
+    done: Callable[[int, Any], None],
+    given_up: Callable[[int], None],
+    stop: Callable[[], bool],
+) -> None:
+    """Run all jobs (numbers): `submit` hands one out and returns its future, `done` gets its result, in any order.
+
+    Workers may die. If several jobs run at a time, a broken pool does not tell which of them killed a worker, so a lost job is
+    first run again after all others. A job that is lost three times waits until all others are done, and then runs alone; if
+    its worker dies three times again, the job is the cause, and `given_up` is called for it.
+
+    **Raises:** `KeyboardInterrupt` once `stop()` is true, or if a worker was interrupted; `RuntimeError` if there are no
+    workers any more; and anything that a job raises.
+    """
+    waiting, suspects = deque(jobs), deque()
+    # How often each job was lost while others ran, and while it ran alone.
+    lost, lost_alone = Counter(), Counter()
+    under_way: dict[Any, int] = {}  # futures, in the order in which they were handed out
+    alone: int | None = None  # the job that runs alone
+    back: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    most_losses = 3
+    try:
+        while waiting or suspects or under_way:
+            # Where the number of workers is not known, so many jobs.
+            room = 512 if workers.side_by_side is None else workers.side_by_side + 1
+            chosen = waiting if waiting or under_way else suspects
+            while chosen and len(under_way) < (1 if chosen is suspects else room):
+                number = chosen[0]
+                alone = number if chosen is suspects else None
+                try:
+                    future = submit(number)
+                except Exception as error:
+                    if not is_broken(error):
+                        raise
+                    if not under_way:
+                        workers.renew()
+                        continue
+                    break  # the futures under way will report the same error
+                chosen.popleft()
+                under_way[future] = number
+                future.add_done_callback(back.put)
+            try:
+                # While no result arrives, requests to stop are looked for.
+                future = back.get(timeout=0.2)
+            except queue.Empty:
+                future = None
+            if stop():
+                raise KeyboardInterrupt
+            if future is None or future not in under_way:
+                continue
+            running = list(under_way)[: workers.side_by_side]
+            number = under_way.pop(future)
+            try:
+                result = future.result()
+            except BaseException as caught:
+                if not is_loss(caught):
+                    raise
+                error = caught
+            else:
+                done(number, result)
+                workers.progressed()
+                continue
+            gone = [(future, number)]
+            if is_broken(error):
+                # Jobs that were finished before the workers died still report their results.
+                gone += [one for one in under_way.items() if not _has_result(one[0])]
+                for one, _ in gone[1:]:
+                    del under_way[one]
+                workers.renew()
+            for one, number in gone:
+                # Jobs begin in order, so only the first ones were running.
+                blamed = most_losses if is_proof(error) else int(one in running)
+                if number == alone:
+                    lost_alone[number] += blamed
+                else:
+                    lost[number] += blamed
+                if lost_alone[number] >= most_losses:
+                    given_up(number)
+                elif lost[number] >= most_losses:
+                    suspects.append(number)
+                else:
+                    waiting.append(number)
+    finally:
+        workers.take_back(under_way)
+
+
+def _has_result(future) -> bool:
+    return future.done() and not future.cancelled() and future.exception() is None

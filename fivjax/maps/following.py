@@ -1,134 +1,174 @@
-"""Many trajectories begun and followed for some steps, in blocks or by kernels, with what can be concluded of each then.
+"""Many trajectories begun and followed for some steps, in blocks or by kernels, with what can be proved of each then.
 
-`jax.vmap` makes of one trajectory a row of them that share a group, and a second `jax.vmap` makes that a block of rows.
+`jax.vmap` makes of one trajectory (`one_trajectory`) a row of them that share a group, and a second `jax.vmap` makes that a
+block of rows.
 """
 
 import functools
+from concurrent.futures import Executor
+from functools import cached_property
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
+from ..contact import Contact, Mechanics
 from ..foundation.blocks import BLOCK_OF_SEVERAL, in_blocks
+from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
-from .conclusion import conclude, may_be_concluded
-from .groups import Batch, Shared, with_values
-from .matrix_kernels import Kernels, for_conclusions
-from .progress import Progress, Setting, begin, placed, released, step
+from ..section.return_maps import BLOCK, Section, of_block
+from ..verdicts.sliding_proof import SlidingModes, used_up
+from .groups import Shared, Task, shared_by, with_values
+from .matrix_kernels import MatrixKernels, begin_building, for_conclusions
+from .one_trajectory import (
+    UNBOUNDED_FROM,
+    Progress,
+    Setting,
+    at_equilibrium,
+    conclude,
+    with_initial_values,
+    with_step,
+)
 from .series_kernels import SeriesKernels
 
-# Trajectories that kernels have followed and that are asked for a verdict at a time: a critical kick has a dozen.
-CONCLUDED = 32
+
+class Batch:
+    """Groups whose trajectories are followed together: their task, the data that each of them shares, and what computes."""
+
+    def __init__(self, task: Task, of_groups: Float[np.ndarray, "g k"], pool: Executor):
+        if task.by_kernel:
+            begin_building(task, pool)
+        self.task, self.pool = task, pool
+        self.shared = shared_by(task, of_groups)
+        # Of several contacts a trajectory takes more memory.
+        self.block = BLOCK_OF_SEVERAL if len(task.scene.structure.contacts) > 1 else None
+
+    @cached_property
+    def kernels(self) -> MatrixKernels | SeriesKernels | None:
+        """The kernels that follow the trajectories, if any do."""
+        if self.task.by_kernel:
+            return MatrixKernels(self.shared, self.pool)
+        return SeriesKernels(self.task, self.shared, self.pool) if self.task.by_series else None
 
 
-def begun(batch: Batch, shared: Flattened, group: np.ndarray, columns: np.ndarray, releases=None) -> Flattened:
-    """Trajectories at their beginning, each with its history; those that are released (from these multiples of their final
-    load) after all kicks.
-    """
-    releases = np.full(len(group), np.nan) if releases is None else releases
+def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
+    """Trajectories at their beginning, each with its kick and initial values in `columns`."""
+    task = batch.task
 
     def function(*block):
-        return _begin_block(
-            batch.scene, batch.names, batch.history, batch.states, batch.energy, batch.by_kernel, *block
-        )
+        states = tuple(task.states.values())
+        return _begin_block(task.scene, task.names, task.history, states, task.limits.energy, task.by_kernel, *block)
 
-    return in_blocks(function, shared, group, flatten((columns, releases)), batch.width, batch.pool, size=_block(batch))
+    trajectories = in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
+    if (task.by_kernel or task.by_series) and len(group):
+        # What concludes is compiled while the kernels are being built.
+        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
+        _conclude(batch, for_conclusions(batch.shared), np.zeros(1, int), columns, now, np.array(now.t))
+    return trajectories
 
 
-def follow(
-    batch: Batch,
-    kernels: Kernels | SeriesKernels | None,
-    shared: Flattened,
-    group: np.ndarray,
-    trajectories: Flattened,
-    steps: int,
-) -> None:
+def follow(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
     """Trajectories so many steps further, in place."""
-    if kernels is not None:
-        _follow_by_kernel(batch, kernels, shared, group, trajectories, steps)
+    task = batch.task
+    if batch.kernels is not None:
+        _follow_by_kernel(batch, batch.kernels, group, trajectories, steps)
         return
-    follow_block = _follow_block_of_many if batch.many else _follow_block
+    follow_block = _follow_block_of_many if task.many else _follow_block
 
     def function(*block):
-        return follow_block(batch.scene, batch.method, batch.names, batch.history, np.int32(steps), *block)
+        return follow_block(task.scene, task.method, task.names, task.history, np.int32(steps), *block)
 
-    in_blocks(function, shared, group, trajectories, batch.width, batch.pool, in_place=True, size=_block(batch))
+    in_blocks(function, batch.shared, group, trajectories, task.width, batch.pool, in_place=True, size=batch.block)
 
 
 def _follow_by_kernel(
-    batch: Batch,
-    kernels: Kernels | SeriesKernels,
-    shared: Flattened,
-    group: np.ndarray,
-    trajectories: Flattened,
-    steps: int,
+    batch: Batch, kernels: MatrixKernels | SeriesKernels, group: np.ndarray, trajectories: Flattened, steps: int
 ) -> None:
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events
     kernels.follow(group, trajectories, steps)
     # While its mode changes again and again, nothing can be proved of a trajectory.
-    asks = np.flatnonzero(may_be_concluded(shared, group, began, events, trajectories.tree[1]))
+    asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
     if len(asks):
         columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], trajectories.tree)
-        concluded = _concluded(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
+        concluded = _conclude(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
         trajectories.numbers[asks] = concluded.numbers
 
 
-def _concluded(
+def _may_be_concluded(
+    shared: Shared, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
+) -> np.ndarray:
+    """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
+    steps: those whose mode has not changed in it, and those that have not moved, are too large or are not finite. Cheap.
+    `began` and `events` are the time (s) and the number of events before the round.
+    """
+    yardstick = np.max(np.abs(shared.weights * shared.modes.linear.equilibrium), axis=1)
+    largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
+    return (now.events == events) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * yardstick[group])
+
+
+def _conclude(
     batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray
 ) -> Flattened:
+    task = batch.task
+
     def function(*block):
-        return _conclude_block(batch.scene, batch.method, batch.names, batch.history, *block)
+        return _conclude_block(task.scene, task.method, task.names, task.history, *block)
 
-    # They are few of each group, and what they share is little.
-    return in_blocks(function, shared, group, flatten((columns, now, began)), 1, batch.pool, size=CONCLUDED)
-
-
-def compile_conclusions(batch: Batch, shared: Flattened, trajectories: Flattened) -> None:
-    """Compile what concludes where kernels follow trajectories, while these are being built."""
-    columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
-    _concluded(batch, for_conclusions(shared), np.zeros(1, int), columns, now, np.array(now.t))
+    # They are few of each group (a critical kick has a dozen), and what they share is little.
+    return in_blocks(function, shared, group, flatten((columns, now, began)), 1, batch.pool, size=32)
 
 
-def _block(batch: Batch) -> int | None:
-    return BLOCK_OF_SEVERAL if len(batch.scene.structure.contacts) > 1 else None
+def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:
+    """Bounds on the shares of their margins that motions from these states can use up under their final loads: those below 1
+    slide for ever.
+    """
+    tree = batch.shared.tree
+    return in_blocks(
+        _bounds, flatten((tree.mechanics, tree.modes)), group, at.flattened(), 1, batch.pool, size=BLOCK
+    ).tree
+
+
+@compiled
+def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
+    def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
+        mechanics, modes = shared
+        return used_up(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
+
+    return of_block(one, shared, rows)
 
 
 @kept
 def _begin_block(
     scene, names, history, states, energy: bool, for_kernel: bool, shared: Flattened, trajectories: Flattened
 ) -> Flattened:
-    def group(shared, columns, releases):
+    def group(shared, columns):
         own = with_values(scene, names, shared.values)
 
-        def one(row, release):
+        def one(row):
             scene = with_values(own, history, row)
-            begun = placed(
-                begin(scene, shared.mechanics, shared.modes, energy, for_kernel),
-                scene,
-                shared,
-                states,
-                row[len(history) :],
-            )
-            return released(own, shared.modes, begun, release)
+            now = at_equilibrium(scene, shared, energy, for_kernel)
+            return with_initial_values(now, scene, shared, states, row[len(history) :])
 
-        return jax.vmap(one)(columns, releases)
+        return jax.vmap(one)(columns)
 
-    columns, releases = trajectories.tree
-    return flatten((columns, jax.vmap(group)(shared.tree, columns, releases)), row_axes=2)
+    columns = trajectories.tree
+    return flatten((columns, jax.vmap(group)(shared.tree, columns)), row_axes=2)
 
 
-def _followed(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
     of_all = functools.partial(_of_all, scene, method, names, history, shared.tree, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
-    a_step, concluded = map(of_all, (step, conclude))
+    a_step, concluded = map(of_all, (with_step, conclude))
     after = jax.lax.fori_loop(0, steps, lambda _, now: a_step(now), begun)
     return flatten((columns, concluded(begun.t, after)), row_axes=2)
 
 
-_follow_block, _follow_block_of_many = kept(_followed), kept(_followed, quickly_compiled=False)
+_follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
 @kept

@@ -5,7 +5,6 @@ matrices of their stepper, the same proofs and the same attractors.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from typing import Any, NamedTuple
 
@@ -32,10 +31,6 @@ from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 
 # Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
 HISTORY = ("p", "duration", "start")
-# Number of groups worked out at a time, so that one size is compiled.
-GROUPS_AT_A_TIME = 64
-# States kept of a torus, mostly.
-OF_TORUS = 512
 
 
 class Shared(eqx.Module):
@@ -50,18 +45,25 @@ class Shared(eqx.Module):
     longest_return: Float[Array, ""]  # of the section's return map, s
 
 
-class Batch(NamedTuple):
-    """The data that all trajectories of a run have in common, and how they are computed."""
+class Limits(NamedTuple):
+    """How far trajectories are followed, and with what."""
 
-    scene: Scene
+    t_max: float | None = None  # s; unless given, it depends on the attractors that are known
+    max_steps: int = 2**21  # enough for 10⁵ cycles with their events; a map of such trajectories takes hours
+    energy: bool = False  # whether with their energy ledgers
+
+
+class Task(NamedTuple):
+    """The data that all trajectories of a run have in common: whose they are, and how they are followed."""
+
+    scene: Scene  # on the way to a worker with NumPy arrays, because JAX arrays lose double precision when they are unpickled
     method: AbstractStepper | Propagation
     names: tuple[str, ...]  # parameters that differ between groups
     history: tuple[str, ...]  # parameters of the kick
-    states: tuple[int, ...]  # indices of the initial state for which trajectories have values of their own
-    energy: bool
-    width: int  # trajectories of a group in a row of a block
-    many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
-    pool: ThreadPoolExecutor
+    states: dict[str, int]  # initial displacements and velocities, with their indices in the state
+    limits: Limits = Limits()
+    width: int = 1  # trajectories of a group in a row of a block
+    many: bool = False  # whether there are so many trajectories that fully optimised code repays its compilation
 
     @property
     def by_kernel(self) -> bool:
@@ -100,11 +102,11 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     own = 8 * (3 * 2 * n + 60)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
-    attractor = 8 * OF_TORUS * 2 * n
+    attractor = 8 * 512 * 2 * n  # mostly so many states are kept of a torus
     return int(own + 3 * (modes + prepared + attractor) / sharing)
 
 
-def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
     """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
     own = [column for name, column in values.items() if name not in HISTORY and name not in states]
     if not own:
@@ -114,13 +116,14 @@ def grouped(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[
     return distinct, group.ravel()
 
 
-def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
+def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
     """`Shared` of each row of `distinct`, as one array."""
-    size, parts = GROUPS_AT_A_TIME, []
+    # So many groups are worked out at a time, so that one size is compiled.
+    size, parts = 64, []
     for start in range(0, len(distinct), size):
         # Padded with copies, so that one size is compiled.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = jax.tree.map(np.asarray, _prepared(batch.scene, batch.method, batch.names, distinct[rows]))
+        part = jax.tree.map(np.asarray, _prepare(task.scene, task.method, task.names, distinct[rows]))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
     modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
@@ -136,7 +139,7 @@ def shared_by(batch: Batch, distinct: np.ndarray) -> Flattened:
 
 
 @kept
-def _prepared(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
+def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
         mechanics = mechanics_about_sliding(own)

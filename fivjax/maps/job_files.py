@@ -11,18 +11,81 @@ import json
 import time
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from ..attractors.catalogue import Attractors
+from ..attractors.cycles import StableCycle
+from ..attractors.neighbourhood import Neighbourhood
+from ..attractors.tori import Torus
+from ..attractors.tube import Tube
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
-from .attractor_files import from_bytes, to_bytes
-from .halfway import Halfway
+from .plan import Places
 from .results import Verdicts, by_name
-from .trajectories import Places
 
-# Time between writes, s, and before a part of the work that may take as long as that.
-KEEP_EVERY, KEEP_BEFORE_LONG = 4.0, 1.0
+
+def to_bytes(found: dict[bytes, Attractors]) -> bytes:
+    """The attractors of groups, by the groups' parameters, as bytes."""
+    arrays, index = {}, []
+    for number, (key, one) in enumerate(found.items()):
+        index.append([key.hex(), len(one.cycles), len(one.tori)])
+        for k, cycle in enumerate(one.cycles):
+            fields = {**cycle._asdict(), **{f"n_{name}": part for name, part in cycle.neighbourhood._asdict().items()}}
+            del fields["neighbourhood"]
+            arrays |= {f"{number}.{k}.{name}": np.asarray(value) for name, value in fields.items()}
+        for k, torus in enumerate(one.tori):
+            fields = {**torus._asdict(), "states": torus.tube.states, "radius": torus.tube.radius}
+            del fields["tube"]
+            arrays |= {f"{number}.torus{k}.{name}": np.asarray(value) for name, value in fields.items()}
+    content = io.BytesIO()
+    np.savez_compressed(content, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)
+    return content.getvalue()
+
+
+def from_bytes(content: bytes) -> dict[bytes, Attractors]:
+    """The attractors that `to_bytes` has written."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    found = {}
+    for number, (key, cycles, tori) in enumerate(json.loads(arrays["index"].tobytes())):
+
+        def of(kind, prefix, own=number, **others):
+            names = [name for name in kind._fields if name not in others]
+            return kind(**others, **{name: _plain(arrays[f"{own}.{prefix}{name}"]) for name in names})
+
+        def tube(k, own=number):
+            return Tube(*(_plain(arrays[f"{own}.torus{k}.{name}"]) for name in ("states", "radius")))
+
+        found[bytes.fromhex(key)] = Attractors(
+            [of(StableCycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)],
+            [of(Torus, f"torus{k}.", tube=tube(k)) for k in range(tori)],
+        )
+    return found
+
+
+def _plain(value: np.ndarray):
+    return value if value.ndim else value.item()
+
+
+class JobState(NamedTuple):
+    """The state of a job after some rounds. What trajectories share follows from the job's values and is worked out again."""
+
+    done: int  # steps of each trajectory
+    own_from: int  # steps after which trajectories search for attractors of their own
+    verdicts: Verdicts  # of all trajectories of the job
+    pending: np.ndarray  # trajectories without a verdict, as indices
+    numbers: np.ndarray  # their states, see `Flattened`
+    known: dict[bytes, Attractors]  # what searches have found, by the group's parameters
+    settled_by: np.ndarray  # time that the known cycles of each group take to attract, s
+    # The same with what trajectories have found on their way, by the group's number; and when their time was over.
+    of_groups: dict[int, Attractors]
+    at_last: dict[int, Attractors]
+
+
+# Time between writes, s.
+KEEP_EVERY = 4.0
 
 
 class JobFile:
@@ -35,7 +98,7 @@ class JobFile:
         self.path, self.key = None if path is None else Path(path), key
         self._written, self._noted = time.monotonic(), None
 
-    def last(self) -> Halfway | None:
+    def last(self) -> JobState | None:
         """The state in which an interrupted run of the job was kept, if there is one."""
         if self.path is None or not self.path.is_file():
             return None
@@ -45,10 +108,12 @@ class JobFile:
             warnings.warn(f"File `{self.path}` of an unfinished job is damaged; the job begins anew.", stacklevel=2)
         return None
 
-    def note(self, now: Halfway, at_once: bool = False) -> None:
-        """Keep this state if it is time, or almost so if `at_once`. Until `moving`, its arrays do not change."""
+    def note(self, now: JobState, at_once: bool = False) -> None:
+        """Keep this state if it is time, or almost so if `at_once`: before a part of the work that may take long. Until
+        `moving`, its arrays do not change.
+        """
         self._noted = now
-        if time.monotonic() - self._written >= (KEEP_BEFORE_LONG if at_once else KEEP_EVERY):
+        if time.monotonic() - self._written >= (0.25 if at_once else 1.0) * KEEP_EVERY:
             self.flush()
 
     def moving(self) -> None:
@@ -66,7 +131,7 @@ class JobFile:
         self._written = time.monotonic()
 
 
-def to_content(now: Halfway, key: str) -> bytes:
+def to_content(now: JobState, key: str) -> bytes:
     """The state as bytes (NumPy's npz, without pickles)."""
     head = {"key": key, "done": now.done, "own_from": now.own_from}
     attractors = {
@@ -82,7 +147,7 @@ def to_content(now: Halfway, key: str) -> bytes:
     return content.getvalue()
 
 
-def from_content(content: bytes, key: str) -> Halfway | None:
+def from_content(content: bytes, key: str) -> JobState | None:
     """The state again; none where it is not of this run and job."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         head = json.loads(file["head"].tobytes())
@@ -92,7 +157,7 @@ def from_content(content: bytes, key: str) -> Halfway | None:
     results = {name.removeprefix("result."): arrays[name] for name in arrays if name.startswith("result.")}
     parts = {name: results.pop(name) for name in Verdicts._fields if name != "energy"}
     known, of_groups, at_last = (from_bytes(arrays[name].tobytes()) for name in ("known", "of_groups", "at_last"))
-    return Halfway(
+    return JobState(
         done=head["done"],
         own_from=head["own_from"],
         verdicts=Verdicts(**parts, energy=results),

@@ -1,8 +1,9 @@
 """A map as independent jobs: each is a pure function from its data to its results, for any process on any machine.
 
-A job runs some trajectories of a map. Its results follow from the job alone, not from the worker or from other jobs. A map
-keeps the results of whole jobs, so an interrupted map continues with its missing jobs; one that was under way goes on from its
-own file (`job_files`).
+A job follows some trajectories of a map, round by round, until the verdict on each is known. After each round of steps the
+decided ones leave and the undecided ones are compacted: work is spent only where the verdict is open. Results follow from the
+job alone, not from the worker or from other jobs. A map keeps the results of whole jobs, so an interrupted map continues with
+its missing jobs; one that was under way goes on from its own file (`job_files`).
 """
 
 from collections.abc import Callable
@@ -12,33 +13,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ..attractors.known import Attractors
+from ..attractors.catalogue import Attractors
+from ..attractors.cycles import CROSSINGS, MORE_CROSSINGS, StableCycle
+from ..attractors.tori import Torus
+from ..foundation.flattened import Flattened
 from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
-from ..model.scene import Scene
-from ..steppers.base import AbstractStepper
-from ..steppers.propagation import Propagation
-from . import rounds
-from .groups import Batch
-from .job_files import JobFile
-from .results import Verdicts, not_run
+from ..verdicts.verdict import Verdict
+from .capture import Capture, attractor_columns
+from .following import Batch, begin, follow
+from .groups import Task, groups_of
+from .job_files import JobFile, JobState
+from .results import Ended, Verdicts, not_run, record
 
-
-class Task(NamedTuple):
-    """The data that all jobs of a run have in common."""
-
-    scene: Scene  # with NumPy arrays, because JAX arrays lose double precision when they are unpickled
-    method: AbstractStepper | Propagation
-    names: tuple[str, ...]  # parameters that differ between groups
-    history: tuple[str, ...]  # parameters of the kick
-    states: dict[str, int]  # initial displacements and velocities, with their indices in the state
-    t_max: float | None
-    max_steps: int
-    energy: bool
-    width: int  # trajectories of a group in a row of a block
-    many: bool  # whether there are so many trajectories that fully optimised code repays its compilation
+# How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
+LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
 
 
 class Job(NamedTuple):
@@ -76,38 +67,113 @@ def run_job(
         end_with_parent()
         with ThreadPoolExecutor(max_workers=1) as one:
             return run_job(job, one, report, interrupted)
-    task = job.task
-    total = len(next(iter(job.values.values())))
-    verdicts, known, log = not_run(total, task.energy), dict(job.known), JobFile(job.file, job.key)
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, task.scene)
-    batch = Batch(
-        scene=scene,
-        method=task.method,
-        names=task.names,
-        history=task.history,
-        states=tuple(task.states.values()),
-        energy=task.energy,
-        width=task.width,
-        many=task.many,
-        pool=threads,
-    )
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, job.task.scene)
+    job = job._replace(task=job.task._replace(scene=scene))
+    done = Done(not_run(len(job.seeding), job.task.limits.energy), dict(job.known))
+    file = JobFile(job.file, job.key)
     try:
-        rounds.follow_all(
-            batch,
-            job.values,
-            job.seeding,
-            tuple(task.states),
-            known,
-            task.t_max,
-            task.max_steps,
-            verdicts,
-            np.arange(total),
-            report or (lambda count: None),
-            log,
-        )
+        follow_all(job, threads, done, file, report or (lambda count: None))
     except KeyboardInterrupt:
-        log.flush()
+        file.flush()
         if interrupted is not None:
-            interrupted(verdicts)
+            interrupted(done.verdicts)
         raise
-    return Done(verdicts, {key: one for key, one in known.items() if key not in job.known})
+    return done._replace(found={key: one for key, one in done.found.items() if key not in job.known})
+
+
+def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: Callable[[int], None]) -> None:
+    """Follow the trajectories of a job, which fit in memory together, and write their `results`.
+
+    Those found already are the known attractors of groups, by the group's parameters. `report` is told how many trajectories
+    have ended. The file keeps the state between rounds, and has the one from which an interrupted run goes on.
+    """
+    task, (verdicts, known) = job.task, results
+    of_groups, group = groups_of(job.values, tuple(task.states))
+    of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(group, return_index=True)[1]])
+    batch = Batch(task, of_groups, pool)
+    own = [job.values[name] for name in (*task.history, *task.states)]
+    columns = np.stack([np.zeros(len(group)), *own], axis=-1)[:, 1:]
+    pending = np.arange(len(group))
+    trajectories = begin(batch, group, columns)
+    capture = Capture(batch, of_groups, group, seeds, report)
+    # After so many rounds the attractors of the groups of those that are undecided are computed; those that are undecided later
+    # ask for a cycle of their own, each time after twice the steps.
+    known_from, own_from = 4 * task.method.round, 16 * task.method.round
+    limit = task.limits.t_max
+    if limit is None:
+        limit = np.maximum(LEAST_TIME, LEAST_PERIODS * batch.shared.tree.modes.slowest_period)
+    limit = np.broadcast_to(limit, len(of_groups))
+    done = 0
+    if (earlier := file.last()) is not None:
+        done, own_from, pending = earlier.done, earlier.own_from, earlier.pending
+        trajectories = Flattened(earlier.numbers, trajectories.form)
+        capture.go_on(earlier)
+        known.update(earlier.known)
+        for whole, part in zip(jax.tree.leaves(verdicts), jax.tree.leaves(earlier.verdicts), strict=True):
+            whole[:] = part
+        report(len(group) - len(pending))
+
+    def state() -> JobState:
+        return JobState(done, own_from, verdicts, pending, trajectories.numbers, dict(known), *capture.state())
+
+    # Rounds from which on cycles of many crossings are tried, too: locked tori, whose neighbours are followed for long
+    # anyway.
+    more_from = 64
+    while True:
+        _, now = trajectories.tree
+        verdict = np.array(now.verdict)
+        if task.limits.t_max is None:
+            in_time = now.t - now.skipped < np.maximum(limit, capture.settled_by)[group[pending]]
+        else:
+            in_time = now.t < limit[group[pending]]
+        entered: dict[int, StableCycle | Torus] = {}
+        if done > known_from:
+            entered = capture.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
+            verdict[list(entered)] = Verdict.LIMIT_CYCLE
+        if done >= task.limits.max_steps:
+            # Only now: their last steps may have led them to an attractor.
+            verdict = np.where((verdict == Verdict.UNDECIDED) & in_time, Verdict.STEP_FAILURE, verdict)
+        finished = (verdict != Verdict.UNDECIDED) | ~in_time
+        # Who says how long to follow says which motions count.
+        late = capture.at_last(
+            pending, now, finished & (verdict == Verdict.UNDECIDED), proving=task.limits.t_max is None
+        )
+        verdict[list(late.attractor)], verdict[late.sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
+        ended = Ended(verdict, *attractor_columns(len(pending), entered | late.attractor, late.chaotic))
+        rows = np.flatnonzero(finished)
+        record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, ended)))
+        pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
+        # A run that begins here comes to the same: it finds nothing more to conclude.
+        file.note(state(), at_once=done == known_from or done >= own_from)
+        report(int(finished.sum()))
+        if not len(pending):
+            return
+        if done == known_from:
+            capture.search(np.unique(group[pending]), known, lambda: file.note(state()))
+        elif done >= own_from:
+            crossings = CROSSINGS if done < more_from * task.method.round else MORE_CROSSINGS
+            capture.search_alone(pending, trajectories.tree[1], crossings)
+            own_from = 2 * done
+        # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
+        steps = min(max(task.method.round, done // 5), max(task.limits.max_steps - done, 1))
+        file.moving()
+        follow(batch, group[pending], trajectories, steps)
+        done += steps
+
+
+def with_seeding(
+    of_groups: Float[np.ndarray, "g k"], seeding: Float[np.ndarray, "g k"]
+) -> tuple[Float[np.ndarray, "more k"], Int[np.ndarray, " g"]]:
+    """The parameters of groups, followed by those of other groups that seed some of them; and which one seeds each."""
+    place = {row.tobytes(): g for g, row in enumerate(of_groups)}
+    more: list[np.ndarray] = []
+    for row in seeding:
+        if row.tobytes() not in place:
+            place[row.tobytes()] = len(place)
+            more.append(row)
+    seeds = np.array([place[row.tobytes()] for row in seeding], int)
+    return np.concatenate([of_groups, np.array(more).reshape(len(more), of_groups.shape[1])]), seeds
+
+
+def _rows(tree, chosen: np.ndarray):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], tree)

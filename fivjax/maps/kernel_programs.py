@@ -3,6 +3,7 @@
 What belongs to a trajectory is a row of numbers, which the kernels change in place.
 """
 
+import enum
 import functools
 from typing import Any, NamedTuple
 
@@ -13,10 +14,17 @@ from ..section.crossings import MOST_TO_CROSSING
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
 
-# Columns of the rows of `returned`: first what is asked, then what is found. The state is in all columns from `STATE` on.
-CROSSINGS, LONGEST, STATUS, DIRECTION, EVENTS, CROSSED, TIME, PEAK, STATE = range(9)
-# Entries of what tells `followed` the columns of its rows.
-T, Y, MODE, MODE_DIRECTION, CROSSING, STATUS_CHANGES, LAST_CHANGE, JUMPS, LOADS = range(9)
+
+class ReturnColumn(enum.IntEnum):
+    """Columns of the rows of `returned`: first what is asked, then what is found. The state is in all from `STATE` on."""
+
+    CROSSINGS, LONGEST, STATUS, DIRECTION, EVENTS, CROSSED, TIME, PEAK, STATE = range(9)
+
+
+class FollowColumn(enum.IntEnum):
+    """Entries of what tells `followed` the columns of its rows."""
+
+    T, Y, MODE, MODE_DIRECTION, CROSSING, STATUS_CHANGES, LAST_CHANGE, JUMPS, LOADS = range(9)
 
 
 class Programs(NamedTuple):
@@ -68,10 +76,10 @@ def programs(form: Form) -> Programs:
         i = first + wp.tid()
         g = group[i]
         own = mechanics[g]
-        y = state_in(rows, i, STATE)
-        mode = mode_type(rows[i, STATUS], rows[i, DIRECTION])
-        crossings = int(rows[i, CROSSINGS])
-        left = rows[i, LONGEST]
+        y = state_in(rows, i, ReturnColumn.STATE)
+        mode = mode_type(rows[i, ReturnColumn.STATUS], rows[i, ReturnColumn.DIRECTION])
+        crossings = int(rows[i, ReturnColumn.CROSSINGS])
+        left = rows[i, ReturnColumn.LONGEST]
         ended = int(0)
         passed = int(0)
         count = int(0)
@@ -93,13 +101,13 @@ def programs(form: Form) -> Programs:
             count += 1
             if not wp.isfinite(after.h):
                 left = zero
-        put(rows, i, STATE, y)
-        rows[i, STATUS] = mode[0]
-        rows[i, DIRECTION] = mode[1]
-        rows[i, EVENTS] = real(ended)
-        rows[i, CROSSED] = real(passed)
-        rows[i, TIME] = rows[i, LONGEST] - left
-        rows[i, PEAK] = top
+        put(rows, i, ReturnColumn.STATE, y)
+        rows[i, ReturnColumn.STATUS] = mode[0]
+        rows[i, ReturnColumn.DIRECTION] = mode[1]
+        rows[i, ReturnColumn.EVENTS] = real(ended)
+        rows[i, ReturnColumn.CROSSED] = real(passed)
+        rows[i, ReturnColumn.TIME] = rows[i, ReturnColumn.LONGEST] - left
+        rows[i, ReturnColumn.PEAK] = top
 
     @wp.kernel(enable_backward=False, module=module)
     def followed(
@@ -116,21 +124,21 @@ def programs(form: Form) -> Programs:
         i = first + wp.tid()
         g = group[i]
         own = mechanics[g]
-        t = rows[i, at[T]]
-        y = state_in(rows, i, at[Y])
-        mode = mode_type(rows[i, at[MODE]], rows[i, at[MODE_DIRECTION]])
-        crossing = state_in(rows, i, at[CROSSING])
-        changes = int(rows[i, at[STATUS_CHANGES]])
-        last_change = rows[i, at[LAST_CHANGE]]
+        t = rows[i, at[FollowColumn.T]]
+        y = state_in(rows, i, at[FollowColumn.Y])
+        mode = mode_type(rows[i, at[FollowColumn.MODE]], rows[i, at[FollowColumn.MODE_DIRECTION]])
+        crossing = state_in(rows, i, at[FollowColumn.CROSSING])
+        changes = int(rows[i, at[FollowColumn.STATUS_CHANGES]])
+        last_change = rows[i, at[FollowColumn.LAST_CHANGE]]
         for _ in range(steps):
             past = int(0)
             for k in range(jumps):
-                if rows[i, at[JUMPS] + k] <= t:
+                if rows[i, at[FollowColumn.JUMPS] + k] <= t:
                     past += 1
             until = real(infinite)
             if past < jumps:
-                until = rows[i, at[JUMPS] + past]
-            after = advance(m, own, interval[g], g, y, mode, rows[i, at[LOADS] + past], until - t)
+                until = rows[i, at[FollowColumn.JUMPS] + past]
+            after = advance(m, own, interval[g], g, y, mode, rows[i, at[FollowColumn.LOADS] + past], until - t)
             if after.h >= until - t:
                 t = until
             else:
@@ -143,12 +151,12 @@ def programs(form: Form) -> Programs:
             # Crossings during the kick do not count for the motion after it.
             if after.crossed > 0 and past == jumps:
                 crossing = y
-        rows[i, at[T]] = t
-        put(rows, i, at[Y], y)
-        rows[i, at[MODE]] = mode[0]
-        rows[i, at[MODE_DIRECTION]] = mode[1]
-        put(rows, i, at[CROSSING], crossing)
-        rows[i, at[STATUS_CHANGES]] = real(changes)
-        rows[i, at[LAST_CHANGE]] = last_change
+        rows[i, at[FollowColumn.T]] = t
+        put(rows, i, at[FollowColumn.Y], y)
+        rows[i, at[FollowColumn.MODE]] = mode[0]
+        rows[i, at[FollowColumn.MODE_DIRECTION]] = mode[1]
+        put(rows, i, at[FollowColumn.CROSSING], crossing)
+        rows[i, at[FollowColumn.STATUS_CHANGES]] = real(changes)
+        rows[i, at[FollowColumn.LAST_CHANGE]] = last_change
 
     return Programs(module, returned, followed, columns_type)

@@ -19,46 +19,28 @@ from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
 from ..steppers.kernel_matrices import matrices
-from .groups import Batch, with_values
-from .kernel_programs import (
-    CROSSED,
-    CROSSINGS,
-    DIRECTION,
-    EVENTS,
-    LONGEST,
-    PEAK,
-    STATE,
-    STATUS,
-    TIME,
-    Programs,
-    programs,
-)
-
-# Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a part.
-AT_A_TIME, LEAST_STEPS = 4, 4096
-# Steps from one crossing of the section to the next, roughly.
-STEPS_TO_CROSSING = 9
-
+from .groups import Task, with_values
+from .kernel_programs import Programs, ReturnColumn, programs
 
 # Forms of batches, by what all jobs of a run have in common: a trace takes as long as thousands of returns.
 _FORMS: dict[Any, Form] = {}
 
 
-def begin_building(batch: Batch) -> None:
-    """Begin to compile a batch's kernels in one of its threads."""
+def begin_building(task: Task, pool: Executor) -> None:
+    """Begin to compile the kernels for a task in one of these threads."""
 
     def mechanics(row):
-        return mechanics_about_sliding(with_values(batch.scene, batch.names, row))
+        return mechanics_about_sliding(with_values(task.scene, task.names, row))
 
-    leaves, structure = jax.tree.flatten(batch.scene)
-    key = structure, tuple(np.shape(leaf) for leaf in leaves), batch.names
+    leaves, structure = jax.tree.flatten(task.scene)
+    key = structure, tuple(np.shape(leaf) for leaf in leaves), task.names
     if key not in _FORMS:
         # Without values: those of a group may be none that a scene could have.
-        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(batch.names))))
-    batch.pool.submit(_built, _FORMS[key])
+        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
+    pool.submit(_build, _FORMS[key])
 
 
-def _built(form: Form) -> Programs:
+def _build(form: Form) -> Programs:
     with ONE_AT_A_TIME:
         found = programs(form)
         load(found.module, ["cpu", *gpus()])
@@ -71,7 +53,7 @@ def for_conclusions(shared: Flattened) -> Flattened:
     return flatten(jax.tree.map(np.asarray, without))
 
 
-class Kernels:
+class MatrixKernels:
     """The kernels for a batch, with the data of its groups on each device."""
 
     def __init__(self, shared: Flattened, pool: Executor):
@@ -79,7 +61,7 @@ class Kernels:
         mechanics, prepared = tree.mechanics, tree.prepared
         form = Form.of(mechanics, leading=1)
         self.pool, self.wp = pool, wp
-        self.types, self.programs = stepping(form).types, _built(form)
+        self.types, self.programs = stepping(form).types, _build(form)
         self.for_conclusions = for_conclusions(shared)
         self.longest = np.asarray(tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
@@ -99,23 +81,25 @@ class Kernels:
         """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
         crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
         """
-        count, size = y.shape
-        rows = np.empty((count, STATE + size))
-        rows[:, CROSSINGS], rows[:, STATUS], rows[:, DIRECTION], rows[:, STATE:] = crossings, status, direction, y
-        rows[:, LONGEST] = self.longest[group] * rows[:, CROSSINGS]
+        (count, size), of = y.shape, ReturnColumn
+        rows = np.empty((count, of.STATE + size))
+        rows[:, of.CROSSINGS], rows[:, of.STATE :] = crossings, y
+        rows[:, of.STATUS], rows[:, of.DIRECTION] = status, direction
+        rows[:, of.LONGEST] = self.longest[group] * rows[:, of.CROSSINGS]
         path = np.full((count, kept * size), np.nan)
-        each = int(STEPS_TO_CROSSING * np.mean(rows[:, CROSSINGS]))
+        # From one crossing to the next there are roughly nine steps.
+        each = int(9 * np.mean(rows[:, of.CROSSINGS]))
         self._launch(self.programs.returned, group, [rows, path], each, [kept, int(peaks)])
-        path, y, crossed = path.reshape(count, kept, size), rows[:, STATE:], rows[:, CROSSED].astype(int)
-        lost = (crossed < rows[:, CROSSINGS]) | ~np.all(np.isfinite(y), axis=1)
-        rows[lost, PEAK], rows[lost, STATE:] = np.nan, np.nan
+        path, y, crossed = path.reshape(count, kept, size), rows[:, of.STATE :], rows[:, of.CROSSED].astype(int)
+        lost = (crossed < rows[:, of.CROSSINGS]) | ~np.all(np.isfinite(y), axis=1)
+        rows[lost, of.PEAK], rows[lost, of.STATE :] = np.nan, np.nan
         # The states were kept in a ring; the newest comes last.
         turned = np.flatnonzero(crossed % kept)
         if len(turned):
             places = (crossed[turned, None] + np.arange(kept)) % kept
             path[turned] = path[turned[:, None], places]
-        events = rows[:, EVENTS].astype(np.int32)
-        return y, rows[:, STATUS].astype(np.int32), rows[:, DIRECTION], events, rows[:, TIME], path, rows[:, PEAK]
+        status, events = (rows[:, column].astype(np.int32) for column in (of.STATUS, of.EVENTS))
+        return y, status, rows[:, of.DIRECTION], events, rows[:, of.TIME], path, rows[:, of.PEAK]
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further, in place."""
@@ -130,6 +114,9 @@ class Kernels:
     def _launch(self, kernel, group: Int[np.ndarray, " m"], rows: list[np.ndarray], steps: int, values: list) -> None:
         """Run a kernel for each row of these arrays, which are changed in place. A row takes some `steps` steps."""
         count, wp, group = len(group), self.wp, group.astype(np.int32)
+        # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a
+        # part.
+        at_a_time, least_steps = 4, 4096
         devices = gpus_for(count)
         if not devices:
             given = [
@@ -137,7 +124,7 @@ class Kernels:
                 *(wp.array(part, device="cpu", copy=False) for part in (group, *rows)),
                 *values,
             ]
-            parts = max(1, min(count, AT_A_TIME * self.threads, count * steps // LEAST_STEPS))
+            parts = max(1, min(count, at_a_time * self.threads, count * steps // least_steps))
             ends = np.linspace(0, count, parts + 1).astype(int).tolist()
 
             def run(part: tuple[int, int]) -> None:

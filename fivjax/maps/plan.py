@@ -1,33 +1,197 @@
-"""The plan of a run of many trajectories: its jobs, and which of them need the attractors of others first.
+"""The plan of a run of many trajectories: how they are divided into jobs, and which jobs need the attractors of others first.
 
 The plan follows from the trajectories alone, not from the executor, so results are the same, bit for bit, on any executor.
+Trajectories of a group (`groups`) share data, above all their attractors, so a job has whole groups if these are small enough.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import HISTORY, bytes_per_trajectory, in_bulk
-from .jobs import Task
-from .trajectories import Grid, Listed, Places
+from .groups import HISTORY, Limits, Task, bytes_per_trajectory, groups_of, in_bulk
 
-# Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.
-SIDE_BY_SIDE = 16
-# The cost of a trajectory in a row of its own, relative to one in a full row.
-COST_OF_STANDING_ALONE = 4
+# Indices of trajectories in a run; those of one job, for instance.
+Places = Int[np.ndarray, " r"]
+# Attractors are computed from scratch for one in so many values of each parameter, and continued from there to the values that
+# follow (`attractors.search`).
+SEEDING = 4
+
+
+class Grid:
+    """One trajectory for each combination of values on axes, in the order of a grid.
+
+    `states` are names of axes that are initial displacements or velocities instead of parameters, with their indices in the
+    state; all other coordinates begin at the sliding equilibrium.
+    """
+
+    def __init__(self, axes: dict[str, np.ndarray], states: Mapping[str, int] | None = None):
+        self.axes, self.names, self.states = axes, tuple(axes), dict(states or {})
+        self.shape = tuple(len(values) for values in axes.values())
+        self.total = math.prod(self.shape)
+        # Axes along which groups change.
+        self.across = [k for k, name in enumerate(axes) if name not in HISTORY and name not in self.states]
+        self.group_count = math.prod(self.shape[k] for k in self.across)
+
+    def columns(self, places: Places | None = None) -> dict[str, np.ndarray]:
+        """The values of these trajectories (all, unless given), by name."""
+        index = np.unravel_index(np.arange(self.total) if places is None else places, self.shape)
+        return {name: values[own] for (name, values), own in zip(self.axes.items(), index, strict=True)}
+
+    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+        """The parameters of the group whose attractors seed the search in the group of each of these trajectories: its own,
+        where that is searched from scratch. It follows from the whole grid, not from `places`.
+        """
+        index = np.unravel_index(places, self.shape)
+        columns = [(list(self.axes.values())[k], index[k]) for k in self.across]
+        if not columns:
+            return np.zeros((len(places), 0))
+        own = np.stack([values[at] for values, at in columns], axis=-1)
+        return _near_enough(own, np.stack([values[at - at % SEEDING] for values, at in columns], axis=-1))
+
+    def groups(self, places: Places) -> Int[np.ndarray, " r"]:
+        """The group of each of these trajectories."""
+        if not self.across:
+            return np.zeros(len(places), int)
+        index = np.unravel_index(places, self.shape)
+        return np.ravel_multi_index([index[k] for k in self.across], [self.shape[k] for k in self.across])
+
+    def tile(self, most: int) -> tuple[int, ...]:
+        """The shape of the equal parts of the grid that make jobs: at most `most` trajectories, whole groups if these are small
+        enough.
+        """
+        shape, left = [1] * len(self.shape), max(most, 1)
+        inside_groups = [k for k in range(len(self.shape)) if k not in self.across]
+        for k in (*reversed(inside_groups), *reversed(self.across)):
+            parts = -(-self.shape[k] // left)
+            shape[k] = -(-self.shape[k] // parts)
+            left = max(left // shape[k], 1)
+        return tuple(shape)
+
+    def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
+        """These trajectories (all, unless given) divided into jobs; a part of the grid is never in two of them."""
+        tile = self.tile(most)
+        if places is None:
+            return Tiles(self.shape, tile)
+        return cut(Tiles(self.shape, tile).holding(places), places, most)
+
+
+class Listed:
+    """Trajectories by equally long columns of their values; `states` as in a grid."""
+
+    def __init__(self, values: Mapping[str, np.ndarray], states: Mapping[str, int] | None = None):
+        self.values, self.names, self.states = dict(values), tuple(values), dict(states or {})
+        self.total = len(next(iter(values.values())))
+        self._distinct, self._group = groups_of(self.values, self.states)
+        self.group_count = len(self._distinct)
+
+    def columns(self, places: Places | None = None) -> dict[str, np.ndarray]:
+        """The values of these trajectories (all, unless given), by name."""
+        return {name: column[slice(None) if places is None else places] for name, column in self.values.items()}
+
+    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+        """As for a grid; a group for which there is none of the run is searched from scratch."""
+        return self._seeding[self._group[places]]
+
+    @cached_property
+    def _seeding(self) -> Float[np.ndarray, "g k"]:
+        own = self._distinct
+        if not own.shape[1]:
+            return own
+        ranks = np.stack([np.unique(column, return_inverse=True)[1] for column in own.T], axis=-1)
+        place = {tuple(rank): k for k, rank in enumerate(ranks.tolist())}
+        wanted = (ranks - ranks % SEEDING).tolist()
+        return _near_enough(own, own[[place.get(tuple(rank), k) for k, rank in enumerate(wanted)]])
+
+    def groups(self, places: Places) -> Int[np.ndarray, " r"]:
+        """The group of each of these trajectories."""
+        return self._group[places]
+
+    def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
+        """These trajectories (all, unless given) divided into jobs, group by group."""
+        places = np.arange(self.total) if places is None else places
+        return cut(self._group[places], places, most)
+
+
+def _near_enough(own: Float[np.ndarray, "r k"], other: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+    """The other parameters where they differ little from the own ones, else the own ones."""
+    # Further away an attractor cannot be continued.
+    near = np.all(np.abs(other - own) <= 0.2 * np.abs(own), axis=1)
+    return np.where(near[:, None], other, own)
+
+
+class Tiles(Sequence):
+    """The equal parts ("tiles") of a grid, each as the indices of its trajectories."""
+
+    def __init__(self, shape: tuple[int, ...], tile: tuple[int, ...]):
+        self.shape, self.tile, self.total = shape, tile, math.prod(shape)
+        self.parts = tuple(-(-length // part) for length, part in zip(shape, tile, strict=True))
+
+    def __len__(self) -> int:
+        return math.prod(self.parts)
+
+    def slices(self, number: int) -> tuple[slice, ...]:
+        """The position of a part on the grid."""
+        if not 0 <= number < len(self):
+            raise IndexError(number)
+        at = np.unravel_index(number, self.parts)
+        return tuple(
+            slice(int(k) * part, min((int(k) + 1) * part, length))
+            for k, part, length in zip(at, self.tile, self.shape, strict=True)
+        )
+
+    def __getitem__(self, number: int) -> Places:
+        along = [np.arange(part.start, part.stop) for part in self.slices(number)]
+        return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
+
+    def holding(self, places: Places) -> Int[np.ndarray, " r"]:
+        """The number of the part in which each of these trajectories lies."""
+        index = np.unravel_index(places, self.shape)
+        return np.ravel_multi_index([i // part for i, part in zip(index, self.tile, strict=True)], self.parts)
+
+    def among(self, places: Places | None) -> Iterator[tuple[int, Int[np.ndarray, " t"], Int[np.ndarray, " t"]]]:
+        """The parts in which these trajectories (all, unless given) lie: of each its number, which entries of it they are, and
+        which of `places`.
+        """
+        if places is None:
+            for number in range(len(self)):
+                yield number, np.arange(len(self[number])), self[number]
+            return
+        numbers = self.holding(places)
+        order = np.argsort(numbers, kind="stable")
+        found, first = np.unique(numbers[order], return_index=True)
+        for number, rows in zip(found.tolist(), np.split(order, first[1:]), strict=True):
+            yield number, np.searchsorted(self[number], places[rows]), rows
+
+
+def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
+    """Jobs of whole units with at most `most` trajectories each; a larger unit makes several jobs."""
+    order = np.argsort(unit, kind="stable")
+    _, counts = np.unique(unit, return_counts=True)
+    ends, filled, at = [0], 0, 0
+    for count in counts:
+        if filled and filled + count > most:
+            ends.append(at)
+            filled = 0
+        for start in range(most, count, most):
+            ends.append(at + start)
+        at, filled = at + count, filled + count if count <= most else most
+    return [places[order[a:b]] for a, b in zip(ends, [*ends[1:], len(places)], strict=True) if b > a]
+
+
 # The most trajectories of a job, with `Propagation` and with other steppers: a second or two of work, because an interrupt
 # loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
 GROUPS_IN_A_JOB = 512
-# Memory that a job may take, bytes: trajectories in small groups take much.
-OF_A_JOB = 2.5e8
 
 
 class Plan(NamedTuple):
@@ -40,21 +204,16 @@ class Plan(NamedTuple):
     memory: float  # of the largest job, bytes
 
 
-def planned(
+def plan_of(
     scene: Scene,
-    values: Mapping[str, np.ndarray],
+    trajectories: Grid | Listed,
     method: AbstractStepper,
-    *,
-    t_max: float | None,
-    max_steps: int,
-    energy: bool = False,
-    states: Mapping[str, int] | None = None,
+    limits: Limits,
     places: Places | None = None,
 ) -> Plan:
     """The plan of a run of these trajectories, or of those at `places`; see `engine.run_to_verdict`."""
-    states = {} if states is None else dict(states)
-    trajectories = values if isinstance(values, Grid) else Listed(values, tuple(states))
-    followed = method if energy else in_bulk(method, scene)
+    states = trajectories.states
+    followed = method if limits.energy else in_bulk(method, scene)
     of_group = trajectories.total / trajectories.group_count
     each = bytes_per_trajectory(scene, of_group)
     jobs = trajectories.jobs(places, in_a_job(followed, each, of_group))
@@ -65,18 +224,19 @@ def planned(
             later.append(number)
         counts[groups] += here
     total = int(counts.sum())
-    in_rows = np.sum(-(-counts // SIDE_BY_SIDE)) * SIDE_BY_SIDE
+    # Trajectories of a group in a row of a block: enough to fill a vector unit and to make matrix products worthwhile.
+    side_by_side = 16
+    in_rows = np.sum(-(-counts // side_by_side)) * side_by_side
     task = Task(
         scene=jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, scene),
         method=followed,
-        names=tuple(name for name in values if name not in HISTORY and name not in states),
-        history=tuple(name for name in values if name in HISTORY),
+        names=tuple(name for name in trajectories.names if name not in HISTORY and name not in states),
+        history=tuple(name for name in trajectories.names if name in HISTORY),
         states=states,
-        t_max=None if t_max is None else float(t_max),
-        max_steps=int(max_steps),
-        energy=energy,
-        # The same in all jobs, because matrix products of other shapes round differently.
-        width=SIDE_BY_SIDE if in_rows <= COST_OF_STANDING_ALONE * total else 1,
+        limits=limits,
+        # The same in all jobs, because matrix products of other shapes round differently. A trajectory in a row of its own
+        # costs four times as much as one in a full row.
+        width=side_by_side if in_rows <= 4 * total else 1,
         many=total >= MANY,
     )
     waiting = set(later)
@@ -87,4 +247,5 @@ def planned(
 def in_a_job(method: AbstractStepper | Propagation, each: float, of_group: float) -> int:
     """The most trajectories of a job, if each takes `each` bytes and so many, on average, are of one group."""
     by_time = IN_A_JOB if isinstance(method, Propagation) else IN_A_LONG_JOB
-    return max(1, min(by_time, int(OF_A_JOB // each), int(GROUPS_IN_A_JOB * of_group)))
+    memory = 2.5e8  # of a job, bytes: trajectories in small groups take much
+    return max(1, min(by_time, int(memory // each), int(GROUPS_IN_A_JOB * of_group)))

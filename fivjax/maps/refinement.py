@@ -10,13 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
+from .plan import Places
 from .results import Verdicts, not_run
-from .shares import wilson
-from .trajectories import Places
-
-# If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A torus
-# and the cycle that it locks to next door do not.
-JUMP = 1.1
 
 # A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
 Run = Callable[[Places, str], Verdicts]
@@ -38,7 +33,7 @@ class Refined(NamedTuple):
     audit: Audit
 
 
-def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
+def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
     """An axis with each of its intervals halved `halvings` times."""
     parts = 2**halvings
     share = np.arange(parts) / parts
@@ -46,7 +41,7 @@ def finer(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, "
     return np.append(inside.ravel(), values[-1])
 
 
-def refined(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
+def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
     """Compute some points of a grid of this shape.
 
     The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
@@ -72,9 +67,9 @@ def refined(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Re
     for level in range(1, halvings + 1):
         # An interrupt leaves trajectories that were not run.
         if not np.any(verdicts.pending()):
-            wanted = _halved(shape, 2 ** (halvings - level), verdicts, row)
+            wanted = _halve(shape, 2 ** (halvings - level), verdicts, row)
             row[wanted] = compute(wanted, f"halving {level} of {halvings}")
-    chosen = _audited(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
+    chosen = _points_to_audit(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
     rows, assumed = compute(chosen, "audit"), row[chosen]
     row[chosen] = rows
     known = ~verdicts.pending(rows)
@@ -90,7 +85,7 @@ def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray,
     return functools.reduce(np.add, np.ix_(*along))
 
 
-def _halved(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
+def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
     """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
     the `row` of the corner before them.
     """
@@ -104,7 +99,7 @@ def _halved(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.n
     return new[wanted]
 
 
-def _audited(computed: Places, total: int, share: float) -> Places:
+def _points_to_audit(computed: Places, total: int, share: float) -> Places:
     """A random share of the points that were not `computed`, without a list of them all."""
     left = total - len(computed)
     count = min(left, math.ceil(share * left))
@@ -113,21 +108,15 @@ def _audited(computed: Places, total: int, share: float) -> Places:
     return which + np.searchsorted(computed - np.arange(len(computed)), which, side="right")
 
 
-def audit_note(audit: Audit) -> dict[str, float | int]:
-    """The audit as attributes of a dataset: counts, the rate of wrong cells and its interval of 95 %."""
-    note: dict[str, float | int] = {"audit_cells": audit.cells, "audit_wrong": audit.wrong}
-    if audit.cells:
-        rate, low, high = (float(part) for part in wilson(audit.wrong, audit.cells))
-        note |= {"audit_rate": rate, "audit_rate_low": low, "audit_rate_high": high}
-    return note
-
-
 def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:
     """Which cells have corners that differ."""
     verdict = verdicts.verdict[corners]
     size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
     low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
-    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > JUMP * low)
+    # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A
+    # torus and the cycle that it locks to next door do not.
+    jump = 1.1
+    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > jump * low)
 
 
 def _over_corners(combine, values: np.ndarray) -> np.ndarray:

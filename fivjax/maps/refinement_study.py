@@ -9,8 +9,6 @@ from .bistability import bistability_map
 
 # Points of the whole map on each axis: intervals of the coarsest grid times two to the power of the halvings, and one.
 COARSEST = 8
-# The belt speeds of the map, in those of the scene, and its kicks.
-SPEEDS, KICKS = (0.8, 1.2), (1.0, 4.0)
 
 
 def refinement_trade(scene: Scene, halvings: int) -> dict[str, np.ndarray]:
@@ -21,11 +19,13 @@ def refinement_trade(scene: Scene, halvings: int) -> dict[str, np.ndarray]:
     """
     seconds, computed, wrong = (np.zeros(halvings + 1) for _ in range(3))
     whole = None
+    # The belt speeds of the map, in those of the scene, and its kicks.
+    speeds, kicks = (0.8, 1.2), (1.0, 4.0)
     for count in (0, *range(halvings + 1)):
         size = COARSEST * 2 ** (halvings - count) + 1
         axes = {
-            "belt_speed": np.sort(float(scene.belt_speed) * np.linspace(*SPEEDS, size)),
-            "p": np.linspace(*KICKS, size),
+            "belt_speed": np.sort(float(scene.belt_speed) * np.linspace(*speeds, size)),
+            "p": np.linspace(*kicks, size),
         }
         begin = time.perf_counter()
         found = bistability_map(scene, **axes, refine=count, audit=0.0, progress=False)

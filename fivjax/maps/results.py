@@ -6,24 +6,10 @@ import numpy as np
 
 from ..simulation.energy import exchanged
 from ..verdicts.verdict import Verdict
-from .progress import Progress
+from .one_trajectory import Progress
 
 # `attractor_kind` of a trajectory that no attractor has captured, and of such a one whose neighbours diverge exponentially.
 NO_ATTRACTOR, CHAOTIC = -1, 2
-
-# The energies of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
-ENERGIES = (
-    "stick_work",
-    "slide_work",
-    "interface_work",
-    "damping_work",
-    "load_work",
-    "kick_work",
-    "impact_loss",
-    "kick_energy",
-    "energy_residual",
-    "energy_exchanged",
-)
 
 
 class Verdicts(NamedTuple):
@@ -49,6 +35,19 @@ class Verdicts(NamedTuple):
 
 def not_run(total: int, energy: bool) -> Verdicts:
     """Results of `total` trajectories that have not been run."""
+    # The energies of a trajectory, see `energy`; `kick_energy` is that of the vibration when the kick ends.
+    energies = (
+        "stick_work",
+        "slide_work",
+        "interface_work",
+        "damping_work",
+        "load_work",
+        "kick_work",
+        "impact_loss",
+        "kick_energy",
+        "energy_residual",
+        "energy_exchanged",
+    )
     return Verdicts(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
         amplitude=np.full(total, np.nan),
@@ -61,7 +60,7 @@ def not_run(total: int, energy: bool) -> Verdicts:
         decided_at=np.full(total, np.nan),
         events=np.zeros(total, np.int32),
         last_event=np.full(total, np.nan),
-        energy={name: np.full(total, np.nan) for name in ENERGIES} if energy else {},
+        energy={name: np.full(total, np.nan) for name in energies} if energy else {},
     )
 
 
@@ -107,7 +106,7 @@ def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -
     verdicts.verdict[index] = verdict
 
 
-def counted(count: int, noun: str) -> str:
+def count_of(count: int, noun: str) -> str:
     """A number with its noun: "1 trajectory", "2 trajectories"."""
     plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
     return f"{count:,} {noun if count == 1 else plural}"

@@ -16,12 +16,8 @@ from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
 from .groups import bytes_per_trajectory, in_bulk, kernels_by
-from .plan import in_a_job
+from .plan import Grid, in_a_job
 from .store import Store, is_store
-from .trajectories import Grid
-
-# Packages whose versions may change a map's last bits.
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
 
 
 def keeper_at(
@@ -35,9 +31,11 @@ def keeper_at(
     if path is None:
         return None
     arguments.instance("resume", path, str | Path, 'the path of a file, such as "map.part", or of a folder "map.zarr"')
+    # Packages whose versions may change a map's last bits.
+    packages = ("jax", "jaxlib", "numpy", "scipy", "diffrax", "equinox")
     run = {
         "fivjax": metadata.version("fivjax"),
-        **{package: metadata.version(package) for package in PACKAGES},
+        **{package: metadata.version(package) for package in packages},
         **kernels_by(method, scene, energy),
         "device": jax.devices()[0].device_kind,
         "scene": describe(scene),

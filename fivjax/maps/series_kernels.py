@@ -1,7 +1,9 @@
 """Trajectories followed, and return maps evaluated, by kernels that step by Taylor series: any friction, several contacts.
 
-A kernel does for one trajectory what `progress.step` says; those of the section are `section.by_kernel`.
+A kernel does for one trajectory what `one_trajectory.with_step` says; those of the section are `section.by_kernel`.
 """
+
+from concurrent.futures import Executor
 
 import equinox as eqx
 import jax
@@ -15,9 +17,9 @@ from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..section.by_kernel import SectionKernels, in_parts, numbers_in_rows
 from ..steppers.event_exact import EventExact
-from .groups import Batch, Shared, with_values
+from .groups import Shared, Task, with_values
 from .matrix_kernels import for_conclusions
-from .progress import Setting, step
+from .one_trajectory import Setting, with_step
 
 
 class Following(eqx.Module):
@@ -29,31 +31,31 @@ class Following(eqx.Module):
     method: EventExact = eqx.field(static=True)
 
 
-def _followed(args, instants):
+def _follow_one(args, instants):
     """A trajectory so many steps further."""
     of_all, (values, mechanics, weights, longest), row, now, steps = args
     scene = with_values(with_values(of_all.scene, of_all.names, values), of_all.history, row)
     shared = Shared(values, mechanics, mechanics, None, None, weights, longest)
     setting = Setting(scene, of_all.method, shared)
     begin = depending_on((scene, mechanics), now)
-    after = jax.lax.fori_loop(0, steps, lambda _, now: step(setting, now), begin)
+    after = jax.lax.fori_loop(0, steps, lambda _, now: with_step(setting, now), begin)
     return jax.tree.leaves(after), ()
 
 
-_follow = KernelFunction(_followed)
+_follow = KernelFunction(_follow_one)
 
 
 class SeriesKernels:
     """The kernels for a batch, with the data of its groups."""
 
-    def __init__(self, batch: Batch, shared: Flattened):
+    def __init__(self, task: Task, shared: Flattened, pool: Executor):
         tree = shared.tree
-        self.pool = batch.pool
+        self.pool = pool
         self.for_conclusions = for_conclusions(shared)
-        self.of_all = Following(batch.scene, batch.names, batch.history, batch.method)
+        self.of_all = Following(task.scene, task.names, task.history, task.method)
         self.of_group = (tree.values, tree.mechanics, tree.weights, tree.longest_return)
         self.table = numbers_in_rows(self.of_group)
-        self.of_section = SectionKernels((tree.mechanics, tree.longest_return), batch.pool)
+        self.of_section = SectionKernels((tree.mechanics, tree.longest_return), pool)
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further, in place."""

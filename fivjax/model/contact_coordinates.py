@@ -17,9 +17,6 @@ from ..foundation.precision import Returned, in_double_precision
 from .contact_point import ContactPoint, directions, pivots
 from .structure import FromParameters, Matrices, Structure
 
-# Of the coordinates that the contacts' directions become.
-KINDS = ("tangential", "normal")
-
 
 def transformation(structure: Structure) -> tuple[np.ndarray, list[int]]:
     """X of q = X z, without unit, and the places in z of the tangential directions and then the normal ones."""
@@ -50,7 +47,9 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     count = len(structure.contacts)
     suffixes = [""] if count == 1 else [f"_{i}" for i in range(count)]
     names = list(structure.coordinates)
-    for place, name in zip(places, [kind + suffix for kind in KINDS for suffix in suffixes], strict=True):
+    # Of the coordinates that the contacts' directions become.
+    kinds = ("tangential", "normal")
+    for place, name in zip(places, [kind + suffix for kind in kinds for suffix in suffixes], strict=True):
         names[place] = name
     contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
     source = structure.source

@@ -20,16 +20,6 @@ from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
 from .printing import as_call
 
-# A law is checked at these shares of the fastest slip that is looked at: so many times the belt's speed, or so many m/s where
-# that is zero or unknown.
-SHARES = np.concatenate([[0.0], np.geomspace(1e-9, 1.0, 121)])
-TIMES = 10.0
-# Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
-LOOKED_AT = np.linspace(0.0, 1.0, 33)
-
-# Halvings of an interval until what is left of a change is a jump.
-HALVINGS = 50
-
 # Gives the next Taylor coefficient in time of μ, from those of the slip speed up to the same order and from those of μ so far.
 NextTerm = Callable[[list[Array], list[Array]], Array]
 
@@ -92,7 +82,9 @@ class AbstractFriction(eqx.Module):
 
     def largest(self, fastest: Float[Array, ""]) -> Float[Array, ""]:
         """The largest coefficient from rest to this slip speed (m/s), as far as looking at some speeds shows."""
-        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(fastest * LOOKED_AT)))
+        # Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
+        looked_at = np.linspace(0.0, 1.0, 33)
+        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(fastest * looked_at)))
 
     def in_time(self, slip_speed: Float[Array, ""], order: int) -> NextTerm:
         """How the Taylor series in time of μ goes on from this slip speed, up to some order."""
@@ -102,7 +94,11 @@ class AbstractFriction(eqx.Module):
     def check(self, belt_speed: Array | float = 0.0) -> None:
         """Refuse a law that breaks its contract, where its values are known, on a belt of this speed (m/s)."""
         fastest = float(np.max(np.abs(np.asarray(belt_speed)))) if is_known(belt_speed) else 0.0
-        speeds = TIMES * (fastest or 1.0) * SHARES
+        # A law is checked at these shares of the fastest slip that is looked at: so many times the belt's speed, or so many
+        # m/s where that is zero or unknown.
+        shares = np.concatenate([[0.0], np.geomspace(1e-9, 1.0, 121)])
+        times = 10.0
+        speeds = times * (fastest or 1.0) * shares
         static = self.static
         mu, slope, bend, bounds, jumps = _sampled(self, jnp.asarray(speeds))
         if not all(map(is_known, (static, mu))):
@@ -166,7 +162,9 @@ def _jump(law: AbstractFriction, low: Float[Array, ""], high: Float[Array, ""]) 
         ends = (low, of_low), (middle, of_middle), (high, of_high)
         return jax.tree.map(lambda a, b: jnp.where(below, a, b), ends[:2], ends[1:])
 
-    (_, of_low), (_, of_high) = jax.lax.fori_loop(0, HALVINGS, halved, ((low, law(low)), (high, law(high))))
+    # Halvings of an interval until what is left of a change is a jump.
+    halvings = 50
+    (_, of_low), (_, of_high) = jax.lax.fori_loop(0, halvings, halved, ((low, law(low)), (high, law(high))))
     return jnp.abs(of_high - of_low)
 
 

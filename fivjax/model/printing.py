@@ -6,9 +6,6 @@ import numpy as np
 
 from ..foundation.precision import is_known
 
-# Matrices up to this many rows are printed in full.
-LARGEST_PRINTED = 6
-
 
 def as_call(name: str, values: Mapping) -> str:
     """`name(first=1, second=0.5)`; what is None is left out."""
@@ -25,6 +22,8 @@ def _text(value) -> str:
         return repr(value)
     if array.ndim == 0:
         return f"{array.item() + 0:.12g}"
-    if max(array.shape) > LARGEST_PRINTED:
+    # Matrices up to this many rows are printed in full.
+    largest_printed = 6
+    if max(array.shape) > largest_printed:
         return f"<array of shape {array.shape}>"
     return np.array2string(array, separator=", ", formatter={"all": lambda x: f"{float(x) + 0:.12g}"}).replace("\n", "")

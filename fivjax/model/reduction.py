@@ -17,11 +17,6 @@ from .sparse_structure import SparseStructure
 from .structure import Structure
 from .structure_checks import lowest_modes
 
-# Modes are computed in growing numbers, until one lies above the frequency; first so many.
-FIRST_LOT = 20
-# A static shape of which the modes leave less than this share would add only rounding.
-NEW_SHAPE = 1e-6
-
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Reduction:
@@ -114,6 +109,8 @@ def craig_bampton(
     held = stiffness[inner][:, inner].tocsc()
     columns = [np.eye(structure.size)[:, outer]]
     squares = np.zeros(0)
+    # A static shape of which the modes leave less than this share would add only rounding.
+    new_shape = 1e-6
     if inner.size:
         try:
             squares, modes = _modes_up_to(held, mass[inner][:, inner], up_to)
@@ -131,7 +128,7 @@ def craig_bampton(
         if np.any(shape):
             # The part of it that the modes do not represent (they are orthonormal in the mass matrix).
             rest = shape - modes @ (modes.T @ (mass[inner][:, inner] @ shape))
-            if rest @ held @ rest > NEW_SHAPE**2 * (shape @ held @ shape):
+            if rest @ held @ rest > new_shape**2 * (shape @ held @ shape):
                 norm = np.sqrt(rest @ mass[inner][:, inner] @ rest)
                 modes = np.column_stack([modes, rest / norm])
         columns.append(np.zeros((structure.size, modes.shape[1])))
@@ -142,7 +139,9 @@ def craig_bampton(
 
 
 def _modes_up_to(stiffness, mass, frequency: float) -> tuple[np.ndarray, np.ndarray]:
-    limit, count = (2 * np.pi * frequency) ** 2, FIRST_LOT
+    # Modes are computed in growing numbers, until one lies above the frequency; first so many.
+    first_lot = 20
+    limit, count = (2 * np.pi * frequency) ** 2, first_lot
     while True:
         squares, modes = lowest_modes(stiffness, mass, count)
         if squares.size < count or squares[-1] > limit:

@@ -11,8 +11,6 @@ import numpy as np
 ROUNDING = 1e-6
 # Eigenvalues below this share of the largest of the lowest ones computed are rigid-body modes.
 RIGID = 1e-6
-# How many of the lowest modes are computed: six rigid-body modes and a few elastic ones.
-LOWEST = 10
 # How many rows a sentence names.
 NAMED = 5
 # Up to this size matrices are dense.
@@ -147,9 +145,11 @@ def check_matrices(
     multipliers = massless & ~empty & (stiffness.diagonal() <= 0)
     both = max(asymmetry["mass"], asymmetry["stiffness"]) <= ROUNDING
     frequencies = rigid = None
+    # How many of the lowest modes are computed: six rigid-body modes and a few elastic ones.
+    lowest = 10
     if both and not np.any(loose):
         with contextlib.suppress(np.linalg.LinAlgError):
-            values = lowest_eigenvalues(stiffness, mass, LOWEST)
+            values = lowest_eigenvalues(stiffness, mass, lowest)
             rigid = int(np.sum(np.abs(values) <= RIGID * np.abs(values).max(initial=0.0)))
             frequencies = tuple(float(f) for f in np.sqrt(np.maximum(values, 0.0)) / (2 * np.pi))
     total = None

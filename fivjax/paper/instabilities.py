@@ -40,9 +40,6 @@ def _onset(runs: Runs, name: str, since: float, where: str):
     return run, hertz, shift, overtones, data, picture, grows
 
 
-# A quantity that changes by less than this share counts as constant.
-CONSTANT = 0.05
-
 NOT_SAID = (
     " (set off by displacing the equilibrium by one part in 10⁴: the paper does not say what does, "
     "and it only shifts the start)"
@@ -214,6 +211,8 @@ def figure_7(runs: Runs) -> Made:
     )
     values = {name: [1e3 * float(x[name]) for x in (start, end, cycle)] for name in cycles.data_vars}
     stick, work, gain, off = (values[n] for n in ("stick_time", "contact_work", "energy_gain", "detach_time"))
+    # A quantity that changes by less than this share counts as constant.
+    constant = 0.05
     findings = (
         statement(
             "Fig. 7(b)",
@@ -234,7 +233,7 @@ def figure_7(runs: Runs) -> Made:
             "energy accumulated in a cycle",
             "constant over the linear phase",
             f"{gain[0]:.2f} mJ at t1, {gain[1]:.2f} mJ at t2: {gain[1] / gain[0] - 1:+.0%}",
-            abs(gain[1] / gain[0] - 1) < CONSTANT,
+            abs(gain[1] / gain[0] - 1) < constant,
             why="energy goes with the square of the amplitude, so an amplitude that grows linearly takes ever more of it",
         ),
         statement(

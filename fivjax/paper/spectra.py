@@ -7,9 +7,6 @@ from ..foundation import arguments
 from ..io.datasets import labelled
 from ..simulation.trajectory import Trajectory
 
-# A Hann window reduces the amplitude of a sinusoid to half.
-HANN_GAIN = 0.5
-
 
 def spectrogram(
     run: Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, window: float = 0.2
@@ -55,7 +52,9 @@ def spectrogram(
 
 def component(t: np.ndarray, signal: np.ndarray, frequency: float) -> complex:
     """The complex amplitude of one frequency (Hz) in an evenly sampled signal, with a Hann window."""
-    weights = np.hanning(len(t)) / (HANN_GAIN * len(t))
+    # A Hann window reduces the amplitude of a sinusoid to half.
+    hann_gain = 0.5
+    weights = np.hanning(len(t)) / (hann_gain * len(t))
     return complex(2 * np.sum(weights * (signal - np.mean(signal)) * np.exp(-2j * np.pi * frequency * t)))
 
 

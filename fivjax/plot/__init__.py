@@ -1,6 +1,11 @@
-"""Pictures of results. Every function takes results, returns a matplotlib `Figure`, and computes nothing."""
+"""Pictures of results. Every function takes results, returns a matplotlib `Figure`, and computes nothing.
+
+Read first: `style`, by which all of them look alike, and `maps` as one of them. `fj.plot` has what is listed here; `energy`,
+`linear` and `fits` are also `fj.plot_energy`, `fj.plot_linear` and `fj.plot_calibration`.
+"""
 
 from . import energy as energy
+from . import fits
 from . import linear as linear
 from .boundary import boundary_section as boundary_section
 from .branches import branch as branch
@@ -18,3 +23,5 @@ from .responses import phase_plane as phase_plane
 from .responses import response as response
 from .thresholds import critical as critical
 from .work_precision import tradeoff as tradeoff
+
+plot_energy, plot_linear, plot_calibration = energy, linear, fits

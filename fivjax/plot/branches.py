@@ -12,11 +12,9 @@ from ..branches.tori_on_branches import turning
 from .maps import bistability
 from .style import BLACK, COLOURS, GREEN, axis_label, check_dataset, legend_above, new_figure
 
-CALL = "fj.continue_cycle(scene, 'mu', (0.02, 0.3))"
 # Of cycles: stable, unstable, and unstable by a complex pair of multipliers.
 STYLES, LABELS = ("-", "--", "-."), ("stable", "unstable", "unstable, beside a torus")
 THIN, THICK = 1.3, 2.6
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 
 
 def branch(
@@ -37,10 +35,11 @@ def branch(
     **Raises:** `TypeError` for anything but branches, `ValueError` for branches over different parameters.
     """
     several = {"": branches} if isinstance(branches, xr.Dataset) else branches
+    call = "fj.continue_cycle(scene, 'mu', (0.02, 0.3))"
     if not isinstance(several, Mapping) or not several:
-        check_dataset(branches, ("amplitude",), CALL, "branches")
+        check_dataset(branches, ("amplitude",), call, "branches")
     for one in several.values():
-        check_dataset(one, ("parameter", "amplitude", "special", "sliding_stable"), CALL, "branches")
+        check_dataset(one, ("parameter", "amplitude", "special", "sliding_stable"), call, "branches")
     names = {str(one.attrs["parameter"]) for one in several.values()}
     if len(names) > 1:
         raise ValueError(
@@ -113,7 +112,8 @@ def _tori(axes: Axes, tori: xr.Dataset) -> list[Line2D]:
 def _special_points(axes: Axes, several: Mapping[str, xr.Dataset]) -> list[Line2D]:
     kinds = sorted({str(name) for one in several.values() for name in one["special"].values if name})
     handles = []
-    for kind, marker in zip(kinds, np.resize(MARKERS, len(kinds)), strict=True):
+    markers = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+    for kind, marker in zip(kinds, np.resize(markers, len(kinds)), strict=True):
         style = {"ls": "none", "marker": str(marker), "ms": 5, "mfc": "white", "mec": BLACK, "zorder": 3}
         for one in several.values():
             here = one["special"].values == kind

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from ..contact import Status
 from ..cycles.cycle import LimitCycle
 from ..foundation import arguments
+from .contact_status import STATUS_NAMES
 from .style import BLACK, BLUE, ORANGE, VERMILION, legend_above, new_figure
 
 ROWS = 2000
@@ -20,7 +21,6 @@ STYLES = {
     Status.SLIDE: {"ls": "-", "lw": 1.4},
     Status.DETACH: {"ls": "--", "lw": 1.4},
 }
-NAMES = {Status.STICK: "sticking", Status.SLIDE: "sliding", Status.DETACH: "detached"}
 
 
 def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figure | None = None) -> Figure:
@@ -37,7 +37,7 @@ def cycle(cycle: LimitCycle, others: Sequence[LimitCycle] = (), *, figure: Figur
     plane, right = figure.subplots(1, 2, width_ratios=(3, 2))
     contact = _phase_plane(plane, cycle)
     handles = [
-        Line2D([], [], color=COLOURS[status], label=NAMES[status], **STYLES[status])
+        Line2D([], [], color=COLOURS[status], label=STATUS_NAMES[status], **STYLES[status])
         for status in _statuses(cycle, contact)
     ]
     for other in others:

@@ -8,7 +8,6 @@ from ..foundation.quantities import QUANTITIES
 from .style import BLACK, SKY, VERMILION, new_figure
 
 MEASURED, FITTED, LEFT = SKY, BLACK, VERMILION
-UNITS = {"acceleration": "m/s²", "velocity": "m/s", "displacement": "m"}
 # The number of blocks shown in the detailed view of a fit.
 DETAIL = 160
 
@@ -21,6 +20,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
     rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
     figure = new_figure(figure, 9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows))
     axes = np.atleast_2d(figure.subplots(len(rows), 2, width_ratios=(3, 2)))
+    units = {"acceleration": "m/s²", "velocity": "m/s", "displacement": "m"}
     for (k, c), (detail, whole) in zip(rows, axes, strict=True):
         t, measured, fitted = fit.t[k], fit.measured[k][:, c], fit.fitted[k][:, c]
         whole.plot(t, measured, color=MEASURED, lw=0.6)
@@ -30,7 +30,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
         detail.plot(t[shown], fitted[shown], color=FITTED, lw=0.9, ls="--", label="fitted")
         channel = fit.recordings[k].channels[c]
         name = f"{channel}" if len(fit.recordings) == 1 else f"recording {k}: {channel}"
-        detail.set_ylabel(f"{name} ({UNITS[channel.quantity]})")
+        detail.set_ylabel(f"{name} ({units[channel.quantity]})")
         for part in (detail, whole):
             part.margins(x=0)
     axes[0, 0].legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), fontsize="small")

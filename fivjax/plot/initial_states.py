@@ -12,9 +12,6 @@ from ..verdicts.verdict import Verdict
 from .maps import SLIDING_SHADE
 from .style import BLACK, VERMILION, cell_edges, check_dataset, new_figure, with_unit
 
-# Colours of attractors, in the order of the table; readers who do not see red and green can distinguish them.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#F0E442")
-
 
 def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Figure | None = None) -> Figure:
     """A picture of basins: each attractor has its colour, and its share is in the legend.
@@ -44,13 +41,15 @@ def basins(dataset: xr.Dataset, *, saddle: LimitCycle | None = None, figure: Fig
     handles: list[Patch | Line2D] = []
     share = 100 * float(dataset["sliding_share"])
     fill(verdict == Verdict.SLIDING, SLIDING_SHADE, f"slides: {share:.1f} %")
+    # Colours of attractors, in the order of the table; readers who do not see red and green can distinguish them.
+    colours = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#F0E442")
     for place in range(dataset.sizes["attractors"]):
         one = dataset.isel(attractors=place)
         label = (
             f"{one['attractor_kind'].values!s}, {float(one['attractor_amplitude']):.4g} m/s: "
             f"{100 * float(one['share']):.1f} %"
         )
-        fill((verdict == Verdict.LIMIT_CYCLE) & (attractor == place), COLOURS[place % len(COLOURS)], label)
+        fill((verdict == Verdict.LIMIT_CYCLE) & (attractor == place), colours[place % len(colours)], label)
     fill(verdict < 0, VERMILION, f"no verdict ({int((verdict < 0).sum())} of {verdict.size})")
     if saddle is not None and names[1] == f"d{names[0]}":
         path = saddle.trajectory(points=2000)

@@ -22,8 +22,6 @@ from .style import (
     variable_label,
 )
 
-FALLS, RISES = BLUE, ORANGE
-
 
 def eigenvalues(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Frequencies and growth rates of the modes over one parameter (Fig. 3), with the critical friction marked.
@@ -80,12 +78,13 @@ def sensitivity(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     figure = new_figure(figure, 6.4, 1.4 + 0.36 * shown.sizes["parameter"])
     axes = figure.subplots()
     names = [str(name) for name in shown["parameter"].values]
+    falling, rising = BLUE, ORANGE
     for row, value in enumerate(shown["normalised"].values):
         falls = value < 0
         axes.barh(
             row,
             np.nan_to_num(value),
-            color=FALLS if falls else RISES,
+            color=falling if falls else rising,
             edgecolor="black",
             linewidth=0.6,
             hatch="///" if falls else None,

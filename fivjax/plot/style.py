@@ -27,7 +27,6 @@ BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
 # From dark to light; lines also differ in their dashes.
 COLOURS = (BLACK, BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DASHES = ("-", "--", "-.", ":")
-SYMBOLS = {"mu": r" $\mu$", "p": " $p$"}
 
 
 def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
@@ -43,7 +42,8 @@ def with_unit(text: str, unit: str) -> str:
 def axis_label(name) -> str:
     """The label of a parameter or result, by its name in fivjax."""
     long_name, unit = QUANTITIES.get(str(name), (str(name), "1"))
-    return with_unit(long_name + SYMBOLS.get(str(name), ""), unit)
+    symbols = {"mu": r" $\mu$", "p": " $p$"}
+    return with_unit(long_name + symbols.get(str(name), ""), unit)
 
 
 def variable_label(variable: xr.DataArray) -> str:

@@ -7,9 +7,6 @@ from matplotlib.lines import Line2D
 
 from .style import BLUE, check_dataset, new_figure
 
-# One for each method, filled for double precision.
-MARKERS = "os^Dv<>pPX*hd"
-
 
 def tradeoff(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """A work–precision diagram of `fj.tradeoff`: the cost of a trajectory per period over the error of its state.
@@ -22,8 +19,10 @@ def tradeoff(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     figure = new_figure(figure, 8.4, 4.8)
     axes = figure.add_subplot(xscale="log", yscale="log")
     handles = []
+    # One for each method, filled for double precision.
+    markers = "os^Dv<>pPX*hd"
     for k, name in enumerate(dataset["stepper"].values):
-        marker = MARKERS[k % len(MARKERS)]
+        marker = markers[k % len(markers)]
         handles.append(Line2D([], [], color=BLUE, ls="", marker=marker, label=str(name)))
         for kind in dataset["precision"].values:
             point = dataset.sel(stepper=name, precision=kind)

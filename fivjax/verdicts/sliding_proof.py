@@ -23,13 +23,6 @@ from ..model.friction_per_contact import FrictionPerContact
 from ..model.scene import Scene
 from ..model.sliding import sliding_states
 
-ENVELOPE_DECADES = 12.0
-ENVELOPE_INSTANTS = 161
-# Modes whose eigenvalues are this close, relative to the largest, are bounded together, because they may be nearly parallel.
-CLOSE = 0.2
-# States are computed from modal coordinates only where the condition number of the modes is below this.
-WELL_CONDITIONED = 1e5
-
 
 class SlidingModes(eqx.Module):
     """`LinearSliding` in modal coordinates w = V⁻¹z; of a conjugate pair only the upper mode is kept, counted twice."""
@@ -86,12 +79,14 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
     count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
     from_modal = np.einsum("gk,gmk->gmk", count, vectors)
+    # States are computed from modal coordinates only where the condition number of the modes is below this.
+    well_conditioned = 1e5
     return SlidingModes(
         linear=linear,
         eigenvalues=eigenvalues,
         to_modal=inverse,
         from_modal=from_modal,
-        regular=condition < WELL_CONDITIONED,
+        regular=condition < well_conditioned,
         pressing=_of_modes(linear.pressing, from_modal),
         slip=_of_modes(linear.slip, from_modal),
         remainder=_in_modes(np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
@@ -128,7 +123,10 @@ def _slowest_period(eigenvalues: np.ndarray) -> np.ndarray:
 
 def _clusters(eigenvalues: np.ndarray) -> np.ndarray:
     """For each set of eigenvalues, in falling order of frequency, clusters of close modes as rows of ones and zeros."""
-    gaps = np.abs(np.diff(eigenvalues, axis=-1)) > CLOSE * np.abs(eigenvalues[:, :1])
+    # Modes whose eigenvalues are this close, relative to the largest, are bounded together, because they may be nearly
+    # parallel.
+    close = 0.2
+    gaps = np.abs(np.diff(eigenvalues, axis=-1)) > close * np.abs(eigenvalues[:, :1])
     number = np.cumsum(np.concatenate([np.zeros((len(gaps), 1), int), gaps], axis=-1), axis=-1)
     return (number[:, None, :] == np.arange(number.max() + 1)[:, None]).astype(float)
 
@@ -230,8 +228,10 @@ def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
     # Long enough for a sum of sizes that is 10⁵ times too large to decay, and finer at the beginning, where the motion is
     # large.
     slowest = 1e-6 * np.max(np.abs(own), axis=-1, keepdims=True) + 1e-300
-    horizon = ENVELOPE_DECADES / np.maximum(-mean.real, slowest)
-    t = horizon * np.linspace(0.0, 1.0, ENVELOPE_INSTANTS)[:, None] ** 2
+    decades = 12.0
+    instants = 161
+    horizon = decades / np.maximum(-mean.real, slowest)
+    t = horizon * np.linspace(0.0, 1.0, instants)[:, None] ** 2
     with np.errstate(over="ignore", invalid="ignore"):
         growth = members * np.exp(offsets * t)
         return Envelope(

@@ -13,11 +13,6 @@ from ..contact import Contact, Mechanics, State, Status
 from ..model.sliding import sliding_states
 from .sliding_proof import SlidingModes
 
-# The share of the time for which sliding is certain that is used, because rounding must not lead past an event.
-USED = 0.999
-# Times shorter than so many periods are left to the stepper.
-LEAST_PERIODS = 4.0
-
 
 def slid_on(
     mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State, allowed: Bool[Array, ""]
@@ -33,9 +28,13 @@ def slid_on(
     sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & linear.exists & allowed
     sizes = jnp.stack([jnp.sum(jnp.abs(shares * modal)) for shares in (modes.pressing, modes.slip)])
     margins = jnp.stack([linear.pressing_margin, linear.slip_margin])
-    time = USED * jnp.min(jnp.log(margins / sizes)) / growth
+    # The share of the time for which sliding is certain that is used, because rounding must not lead past an event.
+    used = 0.999
+    time = used * jnp.min(jnp.log(margins / sizes)) / growth
     frequency = jnp.max(jnp.where(modes.eigenvalues.real >= growth, modes.eigenvalues.imag, 0.0))
-    worthwhile = time * frequency > LEAST_PERIODS * 2 * jnp.pi
+    # Times shorter than so many periods are left to the stepper.
+    least_periods = 4.0
+    worthwhile = time * frequency > least_periods * 2 * jnp.pi
     taken = sliding & modes.regular & (growth > 0) & worthwhile & jnp.isfinite(time)
     time = jnp.where(taken, time, 0.0)
     moved = (modes.from_modal @ (jnp.exp(modes.eigenvalues * time) * modal)).real

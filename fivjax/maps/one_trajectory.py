@@ -1,28 +1,31 @@
-"""One trajectory on its way to a verdict: its beginning, and one step.
+"""One trajectory on its way to a verdict: how it begins, one step of it, and what can be proved of it by then.
 
-Everything here is written for one trajectory; `rounds` follows many. States are deviations from the sliding equilibrium under
-the final load, so that rounding errors are relative to the deviation and not to the total displacement.
+States are deviations from the sliding equilibrium under the final load, so that rounding errors are relative to the deviation
+and not to the total displacement. Many trajectories are followed by `following`; capture by attractors is tested in `capture`.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
-from ..contact import Contact, Mechanics, State
+from ..contact import Contact, State
 from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.propagation import Propagation
-from ..verdicts.sliding_proof import SlidingModes
+from ..verdicts.sliding_proof import used_up
+from ..verdicts.slow_growth import slid_on
+from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .groups import Shared
 
-# The longest advance with an energy ledger, s.
-LONGEST_ENTRY = 1.0
+# A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
+UNBOUNDED_FROM = 1e9
 
 
 class Progress(eqx.Module):
@@ -71,8 +74,9 @@ class LoadSteps(eqx.Module):
         self.loads = jax.vmap(load)(between) - load.final
 
 
-def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool, for_kernel: bool) -> Progress:
+def at_equilibrium(scene: Scene, shared: Shared, energy: bool, for_kernel: bool) -> Progress:
     """A trajectory at the sliding equilibrium of its scene, before the kick."""
+    modes = shared.modes
     q, _ = steady_sliding(scene, scene.load.force)
     equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
     # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
@@ -87,7 +91,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool,
         t=jnp.zeros((), y.dtype),
         skipped=jnp.zeros((), y.dtype),
         y=y,
-        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
+        contact=physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y),
         crossing=jnp.full_like(y, jnp.nan),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
@@ -98,7 +102,7 @@ def begin(scene: Scene, mechanics: Mechanics, modes: SlidingModes, energy: bool,
     )
 
 
-def placed(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...], values) -> Progress:
+def with_initial_values(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...], values) -> Progress:
     """The trajectory with total values (not deviations) at these indices of its initial state; NaN leaves an entry as it is."""
     if not places:
         return now
@@ -109,17 +113,6 @@ def placed(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...],
     return eqx.tree_at(
         lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
     )
-
-
-def released(scene: Scene, modes: SlidingModes, now: Progress, load: Float[Array, ""]) -> Progress:
-    """The trajectory released from rest under `load` times its final load, at a time after all kicks; if `load` is NaN, the
-    trajectory as it is.
-    """
-    q, _ = steady_sliding(scene, load * scene.load.final)
-    deviation = jnp.concatenate([q, jnp.zeros_like(q)]) - modes.linear.equilibrium
-    after = deviation, jnp.max(scene.load.jumps, initial=0.0)
-    chosen = jax.tree.map(lambda new, old: jnp.where(jnp.isnan(load), old, new), after, (now.y, now.t))
-    return eqx.tree_at(lambda now: (now.y, now.t), now, chosen)
 
 
 def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
@@ -133,11 +126,11 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
     return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))
 
 
-def step(setting: Setting, now: Progress) -> Progress:
+def with_step(setting: Setting, now: Progress) -> Progress:
     """The trajectory after one more step, which ends at the next event at the latest."""
     scene, method = setting.scene, setting.method
     # At rest an exact stepper would take an infinite step, over which work cannot be integrated.
-    longest = method.dt if now.energy is None else min(method.dt, LONGEST_ENTRY)
+    longest = method.dt if now.energy is None else min(method.dt, 1.0)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
     assert not isinstance(method, Propagation)
@@ -158,12 +151,12 @@ def step(setting: Setting, now: Progress) -> Progress:
         last_event=jnp.where(changed, t, now.last_event),
         verdict=now.verdict,
         bound=now.bound,
-        energy=None if now.energy is None else _entered(setting, now.energy, now, load, after, t),
+        energy=None if now.energy is None else _with_entry(setting, now.energy, now, load, after, t),
         steps=now.steps,
     )
 
 
-def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
+def _with_entry(setting: Setting, energy: EnergyRecord, before: Progress, load, after: Advance, t) -> EnergyRecord:
     scene = setting.scene
     segment = Segment(before.t, load, before.contact, before.y, after)
     ledger = enter(EnergyData(scene), setting.method, setting.shared.mechanics, energy.ledger, segment)
@@ -171,3 +164,52 @@ def _entered(setting: Setting, energy: EnergyRecord, before: Progress, load, aft
     just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
     vibration = mechanical_energy(scene.structure, after.y)
     return EnergyRecord(ledger, jnp.where(just_kicked, vibration, energy.vibration))
+
+
+def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progress:
+    """The trajectory with its verdict, if one can be proved by now.
+
+    `began` is the time (s) at which the present round of steps began.
+    """
+    scene, mechanics, modes = setting.scene, setting.shared.mechanics, setting.shared.modes
+    structure = scene.structure
+    weights = structure.weights
+    equilibrium, velocity = modes.linear.equilibrium, structure.size + mechanics.tangential
+    belt = weights[velocity] * jnp.abs(scene.belt_speed)
+    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + (jnp.max(belt) if mechanics.several else belt)
+    grown = jnp.max(jnp.abs(weights * now.y)) > UNBOUNDED_FROM * yardstick
+    # There is no proof that several contacts stick for ever.
+    jammed = jnp.asarray(False)
+    if setting.shared.drift is not None:
+        jammed = sticks_forever(setting.shared.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
+    quiet_load = jnp.all(scene.load.jumps <= now.t)
+    bound = used_up(mechanics, modes, now.contact, now.y, quiet_load)
+    verdict = jnp.where(
+        ~jnp.all(jnp.isfinite(now.y)),
+        Verdict.NOT_FINITE,
+        jnp.where(
+            now.t <= began,
+            Verdict.TOO_MANY_EVENTS,
+            jnp.where(
+                bound < 1,
+                Verdict.SLIDING,
+                jnp.where(quiet_load & (jammed | grown), Verdict.UNBOUNDED, Verdict.UNDECIDED),
+            ),
+        ),
+    )
+    now = eqx.tree_at(lambda now: (now.verdict, now.bound), now, (verdict.astype(jnp.int8), bound))
+    return _with_sliding(setting, now, quiet_load) if _may_slide_on(setting, now) else now
+
+
+def _may_slide_on(setting: Setting, now: Progress) -> bool:
+    """Whether a motion that grows slowly may skip the time to its next event: with one contact, constant friction, an exact
+    method, and without an energy ledger.
+    """
+    mechanics = setting.shared.mechanics
+    return not mechanics.several and mechanics.friction.constant and np.isinf(setting.method.dt) and now.energy is None
+
+
+def _with_sliding(setting: Setting, now: Progress, quiet_load: Bool[Array, ""]) -> Progress:
+    open_ = quiet_load & (now.verdict == Verdict.UNDECIDED)
+    y, time = slid_on(setting.shared.mechanics, setting.shared.modes, now.contact, now.y, open_)
+    return eqx.tree_at(lambda now: (now.t, now.skipped, now.y), now, (now.t + time, now.skipped + time, y))

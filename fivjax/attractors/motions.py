@@ -1,0 +1,46 @@
+"""Motions of many groups on the Poincaré section, in rows, as the searches for attractors follow them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..contact import Status
+from ..section.return_maps import Section
+
+# Motions of a group from which attractors are sought at a time.
+NOMINATED = 2
+
+
+class Motions(NamedTuple):
+    """Motions in rows: the group of each, and where it is on the section, or on the way to it."""
+
+    group: Int[np.ndarray, " m"]
+    at: Section
+
+    def rows(self, chosen) -> "Motions":
+        return Motions(self.group[chosen], self.at.rows(chosen))
+
+
+def far_apart(
+    states: Float[np.ndarray, "m 2n"], group, chosen: Bool[np.ndarray, " m"], most: int = NOMINATED
+) -> Int[np.ndarray, " r"]:
+    """A few of the chosen rows of each group, far from each other."""
+    picked: list[int] = []
+    for g in np.unique(group[chosen]):
+        rows = np.flatnonzero(chosen & (group == g))
+        mine = [rows[0]]
+        away = np.linalg.norm(states[rows] - states[rows[0]], axis=1)
+        while len(mine) < min(most, len(rows)):
+            mine.append(rows[np.argmax(away)])
+            away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
+        picked += mine
+    return np.array(picked, int)
+
+
+def section_at(
+    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
+) -> Section:
+    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
+    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
+    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))
