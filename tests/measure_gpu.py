@@ -1,10 +1,11 @@
 """Maps on a GPU, compared with the same maps on the CPU of that machine, in one run.
 
-    python tests/measure_gpu.py [paper|falling|two ...] [points of a side, such as 64 256 1024]
+    python tests/measure_gpu.py [paper|falling|two|motions ...] [points of a side, such as 64 256 1024]
 
 The kernels run on the GPU (with `JAX_PLATFORMS=cpu,cuda` all programs of XLA stay on the CPU, which is faster for them); those of
 the run beside it on the CPU. A row gives the first map of a process, the best of two more, and how many cycles of the belt
-oscillator all trajectories together pass through in a second of it. Without a GPU the CPU is compared with itself.
+oscillator all trajectories together pass through in a second of it. `motions` leaves out verdicts: kernels follow as many motions
+as such a map has for a second each. Without a GPU the CPU is compared with itself.
 
 Verdicts that differ are checked: within 1e-9 of the critical kick rounding decides, elsewhere a difference is an error.
 """
@@ -42,8 +43,31 @@ def axes_of(kind: str, points: int) -> dict[str, np.ndarray]:
     return {mu: np.linspace(0.15, 0.2275, points), "p": np.linspace(1.0, 1.6, points)}
 
 
+def motions(points: int) -> dict[str, np.ndarray]:
+    """The same for motions of a second under constant friction, from the kernel of `simulate`: its last states as amplitudes."""
+    from fivjax.foundation.kernel_text import Form
+    from fivjax.simulation import motion
+
+    rng, rows, form, times = np.random.default_rng(0), [], None, np.array([[0.0, 1.0]])
+    for _ in range(256):
+        mu, v, p = rng.uniform((0.15, 1.0, 1.1), (0.2275, 3.0, 1.6))
+        scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), v, fj.Pulse(100.0, p))
+        form, arrays = Form.of((scene, None, np.asarray(4000, np.int32), motion.How(fj.EventExact(), False)))
+        rows.append(np.concatenate([np.ravel(array).astype(float) for array in arrays]))
+    given, seconds, last = np.tile(rows, (points**2 // 256, 1)), [], None
+    for _ in range(3):
+        begin = time.perf_counter()
+        _, last = motion._by_kernel.of_many(form, given, times)
+        seconds.append(time.perf_counter() - begin)
+    states = np.abs(last["displacement"][:, -1])
+    cycles = FREQUENCY * len(given) / min(seconds[1:])
+    return {"seconds": np.array(seconds), "cycles": cycles, "verdict": np.ones_like(states), "amplitude": states}
+
+
 def measured(kind: str, points: int) -> dict[str, np.ndarray]:
     """Wall times of the first map and of two more, and the results of the last one."""
+    if kind == "motions":
+        return motions(points)
     seconds = []
     for _ in range(3):
         begin = time.perf_counter()
@@ -64,9 +88,8 @@ def on_the_cpu(kind: str, points: int) -> dict[str, np.ndarray]:
 
 
 def compared(kind: str, points: int, here: dict, there: dict) -> None:
-    differ, axes = np.argwhere(here["verdict"] != there["verdict"]), axes_of(kind, points)
-    (name, values), (_, kicks) = axes.items()
-    rounding = 0
+    differ, rounding = np.argwhere(here["verdict"] != there["verdict"]), 0
+    (name, values), (_, kicks) = axes_of(kind, points).items()
     for i, j in differ[:20]:
         found = fj.critical_perturbation(scene_of(kind).replace(**{name: values[i]}), tolerance=1e-11, progress=False)
         rounding += abs(float(found["p_crit"]) - kicks[j]) < ROUNDING
