@@ -41,13 +41,16 @@ class Kernel:
         own = function.differentiated if width else function.function
         self.function, self.form, self.wide, self.width = own, form, wide, width
         self.text = text(kept_value(written, own, form, wide, folder=folder_of_texts()))
+        self._kernel = None
         self.directions = sum(array.size for array, is_wide in zip(form.arrays, wide, strict=False) if is_wide)
 
-    @functools.cached_property
+    @property
     def kernel(self):
         """What Warp launches; compiled at its first launch, because JAX may ask for shapes and call only the derivatives."""
         with ONE_AT_A_TIME:
-            return _compiled(self.text.source, self.text.widths, self.directions, self.width)
+            if self._kernel is None:
+                self._kernel = _compiled(self.text.source, self.text.widths, self.directions, self.width)
+            return self._kernel
 
     def launched(self, given, instants, dots=None, pool: Executor | None = None):
         """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
@@ -78,10 +81,10 @@ class Kernel:
 
     def launch_on_cpu(self, arrays: list, pool: Executor | None = None) -> None:
         """The same for arrays of Warp's, in as many threads as there are cores."""
-        wp, lanes = warp(), arrays[len(GIVEN)].shape[0]
+        wp, kernel, lanes = warp(), self.kernel, arrays[len(GIVEN)].shape[0]
 
         def run(part: tuple[int, int]) -> None:
-            wp.launch(self.kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
+            wp.launch(kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
 
         if lanes == 1:
             run((0, lanes))
