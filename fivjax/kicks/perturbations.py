@@ -10,17 +10,19 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from ..contact import Contact, Status
 from ..foundation.kept_programs import kept
+from ..foundation.kernel_functions import KernelFunction
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import sliding_states
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS
+from ..section.crossings import MOST_SEGMENTS, How
 from ..steppers.core import follow
 from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.kernel_scope import has_kernel
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 
 # Instants per period of the fastest mode, during a history and afterwards.
@@ -148,6 +150,9 @@ class Histories:
     def __init__(self, scene: Scene, pieces: int, time: float):
         self.scene, self.pieces, self.time = scene, pieces, time
         self.sliding = stable_sliding(scene)
+        stepper = EventExact()
+        self.by_kernel = has_kernel(scene, stepper)
+        self.given = How(for_derivatives(stepper)), scene, np.asarray(float(time))
 
     def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
         return np.max(np.abs(u), axis=-1)
@@ -156,15 +161,17 @@ class Histories:
         return np.sign(gradient)
 
     def states(self, u: Vectors) -> Float[np.ndarray, "k state"]:
-        found = []
-        for start in range(0, len(u), SIDE_BY_SIDE):
-            # Padded with copies, so that one size is compiled.
-            rows = np.minimum(np.arange(start, start + SIDE_BY_SIDE), len(u) - 1)
-            found.append(np.asarray(_after(self.scene, EventExact(), jnp.asarray(u[rows]), self.time)))
+        found, size = [], len(u) if self.by_kernel else SIDE_BY_SIDE
+        for start in range(0, len(u), size):
+            # Padded with copies, so that XLA compiles one size.
+            rows = np.minimum(np.arange(start, start + size), len(u) - 1)
+            found.append(_after_history(self.given, np.zeros(1), own=(u[rows],), by_kernel=self.by_kernel)[0])
         return np.concatenate(found)[: len(u)]
 
     def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
-        return gradient @ np.asarray(_after_with_jacobian(self.scene, EventExact(), jnp.asarray(u), self.time))
+        args = *self.given, u
+        _, (slopes, _) = _after_history.derived_by(args, np.zeros(1), u, np.eye(len(u)), by_kernel=self.by_kernel)
+        return gradient @ slopes
 
     def certificate(self) -> Certificate:
         rates = np.asarray(self.sliding.modes.eigenvalues)
@@ -248,27 +255,21 @@ def _highest(sizes: np.ndarray) -> list[int]:
     return [low + int(np.argmax(sizes[low:high])) for low, high in parts if high > low]
 
 
-@kept
-def _after(scene: Scene, stepper: EventExact, factors, time):
-    return jax.vmap(lambda one: _after_one(scene, stepper, one, time))(factors)
-
-
-@kept
-def _after_with_jacobian(scene: Scene, stepper: EventExact, factors, time):
-    return jax.jacfwd(lambda one: _after_one(scene, stepper, one, time))(factors)
-
-
-def _after_one(scene: Scene, stepper: EventExact, factors: Float[Array, " m"], time) -> Float[Array, " state"]:
+def _at_end(args, _):
     """The state after a history of the load that began in steady sliding."""
+    how, scene, time, factors = args
     mechanics, n = mechanics_about_sliding(scene), scene.structure.size
-    stepper = for_derivatives(stepper)
 
     def piece(carry, factor):
         y, contact = carry
         # Loads are deviations from the final load.
         more, part = factor * scene.load.final, time / len(factors)
-        after = follow(stepper, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
+        after = follow(how.method, mechanics, contact, more, y, part, most=MOST_SEGMENTS, kind="lax")
         return (after.y, after.contact), None
 
     sliding = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.sign(scene.belt_speed))
-    return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0]
+    return jax.lax.scan(piece, (jnp.zeros(2 * n), sliding), factors)[0][0], ()
+
+
+# Of (how, scene, time in s, factors on the load).
+_after_history = KernelFunction(_at_end)

@@ -20,14 +20,15 @@ from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics
-from ..foundation.compiling import compiled
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import in_double_precision
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
-from ..section.crossings import MOST_SEGMENTS
+from ..section.crossings import MOST_SEGMENTS, How
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact, for_derivatives
+from ..steppers.kernel_scope import has_kernel
 from .response import directions_of
 
 # The most events that are compared; and the longest time in which two motions separate, in slowest periods.
@@ -66,11 +67,11 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
     """
     stepper, (low, high) = EventExact(), bracket
     period = float(slowest_period(scene.structure))
-    # Padded to a fixed number of directions, so that one program is compiled.
-    directions = directions_of(scene, ("p", *names) + ("p",) * (-(len(names) + 1) % 16))
+    directions = directions_of(scene, ("p", *names))
 
     def events(p: float) -> _Events:
-        return _Events(*map(np.asarray, _events(scene.replace(p=p), stepper)))
+        found, _ = _to_events((How(stepper), scene.replace(p=p)), np.zeros(1), by_kernel=has_kernel(scene, stepper))
+        return found
 
     below, above, found = events(low), events(high), None
     for _ in range(MOST_TOUCHES):
@@ -139,78 +140,99 @@ def _begun(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], Float[Ar
     return mechanics, physics.status_from_forces(mechanics, more, y), more, y
 
 
-@compiled
-def _events(scene: Scene, stepper: EventExact) -> _Events:
+def _find_events(args, _):
+    """The events of the motion after the kick."""
+    how, scene = args
     mechanics, contact, more, y = _begun(scene)
 
-    def observe(total: tuple, segment: Segment):
-        found, since = total
-        ended = segment.after.ended.reshape(-1)
-        happened = jnp.any(ended)
-        place = jnp.where(happened, found.count, MOST_EVENTS)
-        found = _Events(
-            found.time.at[place].set(since + segment.t + segment.after.h, mode="drop"),
-            found.status.at[place].set(segment.contact.status, mode="drop"),
-            found.guard.at[place].set(jnp.argmax(ended).astype(jnp.int32), mode="drop"),
-            found.count + happened,
+    def stretch(carry, part):
+        begin, y, contact, found = carry
+        h, load = part
+
+        def observe(found: _Events, segment: Segment):
+            ended = segment.after.ended.reshape(-1)
+            happened = jnp.any(ended)
+            place = jnp.where(happened, found.count, MOST_EVENTS)
+            return _Events(
+                found.time.at[place].set(begin + segment.t + segment.after.h, mode="drop"),
+                found.status.at[place].set(segment.contact.status, mode="drop"),
+                found.guard.at[place].set(jnp.argmax(ended).astype(jnp.int32), mode="drop"),
+                found.count + happened,
+            )
+
+        after = follow(
+            how.method,
+            mechanics,
+            contact,
+            load,
+            y,
+            h,
+            total=found,
+            observe=observe,
+            until=lambda found: found.count >= MOST_EVENTS,
+            most=64 * MOST_SEGMENTS,
+            kind="lax",
         )
-        return found, since
+        return (begin + h, after.y, after.contact, after.total), None
 
     none, zero = jnp.zeros(MOST_EVENTS, jnp.int32), jnp.zeros((), y.dtype)
-    total = (_Events(jnp.full(MOST_EVENTS, jnp.inf), none, none, jnp.zeros((), jnp.int32)), zero)
-    common = {
-        "observe": observe,
-        "until": lambda total: total[0].count >= MOST_EVENTS,
-        "most": 64 * MOST_SEGMENTS,
-        "kind": "lax",
-    }
-    during = follow(stepper, mechanics, contact, more, y, scene.load.duration, total=total, **common)
-    total = (during.total[0], jnp.asarray(scene.load.duration, y.dtype))
-    longest = MOST_TIME * longest_return(scene)
-    return follow(
-        stepper, mechanics, during.contact, jnp.zeros_like(more), during.y, longest, total=total, **common
-    ).total[0]
+    nothing = _Events(jnp.full(MOST_EVENTS, jnp.inf), none, none, jnp.zeros((), jnp.int32))
+    # In the kick, and after it.
+    parts = jnp.stack([jnp.asarray(scene.load.duration, y.dtype), MOST_TIME * longest_return(scene)])
+    carry, _ = jax.lax.scan(stretch, (zero, y, contact, nothing), (parts, jnp.stack([more, jnp.zeros_like(more)])))
+    return carry[3], ()
+
+
+_to_events = KernelFunction(_find_events)
 
 
 def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, events: int, guard: int):
     """A guard at a time after `events` events, its time derivative, and the derivatives of both along directions of the
     parameters.
     """
-    found = _guard_with_derivatives(
-        scene, stepper, directions, jnp.asarray(time), jnp.asarray(events, jnp.int32), jnp.asarray(guard, jnp.int32)
+    args = How(for_derivatives(stepper)), scene, np.asarray(time), np.int32(events), np.int32(guard)
+    count = len(jax.tree.leaves(directions)[0])
+    # By time, then along the directions.
+    along = jax.tree.map(
+        lambda leaf: np.moveaxis(np.pad(leaf, [(1, 0)] + [(0, 0)] * (leaf.ndim - 1)), 0, -1), directions
     )
-    value, slope, of_parameters = map(np.asarray, found)
-    return float(value), float(slope), of_parameters
+    still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), 1 + count)), args)
+    moving = still[0], along, np.eye(1, 1 + count)[0], *still[3:]
+    by_kernel = has_kernel(scene, stepper)
+    (value, _), (slopes, _) = _to_guard.derived(args, np.zeros(1), moving, by_kernel=by_kernel)
+    return float(value), float(slopes[0]), slopes[1:]
 
 
-@compiled
-def _guard_with_derivatives(scene: Scene, stepper: EventExact, directions: Scene, time, events, guard):
-    def of(scene: Scene, time: Float[Array, ""]) -> Float[Array, ""]:
-        mechanics, contact, more, y = _begun(scene)
-        short = for_derivatives(stepper)
-        duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
-        in_kick = jnp.minimum(time, duration)
-        none = jnp.zeros_like(more)
-        for h, load in ((in_kick, more), (time - in_kick, none)):
-            after = follow(
-                short,
-                mechanics,
-                contact,
-                load,
-                y,
-                h,
-                total=happened,
-                observe=lambda total, segment: total + jnp.any(segment.after.ended),
-                until=lambda total: total >= events,
-                most=64 * MOST_SEGMENTS,
-                kind="lax",
-            )
-            # After the last event the motion goes on in this mode, regardless of its guards.
-            y = short.in_one_mode(mechanics, after.contact, after.y, after.left, load)
-            contact, happened = after.contact, after.total
-        guards = physics.guards(mechanics, contact, jnp.where(time < duration, more, none), y)
-        return guards.reshape(-1)[guard]
+def _find_guard(args, _):
+    how, scene, time, events, guard = args
+    mechanics, contact, more, y = _begun(scene)
+    duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
 
-    value, slope = jax.jvp(lambda time: of(scene, time), (time,), (jnp.ones_like(time),))
-    along = jax.vmap(lambda direction: jax.jvp(lambda scene: of(scene, time), (scene,), (direction,))[1])
-    return value, slope, along(directions)
+    def stretch(carry, part):
+        y, contact, happened = carry
+        h, load = part
+        after = follow(
+            how.method,
+            mechanics,
+            contact,
+            load,
+            y,
+            h,
+            total=happened,
+            observe=lambda total, segment: total + jnp.any(segment.after.ended),
+            until=lambda total: total >= events,
+            most=64 * MOST_SEGMENTS,
+            kind="lax",
+        )
+        # After the last event the motion goes on in this mode, regardless of its guards.
+        y = how.method.in_one_mode(mechanics, after.contact, after.y, after.left, load)
+        return (y, after.contact, after.total), None
+
+    in_kick, none = jnp.minimum(time, duration), jnp.zeros_like(more)
+    parts = jnp.stack([in_kick, time - in_kick]), jnp.stack([more, none])
+    (y, contact, _), _ = jax.lax.scan(stretch, (y, contact, happened), parts)
+    guards = physics.guards(mechanics, contact, jnp.where(time < duration, more, none), y)
+    return guards.reshape(-1)[guard], ()
+
+
+_to_guard = KernelFunction(_find_guard)
