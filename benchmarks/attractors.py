@@ -1,8 +1,8 @@
 """Attractors: those of a call against those of a map, tori against long runs, and verdicts near Hopf points.
 
-    python tests/measure_attractors.py agree [N [SEED]]    # N random scenes, 200 unless given
-    python tests/measure_attractors.py tori [N [SEED]]     # N scenes with tori, 20 unless given
-    python tests/measure_attractors.py hopf [N [SEED]]     # N structures of 35 trajectories each, 12 unless given
+    python -m benchmarks.attractors agree [N [SEED]]    # N random scenes, 200 unless given
+    python -m benchmarks.attractors tori [N [SEED]]     # N scenes with tori, 20 unless given
+    python -m benchmarks.attractors hopf [N [SEED]]     # N structures of 35 trajectories each, 12 unless given
 
 `agree` draws random structures, oscillators about the paper's under constant and falling friction, and two or three of them coupled
 by springs. Each attractor of a map over seven kicks must be among `limit_cycles`, of the same kind, with amplitude and period to 1e-3
@@ -16,12 +16,12 @@ import time
 from collections import Counter
 
 import numpy as np
-import reference
-from measure_verdicts import draw
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 import fivjax as fj
+from benchmarks.verdicts import draw
+from tests.helpers import reference
 
 USUAL = fj.belt_oscillator().parameters
 KICKS = np.array([0.0, 1.2, 1.6, 2.2, 3.0, 4.5, 6.0])

@@ -1,6 +1,6 @@
 """Branches of limit cycles against an ODE solver and the independent solver in `reference`.
 
-    python tests/measure_branches.py [benchmark_a] [births] [cost]
+    python -m benchmarks.branches [benchmark_a] [births] [cost]
 
 `benchmark_a`: both ends of the unstable branch of benchmark A. `births`: the friction at which the paper's limit cycle appears
 at belt speeds 1 and 3, and the independent solver's motions 1e-4 above and below it. `cost`: seconds for a branch, once its
@@ -11,10 +11,10 @@ import argparse
 import time
 
 import numpy as np
-import reference
-from reference import cycles
 
 import fivjax as fj
+from tests.helpers import reference
+from tests.helpers.reference import cycles
 
 
 def paper(belt_speed: float, mu: float, p: float = 1.2) -> fj.Scene:

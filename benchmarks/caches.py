@@ -1,6 +1,6 @@
 """Damage to what is kept of compiled code, and kills while it, or a result, is written.
 
-    python tests/measure_caches.py [damages] [maps] [kills] [calibrations]
+    python -m benchmarks.caches [damages] [maps] [kills] [calibrations]
 
 Each word picks one study; without any, all run. `CACHES_MAPS` sets how many runs of `fivjax map` with damaged files there are (20
 unless given), `FIVJAX_TIMES` how many kills of `fivjax calibrate` (50). Right is: what is read is what was written, or nothing; a map of damaged files has the bits of one without any;
@@ -21,11 +21,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-import recordings
 import xarray as xr
 
 import fivjax as fj
 from fivjax.foundation import kept_folder, kept_kernels
+from tests.helpers import recordings
 
 FLIPS, KILLS, MAPS = 200, 50, int(os.environ.get("CACHES_MAPS", "20"))
 CALIBRATIONS = int(os.environ.get("FIVJAX_TIMES", "50"))

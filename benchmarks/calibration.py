@@ -1,6 +1,6 @@
-"""Errors of recovered parameters, and the time of a calibration: `python tests/measure_calibration.py`.
+"""Errors of recovered parameters, and the time of a calibration: `python -m benchmarks.calibration`.
 
-    python tests/measure_calibration.py [recovery] [points] [quiet] [cost] [--draws=100] [--case="limit cycle"] [--free=3] [--rate=1000]
+    python -m benchmarks.calibration [recovery] [points] [quiet] [cost] [--draws=100] [--case="limit cycle"] [--free=3] [--rate=1000]
 
 Each word picks one study; `--case`, `--free` and `--rate` one of the recordings, of the numbers of free parameters and of the
 rates. Every draw has its
@@ -14,11 +14,11 @@ import time
 from collections import Counter
 
 import numpy as np
-from recordings import CASES, FREE, case, noisy, off, paper, points, recording, times
 from scipy.stats import binomtest
 from tqdm import tqdm
 
 import fivjax as fj
+from tests.helpers.recordings import CASES, FREE, case, noisy, off, paper, points, recording, times
 
 
 def draws(name: str, count: int, total: int, starts: int = 4) -> None:

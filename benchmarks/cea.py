@@ -1,4 +1,4 @@
-"""Measure the linear theory: `python tests/measure_cea.py`.
+"""Measure the linear theory: `python -m benchmarks.cea`.
 
 Prints the library's results beside those of independent routes (Eq. 3 typed out, NumPy's eigenvalues, SciPy's `brentq`; see
 `linear_reference`), and the time they take.
@@ -7,11 +7,11 @@ Prints the library's results beside those of independent routes (Eq. 3 typed out
 import time
 
 import jax
-import linear_reference as reference
 import numpy as np
 
 import fivjax as fj
 from fivjax.linear import cea, design
+from tests.helpers import linear_reference as reference
 
 
 def heading(text):

@@ -1,6 +1,6 @@
 """Critical kicks by Newton's method and their derivatives, against an independent event-exact solver.
 
-    python tests/measure_critical.py [table2] [random] [derivatives] [cost]
+    python -m benchmarks.critical [table2] [random] [derivatives] [cost]
 
 `table2`: the kicks of Table 2, by Newton's method and by bisection with the independent solver. `random`: the same for ten
 random structures. `derivatives`: all of them at two points of each kind against differences of the independent solver's kicks.
@@ -11,11 +11,11 @@ import argparse
 import time
 
 import numpy as np
-import reference
 
 import fivjax as fj
 from fivjax.kicks.critical_derivatives import differentiable
 from fivjax.kicks.stable_manifold import critical_kick
+from tests.helpers import reference
 
 SPEEDS = (0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0)
 

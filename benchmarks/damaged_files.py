@@ -1,6 +1,6 @@
 """Damaged files of 18 formats, each read in a process of its own with 10 s and 2 GB: what comes of them.
 
-    python tests/measure_damaged_files.py [format] …
+    python -m benchmarks.damaged_files [format] …
 
 `FIVJAX_TIMES` is the number of files of each format (200 unless given). A file is "ok" if it is read all the same, "refused" if
 a `ValueError` says what is wrong. Nothing else may come: the exit code is 1 if it does, and the files are kept in the folder

@@ -1,6 +1,6 @@
 """Figures of the energy ledger, as `docs/measurements.md` states them.
 
-    python tests/measure_energy.py [balance] [conservation] [tradeoff] [cost] [paper] [critical]
+    python -m benchmarks.energy [balance] [conservation] [tradeoff] [cost] [paper] [critical]
 
 Each word picks one study; without any, all run (some minutes on two cores).
 """

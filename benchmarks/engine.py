@@ -1,8 +1,8 @@
 """What a first call costs in a fresh process, and what later calls cost: trajectories, their derivatives, cycles, kicks, branches.
 
-    python tests/measure_engine.py first    # CPU seconds of fresh processes, in those of a first solve of diffrax in the same run
-    python tests/measure_engine.py warm     # milliseconds of calls after the first
-    python tests/measure_engine.py bulk     # cycles of vibration of many trajectories in one call
+    python -m benchmarks.engine first    # CPU seconds of fresh processes, in those of a first solve of diffrax in the same run
+    python -m benchmarks.engine warm     # milliseconds of calls after the first
+    python -m benchmarks.engine bulk     # cycles of vibration of many trajectories in one call
 
 `first` runs every call twice in a cache of kernels of its own: with nothing built, and with the kernels that the first run
 kept. A process' CPU seconds include its imports and all threads. Ratios are what counts: the machine may be busy, and a solve of

@@ -1,7 +1,7 @@
 """Executors of a map's jobs: the same bits everywhere, workers that are killed, the cost of processes, Dask and loky, store and
 memory.
 
-    python tests/measure_executors.py [overhead] [killed] [killed_dask] [size]
+    python -m benchmarks.executors [overhead] [killed] [killed_dask] [size]
 
 `FIVJAX_POINTS` (default 320) squared is the number of trajectories of the large map, an eighth of it values of μ. Set `JAX_COMPILATION_CACHE_DIR` to a
 folder: every worker is a new process.

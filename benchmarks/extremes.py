@@ -1,6 +1,6 @@
 """Extreme parameters: the table and figures of `docs/measurements.md`.
 
-    python tests/measure_extremes.py [trajectories] [confirm] [energy] [table] [rows_apart] [resume] [refusals]
+    python -m benchmarks.ranges [trajectories] [confirm] [energy] [table] [rows_apart] [resume] [refusals]
 
 Each word picks one study; without any, all run. `EXTREMES_TRAJECTORIES` sets how many trajectories are drawn (100,000 unless given),
 `EXTREMES_ASKED` of about how many of them `confirm` asks the reference (300 unless given).
@@ -17,23 +17,21 @@ import time
 from pathlib import Path
 
 import equinox as eqx
-import extremes
 import jax
 import jax.numpy as jnp
-import killed_map
 import numpy as np
-import oracle
 import pytest
-import refusing
 import xarray as xr
 
 import fivjax as fj
+from benchmarks import ranges
 from fivjax.maps import engine
 from fivjax.maps.results import Verdicts
 from fivjax.simulation.rows import states_at
 from fivjax.simulation.start import start_state
 from fivjax.steppers.base import MOST_ADVANCES
 from fivjax.verdicts.verdict import Verdict
+from tests.helpers import killed_map, oracle, refusing
 
 COUNT = int(os.environ.get("EXTREMES_TRAJECTORIES", "100000"))
 ASKED = int(os.environ.get("EXTREMES_ASKED", "300"))
@@ -44,7 +42,7 @@ TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest
 
 
 def decided(trajectories: dict, energy: bool = False) -> Verdicts:
-    start = extremes.FALLING if "decay" in trajectories else extremes.CONSTANT
+    start = ranges.FALLING if "decay" in trajectories else ranges.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
         return engine.run_to_verdict(
             start,
@@ -62,7 +60,7 @@ def decided(trajectories: dict, energy: bool = False) -> Verdicts:
 def drawn() -> list[tuple[dict, np.ndarray, np.ndarray]]:
     """All trajectories, those with falling friction apart, with their verdicts and last events: run once, then kept in a file."""
     falling = COUNT // 25
-    draws = [extremes.draw(COUNT - falling, seed=1), extremes.draw_falling(falling, seed=6)]
+    draws = [ranges.draw(COUNT - falling, seed=1), ranges.draw_falling(falling, seed=6)]
     kept = Path(tempfile.gettempdir()) / f"fivjax-extremes-{COUNT}.npz"
     if not kept.exists():
         all_verdicts = [decided(trajectories) for trajectories in draws]
@@ -122,7 +120,7 @@ def painleve(model: oracle.Model) -> bool:
 
 def judged(trajectory: dict, verdict: int, last_event: float) -> bool | None:
     """Whether the independent solver confirms a trajectory's status or its reason; None where it cannot say."""
-    model = extremes.model(trajectory)
+    model = ranges.model(trajectory)
     with np.errstate(all="ignore"):
         if verdict == Verdict.PAINLEVE:
             return painleve(model)
@@ -146,7 +144,7 @@ def judged(trajectory: dict, verdict: int, last_event: float) -> bool | None:
             return bool((sticks and jammed(model)) or run.N[-1] > 1e9 * model.load.force)
         if verdict == Verdict.TOO_MANY_EVENTS:
             return endless(model, last_event)
-        if verdict == Verdict.STEP_FAILURE and T_MAX * extremes.fastest_rate(trajectory) / TURN_OF_A_STEP <= MAX_STEPS:
+        if verdict == Verdict.STEP_FAILURE and T_MAX * ranges.fastest_rate(trajectory) / TURN_OF_A_STEP <= MAX_STEPS:
             return False
         # Neither status says where the trajectory ends; the state on the way there is the same.
         return same_state(trajectory, model)
@@ -178,13 +176,13 @@ def endless(model: oracle.Model, last_event: float) -> bool | None:
 
 def same_state(trajectory: dict, model: oracle.Model) -> bool | None:
     """Whether both solvers are in the same state after three slow periods, or sixty of the fastest if that is less."""
-    t1 = min(T_MAX, 3 * extremes.slow_period(trajectory), 60 * 2 * np.pi / extremes.fastest_rate(trajectory))
+    t1 = min(T_MAX, 3 * ranges.slow_period(trajectory), 60 * 2 * np.pi / ranges.fastest_rate(trajectory))
     run = limited(oracle.simulate, model, t1, np.array([0.0, t1]))
     if run is None or len(run.q) < 2:
         return None
-    ours = fj.simulate(extremes.scene(trajectory), t1, t1)
+    ours = fj.simulate(ranges.scene(trajectory), t1, t1)
     length = np.max(np.abs(run.q))
-    speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / extremes.slow_period(trajectory))
+    speed = max(np.max(np.abs(run.v[-1])), 2 * np.pi * length / ranges.slow_period(trajectory))
 
     def apart(q, v):
         return max(np.max(np.abs(q - run.q[-1])) / length, np.max(np.abs(v - run.v[-1])) / speed)
@@ -203,9 +201,7 @@ def same_state(trajectory: dict, model: oracle.Model) -> bool | None:
 def at_corners(trajectories: dict) -> np.ndarray:
     """How many of a trajectory's parameters lie on a corner of the ranges."""
     return sum(
-        np.isin(trajectories[name], extremes.CORNERS[name]).astype(int)
-        for name in extremes.CORNERS
-        if name in trajectories
+        np.isin(trajectories[name], ranges.CORNERS[name]).astype(int) for name in ranges.CORNERS if name in trajectories
     )
 
 
@@ -223,7 +219,7 @@ def confirm(count: int = ASKED) -> None:
         chosen = list(dict.fromkeys(np.stack([cornered, members], axis=1).ravel()))[: 2 * each]
         answers = []
         for index in chosen:
-            trajectory = extremes.row(trajectories, index)
+            trajectory = ranges.row(trajectories, index)
             answers.append(judged(trajectory, int(code), float(last[index])))
             if answers[-1] is False:
                 print("contradicted:", Verdict(int(code)).name, trajectory, flush=True)
@@ -243,8 +239,8 @@ def energy(count: int = 8192) -> None:
     """The residual of the balance in units of the energy exchanged (net, by line), over every finished trajectory."""
     count = min(COUNT, count)
     draws = {
-        "friction that does not fall": extremes.draw(count, seed=4),
-        "falling friction": extremes.draw_falling(count // 8, seed=9),
+        "friction that does not fall": ranges.draw(count, seed=4),
+        "falling friction": ranges.draw_falling(count // 8, seed=9),
     }
     for name, trajectories in draws.items():
         verdicts = decided(trajectories, energy=True)
@@ -258,7 +254,7 @@ def energy(count: int = 8192) -> None:
         )
         beyond = np.flatnonzero(share > 1e-8)
         for index in beyond[np.argsort(-share[beyond])]:
-            trajectory = extremes.row(trajectories, index)
+            trajectory = ranges.row(trajectories, index)
             print(f"  {share[index]:.1e}", {key: float(f"{value:.3g}") for key, value in trajectory.items()})
 
 
@@ -288,7 +284,7 @@ def rows(t1: float) -> int:
 
 def touches(p: float) -> bool:
     """Whether any contact event happens in the first 0.3 s."""
-    return bool(oracle.propagate(extremes.model({**PAPER, "p": p}), 0.3, np.array([0.0])).events)
+    return bool(oracle.propagate(ranges.model({**PAPER, "p": p}), 0.3, np.array([0.0])).events)
 
 
 def grazing() -> list[dict]:
@@ -307,7 +303,7 @@ def reference(case: dict, t1: float) -> oracle.Run | None:
     key = (t1, tuple(sorted(case.items())))
     if key not in references:
         solver = oracle.simulate if "decay" in case else oracle.propagate
-        references[key] = limited(solver, extremes.model(case), t1, np.linspace(0.0, t1, rows(t1) + 1))
+        references[key] = limited(solver, ranges.model(case), t1, np.linspace(0.0, t1, rows(t1) + 1))
     return references[key]
 
 
@@ -340,7 +336,7 @@ def worst_error(cases: list[dict], method, single: bool) -> tuple[float, set[str
         if "decay" in case:
             del case["mu"]
         try:
-            mine, ending = states(extremes.scene(case), t1, method, single)
+            mine, ending = states(ranges.scene(case), t1, method, single)
         except ValueError:
             endings.add("refused")
             continue
@@ -351,7 +347,7 @@ def worst_error(cases: list[dict], method, single: bool) -> tuple[float, set[str
             continue
         theirs = np.hstack([right.q, right.v])
         lengths, speeds = np.split(np.max(np.abs(theirs), axis=0), 2)
-        speeds = np.maximum(speeds, 2 * np.pi / extremes.slow_period(case) * lengths)
+        speeds = np.maximum(speeds, 2 * np.pi / ranges.slow_period(case) * lengths)
         scale = np.hstack([lengths, speeds])
         scale = np.maximum(scale, 1e-12 * np.max(scale))
         error = np.max(np.abs(mine - theirs) / scale)
@@ -392,7 +388,7 @@ def rows_apart(count: int = int(os.environ.get("EXTREMES_FALLING", "4096")), at_
     }
 
     def followed(own, instants):
-        scene = extremes.FALLING.replace(**own)
+        scene = ranges.FALLING.replace(**own)
         return states_at(scene, fj.EventExact(), start_state(scene, None), instants, MOST_ADVANCES)[0]
 
     with jax.enable_x64(True):

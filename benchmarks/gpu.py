@@ -1,6 +1,6 @@
 """The README's map on an accelerator, compared with the same map on the CPU of that machine, in one run.
 
-    python tests/measure_gpu.py [points of a side, such as 64 256 1024]
+    python -m benchmarks.gpu [points of a side, such as 64 256 1024]
 
 On a machine without an accelerator it compares the CPU with itself. Verdicts that differ are checked: within 1e-9 of the critical kick
 rounding decides, elsewhere a difference is an error.
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from measure_maps import paper_map, scene
 
 import fivjax as fj
+from benchmarks.maps import paper_map, scene
 
 ROUNDING = 1e-9
 

@@ -1,6 +1,6 @@
 """Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
 
-    python tests/measure_maps.py [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
+    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
 
 Each word picks one study; without any, all run (half an hour on two cores). The reference is `tests/oracle.py`.
 """
@@ -36,7 +36,7 @@ def scene(**changes) -> fj.Scene:
 
 def errors() -> None:
     """State error, relative to each coordinate's size, at 0.5 s (9 events) and 2 s (345 events): μ = 0.227, p = 1.3, 3 m/s."""
-    import oracle  # not at the top: other studies measure the memory of this process
+    from tests.helpers import oracle  # not at the top: other studies measure the memory of this process
 
     for t1, kind in ((0.1, "one status"), (0.5, "9 events"), (2.0, "345 events")):
         reference = oracle.simulate(
@@ -68,7 +68,7 @@ def table2() -> None:
 
 def map_() -> None:
     """The paper's map, 64 × 64, and 200 of its trajectories by the oracle."""
-    import oracle
+    from tests.helpers import oracle
 
     m = paper_map(64)
     print("64 × 64:", {name: count for name, count in json.loads(m.attrs["counts"]).items() if count})

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-import oracle
 
 import fivjax as fj
+from tests.helpers import oracle
 
 # From, to, and how values lie between: spread over decades, or evenly. Ratios are to mass 1 and spring 1 of the paper.
 RANGES = {

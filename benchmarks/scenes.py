@@ -1,7 +1,7 @@
 """Random scenes by `fj.simulate`, against solvers that share no code with it, and its tangents against differences of itself.
 
-    python tests/measure_scenes.py [one] [several] [tangents]    # FIVJAX_TIMES scenes in all, 300 unless given
-    python tests/measure_scenes.py one 123                       # one scene again, by its seed
+    python -m benchmarks.scenes [one] [several] [tangents]    # FIVJAX_TIMES scenes in all, 300 unless given
+    python -m benchmarks.scenes one 123                       # one scene again, by its seed
 
 `one` has one contact, `several` two to four. Ends lie in the longest pause after the twentieth event or one of the next eight (or
 fifteen periods of the slowest vibration from the start). The error of a state is its difference over the largest displacement of the
@@ -22,12 +22,12 @@ from collections import Counter
 
 import jax
 import numpy as np
-import oracle
-import several_contacts_reference as reference
-from gradient_reference import richardson
 from scipy.linalg import eigh
 
 import fivjax as fj
+from tests.helpers import oracle
+from tests.helpers import several_contacts_reference as reference
+from tests.helpers.gradient_reference import richardson
 
 SIZES, ROWS, EVENTS, PERIODS = (3, 4, 6, 3, 10, 4, 6, 16, 3, 4, 6, 24), 1000, 20, 15.0
 STATES, TANGENTS, AGREE = 1e-9, 1e-6, 1e-7

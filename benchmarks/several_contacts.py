@@ -1,6 +1,6 @@
 """The cost of several contacts: processor time per trajectory and cycle, on the limit cycle, relative to one contact.
 
-    python tests/measure_several_contacts.py [counts ...]
+    python -m benchmarks.several_contacts [counts ...]
 
 One structure contains copies of the paper's oscillator, uncoupled (each has events of its own) or with neighbours coupled in the mass
 matrix (`coupled`). Processor time is the least of three runs after compilation.
@@ -10,9 +10,9 @@ import sys
 import time
 
 import numpy as np
-from test_several_contacts import copies, scene_of
 
 import fivjax as fj
+from tests.helpers.several_contacts import copies, scene_of
 
 CYCLES = 68.0  # a second
 

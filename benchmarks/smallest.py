@@ -1,6 +1,6 @@
 """The smallest perturbations, against differential evolution on verdicts of the independent solver in `reference`.
 
-    python tests/measure_smallest.py [kick] [state] [history]
+    python -m benchmarks.smallest [kick] [state] [history]
 
 Each prints what `fj.smallest_kick` finds and certifies, and the smallest that SciPy's `differential_evolution` finds in 2,000
 trajectories of the paper's case at 1 m/s, in the same bounds.
@@ -10,10 +10,10 @@ import argparse
 import time
 
 import numpy as np
-import reference
 from scipy.optimize import differential_evolution
 
 import fivjax as fj
+from tests.helpers import reference
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 TRAJECTORIES = 2000

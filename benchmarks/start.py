@@ -1,6 +1,6 @@
 """The parts of the time of a later `fivjax map`, from the start of the process: imports, tracing, lowering, the cache, the map.
 
-    python tests/measure_start.py
+    python -m benchmarks.start
 
 Wall time by JAX's own events (they nest: tracing inside tracing is counted in both). Run it twice with a compilation cache
 (`JAX_COMPILATION_CACHE_DIR`): the second run is the later start. What was traced is kept in that folder, too; without that a

@@ -1,6 +1,6 @@
 """What a map keeps on the disk: interrupted and killed commands, flipped bits, and two processes that begin one store.
 
-    python tests/measure_stores.py [interrupted] [killed] [flipped] [at_once]
+    python -m benchmarks.stores [interrupted] [killed] [flipped] [at_once]
 
 `FIVJAX_TIMES` is the number of interrupts, kills or flips (20, 50 and 200 unless given); `FIVJAX_WITHOUT=warp` hides Warp.
 """

@@ -1,22 +1,21 @@
 """The gallery of `docs/validation.md`: numbers that are published or follow from a formula, and those of fivjax.
 
-    python tests/measure_validation.py [closed] [benchmark] [linear] [cycles] [bifurcation]
+    python -m benchmarks.validation [closed] [benchmark] [linear] [cycles] [bifurcation]
 
 Each word picks one study; without any, all run (some minutes on two cores). Studies with a script of their own are not repeated here:
 Table 2 (`measure_maps.py table2`), energies (`measure_energy.py`), derivatives (`measure_gradients.py`), the paper's figures
 (`fivjax reproduce`).
 """
 
-import json
 import sys
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
 
 import fivjax as fj
+from tests.helpers.reference.cycles import stored
 
-REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
+REFERENCE = stored()
 
 
 def row(what: str, theirs: float, ours: float) -> None:

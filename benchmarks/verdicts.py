@@ -1,14 +1,14 @@
 """Verdicts and amplitudes of maps against the independent solver in `reference`, which follows each trajectory until it is
 certain to fade, or for ten thousand periods.
 
-    python tests/measure_verdicts.py random [--structures N] [--kicks K] [--seed S]
-    python tests/measure_verdicts.py cases [ghost] [invented] [single] [kick] [growth] [amplitudes]
-    python tests/measure_verdicts.py folds [--kicks K]
-    python tests/measure_verdicts.py maps [--side N]
-    python tests/measure_verdicts.py tori [--structures N] [--kicks K] [--seed S]
-    python tests/measure_verdicts.py falling [--structures N] [--kicks K] [--seed S]
-    python tests/measure_verdicts.py contacts [--structures N] [--kicks K] [--seed S]
-    python tests/measure_verdicts.py beside [--structures N] [--kicks K] [--seed S]
+    python -m benchmarks.verdicts random [--structures N] [--kicks K] [--seed S]
+    python -m benchmarks.verdicts cases [ghost] [invented] [single] [kick] [growth] [amplitudes]
+    python -m benchmarks.verdicts folds [--kicks K]
+    python -m benchmarks.verdicts maps [--side N]
+    python -m benchmarks.verdicts tori [--structures N] [--kicks K] [--seed S]
+    python -m benchmarks.verdicts falling [--structures N] [--kicks K] [--seed S]
+    python -m benchmarks.verdicts contacts [--structures N] [--kicks K] [--seed S]
+    python -m benchmarks.verdicts beside [--structures N] [--kicks K] [--seed S]
 
 `random` draws structures and scenes, half of them with friction within 1e-5 to 1e-2 (relative) of its critical value; a
 disagreement counts unless the reference itself says otherwise of a kick that differs by 1e-14 to 1e-11;
@@ -26,12 +26,11 @@ import time
 from collections import Counter
 
 import numpy as np
-import oracle
-import reference
 from scipy.linalg import block_diag
-from test_proofs_side_by_side import proved
 
 import fivjax as fj
+from tests.helpers import oracle, reference
+from tests.helpers.proofs import proved
 
 NEAR = 1e-2  # relative distance from the critical friction that counts as near it
 

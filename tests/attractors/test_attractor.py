@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import reference
 
 import fivjax as fj
 from fivjax.attractors import tube
@@ -20,6 +19,7 @@ from fivjax.attractors.tori import (
 )
 from fivjax.attractors.tube import Tube
 from fivjax.section.return_maps import Section
+from tests.helpers import reference
 
 STATES = 256
 GOLDEN = (np.sqrt(5) - 1) / 2

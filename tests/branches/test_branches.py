@@ -1,16 +1,14 @@
 """Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-import reference
-from reference import cycles
 
 import fivjax as fj
+from tests.helpers import reference
+from tests.helpers.reference import cycles
+from tests.helpers.reference.cycles import stored
 
-REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
+REFERENCE = stored()
 
 
 def paper(belt_speed: float, mu: float) -> fj.Scene:

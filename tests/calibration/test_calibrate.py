@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from recordings import FREE, SAMPLE, case, clean, noisy, off, pair, paper, recording, scores, slid, times
 
 import fivjax as fj
 from fivjax import cli
@@ -21,6 +20,7 @@ from fivjax.calibration.parameters import FreeParameters
 from fivjax.calibration.problem import Problem
 from fivjax.calibration.result import FitOutcome
 from fivjax.plot import calibration
+from tests.helpers.recordings import FREE, SAMPLE, case, clean, noisy, off, pair, paper, recording, scores, slid, times
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +284,7 @@ def test_a_limit_cycle_that_beats_is_not_fitted():
 @pytest.mark.parametrize("guess", [{"mu": 0.227}, {"mu": 0.26, "c1": 0.91, "k1": 127e3}], ids=["README", "notebook"])
 def test_the_sample_recording_gives_what_it_was_made_with(guess):
     """The example of the README runs from a checkout; the notebook begins 30 % off in every parameter."""
-    data = fj.read_recording(Path(__file__).parents[1] / "notebooks" / "decay.csv", "kick", offset=(0.0, 0.2))
+    data = fj.read_recording(Path(__file__).parents[2] / "notebooks" / "decay.csv", "kick", offset=(0.0, 0.2))
     fit = fj.calibrate(paper(**guess), data, FREE[3], bounds={"mu": (0.05, 0.5)}, progress=False)
     assert fit.outcome is FitOutcome.CONVERGED
     assert max(scores(fit, paper(**SAMPLE)).values()) < 4

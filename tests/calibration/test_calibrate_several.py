@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from recordings import clean, noisy, off, pair, recording, slid
 
 import fivjax as fj
 from fivjax.calibration.result import FitOutcome
+from tests.helpers.recordings import clean, noisy, off, pair, recording, slid
 
 QUIET = np.zeros((400, 1)) + 1e-3
 

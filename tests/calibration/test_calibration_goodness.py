@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from recordings import case, noisy, off, recording, scores
 
 import fivjax as fj
 from fivjax.calibration.result import FitOutcome
+from tests.helpers.recordings import case, noisy, off, recording, scores
 
 LINEAR = ["mu", "c1", "k1"]
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from recordings import FREE, noisy, off, paper, points, recording, scores
 
 import fivjax as fj
 from fivjax.calibration.result import FitOutcome
+from tests.helpers.recordings import FREE, noisy, off, paper, points, recording, scores
 
 STIFFNESS, DAMPING, FORCE, PULLED = 400.0, 0.4, 0.5, 0.1
 

@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 import pytest
-from recordings import paper
 
 from fivjax.calibration.covariance import combinations, covariance_of
 from fivjax.calibration.cycle_misfit import BEATS
@@ -12,6 +11,7 @@ from fivjax.calibration.goodness_of_fit import exceeds_noise, what_is_left
 from fivjax.calibration.least_squares import Evaluated, minimise
 from fivjax.calibration.noise import estimated_noise
 from fivjax.calibration.parameters import FreeParameters
+from tests.helpers.recordings import paper
 
 FREQUENCY = 67.456
 

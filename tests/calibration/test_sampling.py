@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from recordings import paper
 
 import fivjax as fj
 from fivjax.calibration.responses import sliding_throughout, through_events
 from fivjax.calibration.samples import sampled
 from fivjax.io.low_pass import LowPass
 from fivjax.io.recordings import averaged, channel
+from tests.helpers.recordings import paper
 
 RATE, BEGIN, COUNT, FINER = 2000.0, 0.0371, 320, 20
 NAMES = ("displacement 1", "velocity 0", "acceleration 1")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
-from refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 import fivjax as fj
 from fivjax import cli
 from fivjax.maps import checkpoint
+from tests.helpers.refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 T = np.arange(64) * 1e-3
 A = np.sin(400.0 * T)

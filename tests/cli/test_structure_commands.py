@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusing import EngineReached, refused_on_the_command_line, untouched, without_engines
 
 import fivjax as fj
 from fivjax import cli
 from fivjax.io.node_contacts import read_contacts
+from tests.helpers.refusing import EngineReached, refused_on_the_command_line, untouched, without_engines
 
-PAGE = (Path(__file__).parents[1] / "docs" / "howto" / "structure.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "structure.md").read_text()
 SECTION = PAGE.split("### On the command line")[1].split("### ")[0]
 COMMANDS = dict.fromkeys(line for line in SECTION.splitlines() if line.startswith("fivjax "))
 CONTACTS = re.search(r"```text\n(node,.*?)```", SECTION, re.DOTALL)[1]

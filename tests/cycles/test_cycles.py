@@ -1,11 +1,7 @@
 """Limit cycles against closed forms, against ODE solvers of another kind (`reference/cycles.json`), and against trajectories."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-import reference
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
@@ -13,8 +9,10 @@ from fivjax.contact import Contact
 from fivjax.cycles import search
 from fivjax.cycles.around import Round, word
 from fivjax.cycles.torus import off_the_curve
+from tests.helpers import reference
+from tests.helpers.reference.cycles import stored
 
-REFERENCE = json.loads((Path(__file__).parent / "reference" / "cycles.json").read_text())
+REFERENCE = stored()
 
 
 def paper(belt_speed: float, mu: float = 0.227, **others) -> fj.Scene:

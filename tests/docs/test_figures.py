@@ -8,7 +8,7 @@ import pytest
 from fivjax.attractors import long_run, parting
 from fivjax.maps import plan
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import fivjax as fj
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 SLOW = doctest.register_optionflag("SLOW")
 

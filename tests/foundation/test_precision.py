@@ -7,9 +7,9 @@ import textwrap
 import jax
 import numpy as np
 import pytest
-from catalogue import LOW_ORDER
 
 import fivjax as fj
+from tests.helpers.catalogue import LOW_ORDER
 
 
 def in_a_fresh_process(code: str) -> str:

@@ -18,8 +18,10 @@ from fivjax.foundation import linear_solve, matrix_factors, matrix_routines
 from fivjax.foundation.flattened import Flattened, flatten
 from fivjax.maps import following, groups
 from fivjax.steppers.event_exact import EventExact
+from tests.helpers.chains import chain
 
 PACKAGE = Path(fj.__file__).parent
+ROOT = Path(__file__).parents[2]
 # Modules of JAX whose functions call LAPACK, but for the one that does not.
 LINEAR_ALGEBRA = ("jnp.linalg", "jax.numpy.linalg", "jax.lax.linalg", "jax.scipy", "lax.linalg")
 PRIMITIVES = {one.name for name, one in vars(jax.lax.linalg).items() if name.endswith("_p") and hasattr(one, "name")}
@@ -62,15 +64,6 @@ def of_program(function, *arguments):
     """The primitives of a program, and arrays of zeros in the form of its result."""
     traced, form = jax.make_jaxpr(function, return_shape=True)(*arguments)
     return called(traced.jaxpr, set()), jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), form)
-
-
-def chain(n: int, contacts: int) -> fj.Scene:
-    stiffness = np.diag(np.linspace(1e4, 1e6, n)) + 1e3
-    load = np.zeros(n)
-    load[1 : 2 * contacts : 2] = -1.0
-    places = [fj.ContactPoint(2 * i, 2 * i + 1) for i in range(contacts)]
-    structure = fj.Structure(np.eye(n) + 0.01, 1e-5 * stiffness, stiffness, load, contacts=places)
-    return fj.Scene(structure, fj.Coulomb(mu=0.3), belt_speed=1.0, load=fj.Pulse(force=10.0, p=2.0))
 
 
 def test_a_batch_of_trajectories_has_no_lapack():
@@ -181,10 +174,10 @@ def test_lapack_gets_one_matrix_at_a_time():
 
 PREPARING = """
 import numpy as np
-from fivjax.maps import groups as sharing
+from fivjax.maps import groups
 from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
-from test_standstill import chain
+from tests.helpers.chains import chain
 scene = chain(24, 1)
 run = in_double_precision(groups._prepared)
 print(np.isfinite(run(scene, EventExact(), ("mu",), np.linspace(0.1, 0.5, 64)[:, None])[-1]).all())
@@ -192,7 +185,7 @@ print(np.isfinite(run(scene, EventExact(), ("mu",), np.linspace(0.1, 0.5, 64)[:,
 MAP = """
 import sys
 import numpy as np, fivjax as fj
-from test_standstill import chain
+from tests.helpers.chains import chain
 n, contacts = map(int, sys.argv[1:])
 scene = chain(n, contacts)
 common = dict(t_max=0.02, progress=False)
@@ -206,7 +199,7 @@ def ended(code: str, *arguments, threads: int, deadline: float) -> str:
     """What a process says that has so many threads in XLA's pool; it is killed at the deadline (s)."""
     variables = os.environ | {
         "NPROC": str(threads),
-        "PYTHONPATH": os.pathsep.join([str(PACKAGE.parent), str(Path(__file__).parent)]),
+        "PYTHONPATH": os.pathsep.join([str(PACKAGE.parent), str(ROOT)]),
     }
     command = [sys.executable, "-c", code, *map(str, arguments)]
     ran = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=deadline)

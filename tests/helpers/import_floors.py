@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent.parent / "fivjax"
+PACKAGE = Path(__file__).parents[2] / "fivjax"
 # The public names (`fivjax/__init__.pyi`): above every room but the command line, which is written with them.
 DOOR = "fivjax"
 

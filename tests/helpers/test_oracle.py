@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
-import oracle
 import pytest
-from oracle import (
+
+from tests.helpers import oracle
+from tests.helpers.oracle import (
     DETACH,
     SLIDE,
     STICK,

@@ -1,11 +1,11 @@
 """The reference solver in C++ against closed forms and against `oracle`, with which it shares nothing."""
 
 import numpy as np
-import oracle
 import pytest
-import reference
-from reference import cycles
 from scipy.linalg import expm
+
+from tests.helpers import oracle, reference
+from tests.helpers.reference import cycles
 
 pytestmark = pytest.mark.skipif(not reference.available(), reason="The reference solver needs the compiler g++.")
 

@@ -44,10 +44,10 @@ def test_csv_with_semicolons_and_decimal_commas(tmp_path):
 
 def test_the_sample_recording_is_read():
     """The file that README and notebook fit: 0.8 s at 2 kHz of two accelerations, units in its names."""
-    found = fj.read_recording(Path(__file__).parents[1] / "notebooks" / "decay.csv", "kick")
+    found = fj.read_recording(Path(__file__).parents[2] / "notebooks" / "decay.csv", "kick")
     assert found.channels == (Channel("acceleration", 0), Channel("acceleration", 1))
     assert found.rate == pytest.approx(2000) and found.duration == pytest.approx(0.8, rel=1e-3)
-    assert len((Path(__file__).parents[1] / "notebooks" / "decay.csv").read_text()) < 50_000
+    assert len((Path(__file__).parents[2] / "notebooks" / "decay.csv").read_text()) < 50_000
 
 
 def test_noise_by_channel_or_one_for_all():

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import xarray as xr
 from jaxtyping import Array, Float
-from refusing import refused
 
 import fivjax as fj
 from fivjax.foundation import whole_files
 from fivjax.io import files
 from fivjax.model.friction import AbstractFriction
 from fivjax.model.scene import IMPACT_LAWS
+from tests.helpers.refusing import refused
 
 
 @pytest.fixture(scope="module")

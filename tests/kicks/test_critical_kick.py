@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import reference
 
 import fivjax as fj
+from tests.helpers import reference
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-import reference
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
 import fivjax as fj
 from fivjax.kicks.critical_derivatives import differentiable
 from fivjax.kicks.touching import grazing_kick
+from tests.helpers import reference
 
 SCENE = fj.Scene(
     fj.belt_oscillator(), fj.Coulomb(0.227, mu_static=0.5), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2)

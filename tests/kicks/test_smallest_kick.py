@@ -3,13 +3,13 @@
 import jax
 import numpy as np
 import pytest
-import reference
 from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.kicks.perturbations import Histories, InitialStates
 from fivjax.kicks.smallest import certified_excess
 from fivjax.model.sliding import sliding_states
+from tests.helpers import reference
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 

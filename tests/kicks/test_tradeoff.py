@@ -3,14 +3,14 @@
 import json
 
 import numpy as np
-import oracle
 import pytest
-from catalogue import LOW_ORDER
 
 import fivjax as fj
 from fivjax.kicks import tradeoff_study
 from fivjax.kicks.tradeoff_study import recommend, table
 from fivjax.maps import refinement_study
+from tests.helpers import oracle
+from tests.helpers.catalogue import LOW_ORDER
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 3.0))
 PARTS = {"end state alone": 1.0, "energy ledger": 1.5}

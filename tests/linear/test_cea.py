@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import linear_reference as reference
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +16,7 @@ from fivjax.linear import cea, linearisation, polynomials, routh_hurwitz
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.linear.outcomes import Mechanism, StabilityOutcome
 from fivjax.model.scene import steady_sliding
+from tests.helpers import linear_reference as reference
 
 # μ_crit is a root where the growth rate has a slope of some 500/s and rounding of some 1e-12/s: both routes agree to 1e-14.
 MU_CRIT = reference.critical_friction()

@@ -1,8 +1,5 @@
 """Complex modes of general pencils and of several sliding contacts, reduction, and derivatives by left and right eigenvectors."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy import linalg, sparse
@@ -10,8 +7,7 @@ from scipy import linalg, sparse
 import fivjax as fj
 from fivjax.linear import mode_search
 from fivjax.linear.mode_search import AT_ONCE, DENSE, near
-
-DATA = Path(os.environ.get("FIVJAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
+from tests.helpers.brake import FOLDER, measure
 
 
 def chain(
@@ -315,13 +311,11 @@ def test_near_finds_the_nearest():
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    not (DATA / "brake").is_dir(), reason="the finite-element brake is not there; name its folder with FIVJAX_DATA"
+    not FOLDER.is_dir(), reason="the finite-element brake is not there; name its folder with FIVJAX_DATA"
 )
 def test_the_brake():
     """Unstable modes of a finite-element brake to 1e-6 of a reference found by another route, in a minute; reduced to 60, to 1e-3."""
-    import measure_brake
-
-    measured = measure_brake.measure(DATA / "brake")
+    measured = measure(FOLDER)
     assert measured["seconds"] < 60
     assert measured["relative error"].max() < 1e-6
     assert measured["reference residual"].max() < 1e-12

@@ -1,6 +1,5 @@
 """Search and design by gradient, judged by the independent route of `linear_reference`."""
 
-import linear_reference as reference
 import numpy as np
 import pytest
 
@@ -9,6 +8,7 @@ from fivjax.linear import cea, design
 from fivjax.linear.design import DesignOutcome
 from fivjax.linear.outcomes import StabilityOutcome
 from fivjax.plot import linear as plot_linear
+from tests.helpers import linear_reference as reference
 
 ROUTES = ["eigenvalues", "routh-hurwitz"]
 STARTS = np.random.default_rng(2025).uniform(0.0, 1.0, 20)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from catalogue import steady
 
 import fivjax as fj
+from tests.helpers.catalogue import steady
 
 SCENES = {
     "mode coupling": fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.5), 3.0, steady()),

@@ -1,13 +1,13 @@
 """Basins of attraction: initial states, their verdicts and shares, against solvers that share no code."""
 
 import numpy as np
-import oracle
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import binomtest
 
 import fivjax as fj
 from fivjax.maps.shares import wilson
+from tests.helpers import oracle
 
 
 def paper(v=3.0, mu=0.2):

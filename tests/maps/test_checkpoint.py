@@ -7,7 +7,6 @@ import subprocess
 import sys
 
 import jax
-import killed_map
 import numpy as np
 import pytest
 import xarray as xr
@@ -19,6 +18,7 @@ from fivjax.maps import checkpoint, job_files, plan, rounds
 from fivjax.maps.halfway import Halfway
 from fivjax.maps.matrix_kernels import Kernels
 from fivjax.maps.results import Ended, not_run, record
+from tests.helpers import killed_map
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
 

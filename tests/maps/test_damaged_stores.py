@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import stand_in_jobs
 
 import fivjax as fj
 from fivjax.maps import engine, job_files, plan, store_folder
 from fivjax.maps.checkpoint import Checkpoint
 from fivjax.maps.checkpoint_file import BLOCK
 from fivjax.maps.results import not_run
+from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 3), "p": np.linspace(1.0, 3.0, 4)}
 

@@ -6,13 +6,13 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, Thre
 
 import numpy as np
 import pytest
-import stand_in_jobs
 
 import fivjax as fj
 from fivjax.maps import engine, plan
 from fivjax.maps.executors import Workers
 from fivjax.maps.handing_out import hand_out
 from fivjax.maps.trajectories import Grid, Listed
+from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 5), "p": np.linspace(1.0, 3.0, 7), "belt_speed": np.array([1.0, 2.0, 3.0])}
 

@@ -9,14 +9,13 @@ import warnings
 
 import jax
 import numpy as np
-import oracle
 import pytest
-import reference
 import xarray as xr
 
 import fivjax as fj
 from fivjax.maps import engine, plan
 from fivjax.maps.matrix_kernels import Kernels
+from tests.helpers import oracle, reference
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
 TABLE_2 = np.array([1.06, 1.11, 1.17, 1.20, 1.20, 1.20, 1.20])

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import stand_in_jobs
 
 import fivjax as fj
 from fivjax.foundation.precision import in_double_precision
 from fivjax.foundation.traced_code import digest, is_from_outside
 from fivjax.maps import engine
+from tests.helpers import stand_in_jobs
 
 AXES = {"mu": [0.1, 0.15, 0.2], "p": [1.2, 2.5]}
 

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_several_contacts import copies, scene_of
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, slides_uniquely
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.section.free_directions import directions_of_several
 from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
+from tests.helpers.several_contacts import copies, scene_of
 
 SHARES = np.array([1.0, 0.8])
 

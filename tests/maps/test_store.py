@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import stand_in_jobs
 import xarray as xr
 
 import fivjax as fj
@@ -14,6 +13,7 @@ from fivjax.attractors.neighbourhood import Neighbourhood
 from fivjax.attractors.tube import Tube
 from fivjax.maps import engine, plan
 from fivjax.maps.attractor_files import from_bytes, to_bytes
+from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 6), "p": np.linspace(1.0, 3.0, 7)}
 

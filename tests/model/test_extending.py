@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusing import refused
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
 from fivjax.verdicts.sliding_proof import why_withheld
+from tests.helpers.refusing import refused
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 
 
 def test_the_page_runs_as_it_stands():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
-from refusing import refused
 
 import fivjax as fj
 from fivjax.io.datasets import labelled
 from fivjax.notebook import display, registration
+from tests.helpers.refusing import refused
 
 
 @pytest.fixture(scope="module")

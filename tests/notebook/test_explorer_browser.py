@@ -23,7 +23,7 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 MISSING = [name for name in ("jupyterlab", "playwright") if find_spec(name) is None]
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 CELL = """
 import numpy as np

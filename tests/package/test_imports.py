@@ -6,10 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import import_floors
 import pytest
 
 import fivjax as fj
+from tests.helpers import import_floors
 
 # The rooms by floor, lowest first. Rooms of one floor do not import one another.
 FLOORS = (

@@ -11,7 +11,7 @@ import pytest
 import fivjax as fj
 from fivjax.io.references import PAPER_DOI
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CITATION = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
@@ -51,7 +51,14 @@ def test_a_type_checker_is_told_to_look():
 @pytest.mark.slow
 def test_a_user_s_file_is_clean_to_a_type_checker():
     """Rejects a public name whose type a checker cannot see, or sees wrongly."""
-    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, str(ROOT / "tests" / "typed_user.py")]
+    command = [
+        sys.executable,
+        "-m",
+        "pyright",
+        "--pythonpath",
+        sys.executable,
+        str(ROOT / "tests" / "helpers" / "typed_user.py"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "tests")
     assert done.returncode == 0, done.stdout
 

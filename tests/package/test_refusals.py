@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
-from refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 import fivjax as fj
 from fivjax import cli
 from fivjax.foundation import arguments, digits
 from fivjax.io import files
+from tests.helpers.refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 
 @pytest.fixture(autouse=True)

@@ -94,7 +94,7 @@ else:
 
 
 def in_process(code: str) -> subprocess.CompletedProcess:
-    paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
 

@@ -8,9 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
-from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
@@ -22,6 +20,8 @@ from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.simulation import energy as accounts
 from fivjax.steppers.core import Segment
 from fivjax.verdicts.verdict import Verdict
+from tests.helpers import oracle
+from tests.helpers.transients import CASES, scene_of
 
 # What the issue of this ledger asks for is 1e-10 of the energy exchanged; rounding over some 10⁴ advances is this.
 CLOSED = 1e-13

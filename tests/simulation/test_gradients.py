@@ -1,17 +1,17 @@
 """Derivatives through contact against differences and closed forms; where there is none, that the result says so.
 
-The whole table, reverse mode included, is in `measure_gradients.py`.
+The whole table, reverse mode included, is printed by `python -m benchmarks.gradients`.
 """
 
 import jax
 import jax.numpy as jnp
-import measure_gradients as measure
 import numpy as np
 import pytest
 import scipy.linalg
-from gradient_reference import point_mass
 
 import fivjax as fj
+from tests.helpers import derivative_cases as cases
+from tests.helpers.gradient_reference import point_mass
 
 # As exact as the default, in more steps, of which short motions need few: it compiles in half the time.
 FEW = fj.EventExact(order=8)
@@ -35,19 +35,19 @@ def structure(stiffness, mass=None, damping=None, load_direction=None) -> fj.Str
 
 def test_state_in_all_parameters_through_nine_events():
     """Wrong if an event time, a jump of the load or a status is left out of the derivative."""
-    changes, t1 = measure.CASES["v = 3, p = 1.3, 0.5 s"]
-    found, forward = measure.jacobian(measure.paper(**changes), t1)
-    expected, _ = measure.differences(measure.paper(**changes), t1)
+    changes, t1 = cases.CASES["v = 3, p = 1.3, 0.5 s"]
+    found, forward = cases.jacobian(cases.paper(**changes), t1)
+    expected, _ = cases.differences(cases.paper(**changes), t1)
     assert found.events == 9
     assert found.exist
     # What extrapolated differences of a state computed to 1e-13 are good for.
-    assert measure.relative(forward, expected).max() < 1e-6
+    assert cases.relative(forward, expected).max() < 1e-6
 
 
 def test_bouncing_mass_and_stick_slip_block_forward():
     """Rounding alone is allowed between the solver's derivative and that of the closed form."""
-    for _, found, expected in measure.closed_forms("forward", FEW):
-        assert measure.relative(found, expected).max() < 1e-10
+    for _, found, expected in cases.closed_forms("forward", FEW):
+        assert cases.relative(found, expected).max() < 1e-10
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
@@ -93,16 +93,16 @@ def test_a_start_that_sticks_by_the_belt_speed():
 
 def test_bouncing_mass_reverse():
     """In reverse mode a stretch may use only what it is given, and a step worked out elsewhere is refused by JAX."""
-    _, found, expected = next(measure.closed_forms("reverse", FEW))
-    assert measure.relative(found, expected).max() < 1e-10
+    _, found, expected = next(cases.closed_forms("reverse", FEW))
+    assert cases.relative(found, expected).max() < 1e-10
 
 
 @pytest.mark.slow
 def test_a_step_that_is_told_takes_part_in_reverse_mode():
     """The steps of `WhereSwitched` are an array, so that not every step is compiled: of the same rounding in both modes."""
-    scene, method = measure.paper(p=1.3, start=0.0), fj.WhereSwitched(dt=1e-5)
+    scene, method = cases.paper(p=1.3, start=0.0), fj.WhereSwitched(dt=1e-5)
     found = [
-        fj.derivatives(measure.last_state, scene, ["mu", "k1"], 0.02, 0.01, mode=mode, method=method)
+        fj.derivatives(cases.last_state, scene, ["mu", "k1"], 0.02, 0.01, mode=mode, method=method)
         for mode in ("forward", "reverse")
     ]
     for name in ("mu", "k1"):
@@ -112,26 +112,26 @@ def test_a_step_that_is_told_takes_part_in_reverse_mode():
 @pytest.mark.slow
 def test_reverse_equals_forward_in_the_table():
     """Both modes through up to 35 events, sticking included: one transposed wrong would differ in the first digits."""
-    for changes, t1 in measure.CASES.values():
-        scene = measure.paper(**changes)
-        found, forward = measure.jacobian(scene, t1)
+    for changes, t1 in cases.CASES.values():
+        scene = cases.paper(**changes)
+        found, forward = cases.jacobian(scene, t1)
         assert found.exist
-        _, reverse = measure.jacobian(scene, t1, "reverse")
-        expected, _ = measure.differences(scene, t1)
-        assert measure.relative(reverse, forward).max() < 1e-10
-        assert measure.relative(forward, expected).max() < 1e-6
+        _, reverse = cases.jacobian(scene, t1, "reverse")
+        expected, _ = cases.differences(scene, t1)
+        assert cases.relative(reverse, forward).max() < 1e-10
+        assert cases.relative(forward, expected).max() < 1e-6
 
 
 @pytest.mark.slow
 def test_bouncing_mass_and_stick_slip_block_reverse():
-    for _, found, expected in measure.closed_forms("reverse"):
-        assert measure.relative(found, expected).max() < 1e-10
+    for _, found, expected in cases.closed_forms("reverse"):
+        assert cases.relative(found, expected).max() < 1e-10
 
 
 @pytest.mark.slow
 def test_energy_in_reverse_and_a_run_that_may_be_differentiated_both_ways():
     """The ledger's own derivative takes part in that of a span; JAX's loop without `derivatives` says the same."""
-    scene = measure.paper(p=1.3, start=0.0)
+    scene = cases.paper(p=1.3, start=0.0)
     with jax.enable_x64(True):
 
         def loss(mu, derivatives):
@@ -151,7 +151,7 @@ def test_the_end_of_a_kick_on_a_saved_instant():
     with jax.enable_x64(True):
 
         def speed(duration, dt_save):
-            scene = measure.paper(p=1.05, start=0.0, duration=duration)
+            scene = cases.paper(p=1.05, start=0.0, duration=duration)
             return fj.simulate(scene, 0.15, dt_save).velocity[-1, 0]
 
         on_it, between = (jax.jvp(lambda x, dt=dt: speed(x, dt), (0.1,), (1.0,))[1] for dt in (0.05, 0.15))
@@ -160,7 +160,7 @@ def test_the_end_of_a_kick_on_a_saved_instant():
 
 def existing(scene, y0) -> fj.Derivatives:
     t1 = END[scene.structure.size]
-    return fj.derivatives(measure.last_state, scene, ["force"], t1, t1, y0=y0, method=FEW)
+    return fj.derivatives(cases.last_state, scene, ["force"], t1, t1, y0=y0, method=FEW)
 
 
 @pytest.mark.parametrize(("touch", "exist"), [(1e-9, False), (-1e-9, False), (0.3, True), (-0.3, True)])
@@ -221,7 +221,7 @@ def test_an_event_at_the_very_end_has_no_derivative(late, exist):
 
 def test_quiet_motion_has_derivatives_and_says_so():
     """The paper's oscillator, all of it a hundred times as slow: in few steps."""
-    paper = measure.paper()
+    paper = cases.paper()
     mass, damping, stiffness, load_direction = map(np.asarray, paper.structure.matrices)
     slow = structure(1e-4 * stiffness, mass, 1e-2 * damping, load_direction)
     scene = fj.Scene(slow, fj.Coulomb(0.227, 0.227), 0.03, steady(1e-2))
@@ -270,7 +270,7 @@ def test_a_run_that_did_not_reach_its_end_has_no_derivatives():
 )
 def test_refusals(options, error, fragments):
     """Refused before anything compiles, by name."""
-    given = {"functional": lambda run: run.velocity[-1, 0], "scene": measure.paper(), "wrt": ["mu"], **options}
+    given = {"functional": lambda run: run.velocity[-1, 0], "scene": cases.paper(), "wrt": ["mu"], **options}
     with pytest.raises(error) as refusal:
         fj.derivatives(**given)
     for fragment in fragments:
@@ -282,7 +282,7 @@ def test_a_structure_of_ones_own_takes_part():
     """Parameters of a builder that is not fivjax's are parameters like any other: as in the closed forms above, by `derivatives`."""
     scene = fj.Scene(point_mass(1.0, 0.1), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(1.0))
     start = ([0.0, 0.0], [0.5, 0.0])
-    d = fj.derivatives(measure.last_state, scene, ["stiffness", "damping"], 1.0, 1.0, y0=start, method=FEW)
+    d = fj.derivatives(cases.last_state, scene, ["stiffness", "damping"], 1.0, 1.0, y0=start, method=FEW)
     assert d.exist and all(np.all(np.isfinite(d[name])) for name in ("stiffness", "damping"))
     assert jnp.shape(d["damping"]) == (4,)
     # Slips towards rest about F μ / k; more stiffness holds it back.

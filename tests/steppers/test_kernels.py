@@ -6,9 +6,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
-from test_simulate import CASES, scene_of
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
@@ -24,6 +22,8 @@ from fivjax.steppers.kernel_advance import stepping
 from fivjax.steppers.kernel_laws import Form
 from fivjax.steppers.kernel_matrices import matrices
 from fivjax.steppers.propagation import propagators
+from tests.helpers import oracle
+from tests.helpers.transients import CASES, scene_of
 
 # The most advances of a trajectory here.
 MOST = 5000
@@ -90,7 +90,7 @@ def march_of(form: Form):
             times: wp.array(dtype=real),
         ):
             time = real(0.0)
-            past = int(0)
+            past = 0
             for k in range(MOST):
                 while past < jumps.shape[0] and jumps[past] <= time:
                     past += 1

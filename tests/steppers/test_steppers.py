@@ -4,15 +4,15 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
-from catalogue import LOW_ORDER
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, status_from_forces
 from fivjax.foundation.compiling import compiled
 from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.steppers.core import follow
+from tests.helpers import oracle
+from tests.helpers.catalogue import LOW_ORDER
 
 # Of the lowest order, of the default one and of the highest; others are compiled anew, too.
 RUNGE_KUTTA = [diffrax.Heun, diffrax.Tsit5, diffrax.Dopri8]

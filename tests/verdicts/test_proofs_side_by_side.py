@@ -6,8 +6,6 @@ friction is linear, and its normal forces and slip speeds are looked at until it
 
 import inspect
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,10 +15,10 @@ from jaxtyping import TypeCheckError, jaxtyped
 from scipy.linalg import expm
 
 import fivjax as fj
-from fivjax.contact import Contact, Mechanics, Status
-from fivjax.linear.linearisation import LinearSliding, linear_sliding
+from fivjax.linear.linearisation import LinearSliding
 from fivjax.verdicts import sliding_proof
-from fivjax.verdicts.sliding_proof import slides_forever, sliding_modes
+from fivjax.verdicts.sliding_proof import sliding_modes
+from tests.helpers.proofs import proved
 
 
 @pytest.fixture(autouse=True)
@@ -109,21 +107,6 @@ def true_margins(structure, mu, belt, deviations, times, step):
         least[1] = np.minimum(least[1], np.min(belt[:, None] - y[n::2], axis=0))
         y = flow @ y
     return least
-
-
-def proved(scenes, deviations):
-    """Which deviations are proved to slide for ever, in each of several scenes that are proved together."""
-    with jax.enable_x64(True):
-        linear = [jax.tree.map(np.asarray, eqx.filter_jit(linear_sliding)(scene)) for scene in scenes]
-        modes = sliding_modes(jax.tree.map(lambda *leaves: np.stack(leaves), *linear))
-        mechanics = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(Mechanics, scenes))
-        one = jnp.ones(len(scenes[0].structure.contacts))
-        contact = Contact((Status.SLIDE * one).astype(jnp.int32), one)
-
-        def of_group(mechanics, modes):
-            return jax.vmap(lambda y: slides_forever(mechanics, modes, contact, y, True))(jnp.asarray(deviations))
-
-        return np.asarray(eqx.filter_jit(jax.vmap(of_group))(mechanics, jax.tree.map(jnp.asarray, modes)))
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)])

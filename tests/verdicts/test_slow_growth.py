@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy.linalg import expm
 
 import fivjax as fj
@@ -14,6 +13,7 @@ from fivjax.model.sliding import sliding_states
 from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.verdicts.sliding_proof import sliding_modes
 from fivjax.verdicts.slow_growth import slid_on
+from tests.helpers import reference
 
 STRUCTURE = fj.belt_oscillator()
 

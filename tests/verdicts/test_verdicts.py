@@ -3,14 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
-from catalogue import steady
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
+from tests.helpers import oracle
+from tests.helpers.catalogue import steady
 
 
 def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):

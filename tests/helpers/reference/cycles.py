@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-import reference
+from tests.helpers import reference
 
 STORED = Path(__file__).with_name("cycles.json")
 DAMPING, MU_D, MU_S, DECAY = 0.1, 0.5, 1.0, 2.0
