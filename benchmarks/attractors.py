@@ -1,5 +1,6 @@
 """Attractors: those of a call against those of a map, tori against long runs, and verdicts near Hopf points.
 
+    python -m benchmarks.attractors                     # all three
     python -m benchmarks.attractors agree [N [SEED]]    # N random scenes, 200 unless given
     python -m benchmarks.attractors tori [N [SEED]]     # N scenes with tori, 20 unless given
     python -m benchmarks.attractors hopf [N [SEED]]     # N structures of 35 trajectories each, 12 unless given
@@ -9,6 +10,10 @@ by springs. Each attractor of a map over seven kicks must be among `limit_cycles
 (1e-6 for a cycle); where the map has none, nothing is compared. `tori` compares amplitudes with the largest speed of a run of 400 s by
 the reference, which shares no code, in its last 320 s. `hopf` draws oscillators under falling friction whose sliding has a
 Hopf point at some belt speed, and maps seven belt speeds from 1 % below it to 3 % above it by five kicks.
+
+`agree` prints a line a scene: a word for what came of it, the map's verdicts (s slides, C limit cycle, ? undecided), seconds of map and
+call, and the attractors where one is missed; then how often each word came. `tori` prints a line a torus, its amplitude beside the
+run's, then the largest and the median difference. `hopf` prints for each oscillator the verdicts of each belt speed, one letter a kick.
 """
 
 import sys
@@ -169,4 +174,5 @@ def hopf(count=12, seed=1):
 STUDIES = {"agree": agree, "tori": tori, "hopf": hopf}
 
 if __name__ == "__main__":
-    STUDIES[sys.argv[1]](*map(int, sys.argv[2:]))
+    for study in sys.argv[1:2] or STUDIES:
+        STUDIES[study](*map(int, sys.argv[2:]))

@@ -5,6 +5,9 @@
 `benchmark_a`: both ends of the unstable branch of benchmark A. `births`: the friction at which the paper's limit cycle appears
 at belt speeds 1 and 3, and the independent solver's motions 1e-4 above and below it. `cost`: seconds for a branch, once its
 programs are compiled.
+
+Special points are listed as the value of the parameter and what happens there. Just above a birth the reference's motions should be
+sustained, just below it slide.
 """
 
 import argparse

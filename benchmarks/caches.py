@@ -3,8 +3,11 @@
     python -m benchmarks.caches [damages] [maps] [kills] [calibrations]
 
 Each word picks one study; without any, all run. `CACHES_MAPS` sets how many runs of `fivjax map` with damaged files there are (20
-unless given), `FIVJAX_TIMES` how many kills of `fivjax calibrate` (50). Right is: what is read is what was written, or nothing; a map of damaged files has the bits of one without any;
-a killed writer leaves the old file or the new one, and the next writer leaves nothing else.
+unless given), `FIVJAX_TIMES` how many kills of `fivjax calibrate` (50).
+
+A line for each kind of file counts damages or kills and what came of them. Right is: what is read is what was written, or nothing; a
+map of damaged files has the bits of one without any; a killed writer leaves the old file or the new one, and the next writer leaves
+nothing else.
 """
 
 import contextlib

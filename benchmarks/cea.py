@@ -1,7 +1,10 @@
-"""Measure the linear theory: `python -m benchmarks.cea`.
+"""Linear theory beside independent routes: critical friction, sensitivities, charts, corners, designs; and seconds.
 
-Prints the library's results beside those of independent routes (Eq. 3 typed out, NumPy's eigenvalues, SciPy's `brentq`; see
-`linear_reference`), and the time they take.
+    python -m benchmarks.cea
+
+The routes are Eq. 3 typed out, NumPy's eigenvalues and SciPy's `brentq` (`tests/helpers/linear_reference.py`). Each block has a line for
+each route: its value and how far it is from the first one's or the reference's. Searches by steps are off by their tolerance, all
+others by rounding.
 """
 
 import time

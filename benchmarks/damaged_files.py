@@ -2,7 +2,7 @@
 
     python -m benchmarks.damaged_files [format] …
 
-`FIVJAX_TIMES` is the number of files of each format (200 unless given). A file is "ok" if it is read all the same, "refused" if
+`FIVJAX_TIMES` is the number of files of each format (200 unless given). A line a format counts what came of them. A file is "ok" if it is read all the same, "refused" if
 a `ValueError` says what is wrong. Nothing else may come: the exit code is 1 if it does, and the files are kept in the folder
 `damaged` for a look at them. Linux or macOS.
 """

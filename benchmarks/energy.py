@@ -1,8 +1,9 @@
-"""Figures of the energy ledger, as `docs/measurements.md` states them.
+"""The energy ledger: its residual, what it costs, and the paper's statements about energy in numbers.
 
     python -m benchmarks.energy [balance] [conservation] [tradeoff] [cost] [paper] [critical]
 
-Each word picks one study; without any, all run (some minutes on two cores).
+Each word picks one study; without any, all run (some minutes on two cores). `docs/measurements.md` states the figures. Residuals and
+drifts are relative to the energy exchanged and should be rounding, 1e-13 or less, but for `WhereSwitched`.
 """
 
 import sys

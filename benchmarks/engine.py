@@ -1,5 +1,6 @@
 """What a first call costs in a fresh process, and what later calls cost: trajectories, their derivatives, cycles, kicks, branches.
 
+    python -m benchmarks.engine          # all three
     python -m benchmarks.engine first    # CPU seconds of fresh processes, in those of a first solve of diffrax in the same run
     python -m benchmarks.engine warm     # milliseconds of calls after the first
     python -m benchmarks.engine bulk     # cycles of vibration of many trajectories in one call
@@ -169,5 +170,6 @@ def bulk() -> None:
 
 
 if __name__ == "__main__":
-    kind, *names = sys.argv[1:]
-    first(names or CALLS) if kind == "first" else {"warm": warm, "bulk": bulk}[kind]()
+    studies = {"first": lambda: first(sys.argv[2:] or CALLS), "warm": warm, "bulk": bulk}
+    for study in sys.argv[1:2] or studies:
+        studies[study]()

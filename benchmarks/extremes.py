@@ -1,10 +1,15 @@
-"""Extreme parameters: the table and figures of `docs/measurements.md`.
+"""Extreme parameters: trajectories drawn over all ranges, the balance of energy, the table of extremes, kills and refusals.
 
-    python -m benchmarks.ranges [trajectories] [confirm] [energy] [table] [rows_apart] [resume] [refusals]
+    python -m benchmarks.extremes [trajectories] [confirm] [energy] [table] [rows_apart] [resume] [refusals]
 
 Each word picks one study; without any, all run. `EXTREMES_TRAJECTORIES` sets how many trajectories are drawn (100,000 unless given),
 `EXTREMES_ASKED` of about how many of them `confirm` asks the reference (300 unless given).
-`confirm` needs no `trajectories` before it; both keep what they ran in the temporary folder. The reference is `tests/oracle.py`.
+`confirm` needs no `trajectories` before it; both keep what they ran in the temporary folder. The reference is
+`tests/helpers/oracle.py`.
+
+`trajectories` counts them by status; none may be without one. `confirm` counts those of each status that the reference confirms,
+contradicts, or cannot tell; each contradiction is printed with its parameters. `table` is that of `docs/measurements.md`: one row for
+each extreme, the error of the state for each method and precision.
 """
 
 import itertools
@@ -433,8 +438,8 @@ def resume(times: int = 20) -> None:
 
 def refusals() -> None:
     """Kinds of bad input whose refusals the tests check: sentences that differ in more than their values."""
-    here = Path(__file__).parent
-    pytest.main(["-q", str(here / "test_refusals.py"), str(here / "test_refusals_of_commands.py")])
+    tests = Path(__file__).parents[1] / "tests"
+    pytest.main(["-q", str(tests / "package/test_refusals.py"), str(tests / "cli/test_refusals_of_commands.py")])
     print(f"{len(refusing.SEEN)} kinds of bad input, each refused with a sentence of its own")
 
 
@@ -450,4 +455,5 @@ STUDIES = {
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or STUDIES:
+        print(f"--- {name}: {STUDIES[name].__doc__}", flush=True)
         STUDIES[name]()

@@ -1,9 +1,10 @@
-"""Derivatives through contact, against differences and closed forms: `python -m benchmarks.gradients`.
+"""Derivatives through contact: against differences and closed forms, where-switched ones beside exact ones, and seconds.
 
     python -m benchmarks.gradients [state] [closed] [where] [cost] [cycles]
 
 Each word picks one study; without any, all run (some minutes on two cores). Errors are relative, of the worst component of
-the state, each component's derivative in proportion to its own size.
+the state, each component's derivative in proportion to its own size. Those against differences are as large as the differences' own,
+which stand beside them (1e-8); those against closed forms are rounding.
 """
 
 import sys

@@ -1,8 +1,12 @@
-"""Figures of trajectories, maps and critical perturbations, as `docs/measurements.md` states them.
+"""Trajectories, maps and critical perturbations: errors against the oracle, seconds, memory, and maps of ten million cells.
 
     python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
 
-Each word picks one study; without any, all run (half an hour on two cores). The reference is `tests/oracle.py`.
+Each word picks one study; without any, all run (half an hour on two cores). `docs/measurements.md` states the figures. The reference
+is `tests/helpers/oracle.py`.
+
+Each study prints what its heading says, a line a case. Wall times are of warm maps unless a line says otherwise, and mean little on a
+busy machine; those of cores and the ratios of maps in turns do.
 """
 
 import contextlib

@@ -13,6 +13,8 @@ scenes are counted apart.
 
 `tangents` compares jax.jvp of the end state after about the eighth event with central differences, extrapolated (Richardson) from
 two largest steps; where these two differ by more than 1e-7 at all sizes of steps, grazing is near, and nothing is compared.
+
+For each study: how many were compared, quantiles of the errors, and each that is above what is allowed, with its seed.
 """
 
 import os

@@ -4,6 +4,8 @@
 
 Each prints what `fj.smallest_kick` finds and certifies, and the smallest that SciPy's `differential_evolution` finds in 2,000
 trajectories of the paper's case at 1 m/s, in the same bounds.
+
+The certified bound must be below both; the found one should be no larger than that of the 2,000 trajectories.
 """
 
 import argparse

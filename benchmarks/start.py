@@ -5,6 +5,8 @@
 Wall time by JAX's own events (they nest: tracing inside tracing is counted in both). Run it twice with a compilation cache
 (`JAX_COMPILATION_CACHE_DIR`): the second run is the later start. What was traced is kept in that folder, too; without that a
 later start traces anew (remove the folder `fivjax-traced` in it to see what that costs).
+
+A line for imports, then for each of two maps its seconds and those of each of JAX's events in it.
 """
 
 import time

@@ -3,6 +3,9 @@
     python -m benchmarks.stores [interrupted] [killed] [flipped] [at_once]
 
 `FIVJAX_TIMES` is the number of interrupts, kills or flips (20, 50 and 200 unless given); `FIVJAX_WITHOUT=warp` hides Warp.
+
+Counts of what came of them: a map that is whole after all stops should have the same bits as one without, a flipped bit should be
+found and its cells computed anew, and of two commands at once one should say that the other is at work.
 """
 
 import os
@@ -20,7 +23,7 @@ import xarray as xr
 
 import fivjax as fj
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 COMMAND = [sys.executable, "-c", "from fivjax.cli import program; program()"]
 # Hides Warp from a process that imports it at its start.
 HIDING = """
@@ -39,7 +42,7 @@ def times(usual: int) -> int:
 def command(folder: Path, *options: str, points: int = 64) -> subprocess.Popen:
     """`fivjax map` in a folder."""
     (folder / "hiding").mkdir(exist_ok=True)
-    paths = [str(HERE.parent)]
+    paths = [str(ROOT)]
     if os.environ.get("FIVJAX_WITHOUT") == "warp":
         (folder / "hiding" / "sitecustomize.py").write_text(HIDING)
         paths.append(str(folder / "hiding"))

@@ -3,8 +3,10 @@
     python -m benchmarks.validation [closed] [benchmark] [linear] [cycles] [bifurcation]
 
 Each word picks one study; without any, all run (some minutes on two cores). Studies with a script of their own are not repeated here:
-Table 2 (`measure_maps.py table2`), energies (`measure_energy.py`), derivatives (`measure_gradients.py`), the paper's figures
+Table 2 (`benchmarks.maps table2`), energies (`benchmarks.energy`), derivatives (`benchmarks.gradients`), the paper's figures
 (`fivjax reproduce`).
+
+A line a quantity: the published or closed number, that of fivjax, and how far apart they are.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Parameters from recordings: recovered with honest uncertainties, withheld where the data do not tell them.
 
-How often, over a hundred draws of noise in each regime, is measured in `measure_calibration.py`.
+How often, over a hundred draws of noise in each regime, is measured by `benchmarks.calibration`.
 """
 
 from pathlib import Path

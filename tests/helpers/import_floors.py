@@ -1,6 +1,6 @@
 """The rooms of the package and the floors they stand on, read off the code's own imports.
 
-    python tests/import_floors.py
+    python tests/helpers/import_floors.py
 
 prints the floors, lowest first. A room is a subpackage (or a module beside them, such as `cli`); its floor is one above
 the highest room that it imports. Imports inside functions count as well, and so do modules imported by name.

@@ -1,6 +1,6 @@
 """A map in a process of its own that kills itself: for the tests of what survives.
 
-    python tests/killed_map.py FOLDER SIGNAL DELAY
+    python tests/helpers/killed_map.py FOLDER SIGNAL DELAY
 
 Runs a small map with the checkpoint FOLDER/map.part and saves it as FOLDER/map.nc. DELAY seconds after the first trajectories
 are kept the process sends SIGNAL to itself ("none" for never).

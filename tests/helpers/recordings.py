@@ -1,6 +1,6 @@
 """Synthetic recordings: what an accelerometer would give of a run of the paper's scene.
 
-python tests/recordings.py notebooks/decay.csv    # writes the recording that README and notebook fit
+python tests/helpers/recordings.py notebooks/decay.csv    # writes the recording that README and notebook fit
 """
 
 import sys

@@ -44,7 +44,7 @@ def test_what_has_no_bound_is_refused():
 def test_the_paper_s_smallest_kick_is_certified_to_more_than_half():
     kick = fj.smallest_kick(SCENE, bounds={"p": (1.0, 1.3)})
     assert 0.5 <= kick.ratio < 1 and kick.certified < kick.proved_low < kick.p < kick.proved_high
-    # Differential evolution on the independent solver's verdicts comes down to 1.06466083 (`measure_smallest.py kick`).
+    # Differential evolution on the independent solver's verdicts comes down to 1.06466083 (`benchmarks.smallest kick`).
     assert kick.p < 1.06466083
     assert "slides for ever" in str(kick)
 

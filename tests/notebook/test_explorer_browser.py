@@ -1,6 +1,6 @@
 """The explorer in a real browser: JupyterLab on a loopback port, Chromium without a screen, driven by Playwright.
 
-    python tests/test_explorer_browser.py picture.png
+    python tests/notebook/test_explorer_browser.py picture.png
 
 does the same outside pytest, prints how long pictures take to change, and takes a screenshot: `picture.png`, and
 `picture_narrow.png` of a window 900 pixels wide.

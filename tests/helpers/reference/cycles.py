@@ -1,6 +1,6 @@
 """Limit cycles found without the library: Benchmark A with SciPy's DOP853, the paper's oscillator with the C++ solver.
 
-`cd tests && python -m reference.cycles` computes them again and writes `cycles.json`, which the tests read.
+`python -m tests.helpers.reference.cycles` computes them again and writes `cycles.json`, which the tests read.
 
 Benchmark A (Papangelo, Ciavarella and Hoffmann 2017): x'' + 2 xi x' + x = mu(v - x') with
 mu(w) = mu_d + (mu_s - mu_d) exp(-w / v0); unit mass and spring, xi = 0.05, mu_d = 0.5, mu_s = 1, v0 = 0.5.
