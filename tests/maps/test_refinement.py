@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import hypergeom
 
 import fivjax as fj
 from fivjax.maps.refinement import finer, refined
@@ -57,11 +58,15 @@ def test_the_audit_finds_islands_that_the_coarse_grid_missed():
     """An island between the places of the coarse grid is missed; the audit's rate tells of it."""
     truth = np.zeros((129, 129), int)
     truth[33:47, 33:47] = 1
-    found, _, checked, _ = fill(truth, 4, audit=0.5)
-    assert checked.wrong > 0
-    missed = np.sum(found != truth)
-    assert missed / truth.size < 196 / 129**2
-    assert checked.wrong / checked.cells == pytest.approx(196 / 129**2, rel=0.5)
+    found, computed, checked, _ = fill(truth, 4, audit=0.5)
+    # All of the island was assumed to be sea; what the audit came across is right now, and counted.
+    assert checked.wrong == np.sum(computed & (truth == 1))
+    assert checked.wrong + np.sum(found != truth) == 196
+    # It drew half of the assumed cells, each as likely as any other: so much it may be off by chance, once in ten thousand draws.
+    assumed = truth.size - (computed.sum() - checked.cells)
+    low, high = hypergeom.interval(1 - 1e-4, assumed, 196, checked.cells)
+    assert low <= checked.wrong <= high
+    assert checked.cells == assumed // 2
 
 
 def test_after_an_interrupt_the_finer_places_are_not_run():

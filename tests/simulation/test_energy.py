@@ -578,7 +578,15 @@ def test_fig_7_sticking_keeps_the_energy_gained_per_cycle_constant():
     assert np.all(np.diff(growing["stick_time"]) > 0)
     assert growing["stick_time"][-1] > 1.9 * growing["stick_time"][0]
     assert growing["contact_work"][-1] > 2.2 * growing["contact_work"][0]
-    np.testing.assert_allclose(growing["energy_gain"], 3.7e-3, rtol=0.16)
+    # The gains themselves are those of the oracle, which is followed to 1e-11.
+    instants = np.concatenate([[0.0], growing["cycle_start"], growing["cycle_end"][-1:]])
+    model = oracle.paper_model(mu_static=0.6, mu_dynamic=0.5, decay=0.5, belt_speed=0.5, p=1.0)
+    reference = oracle.simulate(model, instants[-1], instants, (1.001 * q, 0 * q), rtol=1e-11)
+    energies = 0.5 * np.einsum("ti,ij,tj->t", reference.v, model.mass, reference.v)
+    energies += 0.5 * np.einsum("ti,ij,tj->t", reference.q, model.stiffness, reference.q)
+    np.testing.assert_allclose(growing["energy_gain"], np.diff(energies)[1:], rtol=1e-9)
+    # What the paper reads off its figure as constant varies by a third, while what the contact gives grows to more than twice.
+    assert growing["energy_gain"].max() < 1.4 * growing["energy_gain"].min()
     # Detachment ends it.
     after = c.isel(cycle=slice(first_detach + 20, None))
     assert np.all(np.abs(after["energy_gain"]) < 0.1 * growing["energy_gain"].min())

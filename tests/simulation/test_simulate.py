@@ -112,7 +112,8 @@ def test_negative_slope_grows_to_a_limit_cycle_of_sticking_without_detachment():
 def test_both_together_grow_exponentially_then_linearly_with_sticking_then_detach():
     """Section 3.3: 0.6 to 0.5 at 0.5 m/s; sticking straightens the growth, detachment ends it."""
     scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.6, 0.5, 0.5), 0.5, steady())
-    run = fj.simulate(scene, 3.0, 1e-3, QUICK, y0=away_from_equilibrium(scene))
+    # Rows a 150th of a period apart: peaks are read to 2e-4 of themselves, what they grow by in half the time to 1 %.
+    run = fj.simulate(scene, 3.0, 1e-4, QUICK, y0=away_from_equilibrium(scene))
     stick = run.t[np.argmax(run.status == Status.STICK)]
     detach = run.t[np.argmax(run.status == Status.DETACH)]
     assert 0.1 < stick < detach - 0.2 < 2.0
@@ -127,9 +128,10 @@ def test_both_together_grow_exponentially_then_linearly_with_sticking_then_detac
         values = [measure(amplitude(t)) for t in (begin, 0.5 * (begin + end), end)]
         return (values[2] - values[1]) / (values[1] - values[0])
 
-    assert growth(0.1, stick - 0.02, np.log) == pytest.approx(1.0, abs=0.15)
-    assert growth(0.1, stick - 0.02, float) > 2.0
-    assert growth(stick + 0.1, detach - 0.02, float) == pytest.approx(1.0, abs=0.35)
+    assert growth(0.1, stick - 0.02, np.log) == pytest.approx(1.0, abs=0.05)
+    assert growth(0.1, stick - 0.02, float) > 5.0
+    # It is straight to 6 %, and read to 1 %.
+    assert growth(stick + 0.1, detach - 0.02, float) == pytest.approx(1.0, abs=0.08)
     rate = np.log(amplitude(stick - 0.02) / amplitude(0.1)) / (stick - 0.12)
     assert amplitude(detach) < 0.2 * amplitude(stick) * np.exp(rate * (detach - stick))
     assert np.abs(run.velocity[run.t > 2.5, 0]).max() > 0.6
