@@ -335,10 +335,11 @@ def test_command_line(tmp_path, decay, capsys, monkeypatch):
     path = tmp_path / "run.npz"
     np.savez(path, t=data.t, a0=data.values[:, 0], a1=data.values[:, 1])
     out = str(tmp_path / "fit")
-    # From where `decay_fit` starts, so that it is compiled already.
+    # From where `decay_fit` starts, of samples of the same kind, so that it is compiled already.
     begin = off(scene, FREE[3], 0).parameters
     values = [word for name in FREE[3] for word in (f"--{name}", repr(float(begin[name])))]
     options = ["--free", "mu,c1,k1", *values, "--p", "1.2", "--starts", "4", "--out", out]
+    options += ["--sampling", "averages"]
     assert cli.main(["calibrate", str(path), *options]) == 0
     assert (tmp_path / "fit.nc").exists() and (tmp_path / "fit.png").exists()
     printed = capsys.readouterr().out

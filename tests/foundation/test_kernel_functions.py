@@ -87,7 +87,7 @@ def test_its_derivatives_are_those_of_jax():
         return loss(KERNEL, x, matrix, instants)
 
     with jax.enable_x64(True):
-        expected = jax.jacfwd(of_jax, (0, 1))(x, matrix)
+        expected = jax.jit(jax.jacfwd(of_jax, (0, 1)))(x, matrix)
         for derivative in (jax.grad, jax.jacfwd):
             for found in (derivative(of_kernel, (0, 1)), jax.jit(derivative(of_kernel, (0, 1)))):
                 for own, other in zip(found(x, matrix), expected, strict=True):
@@ -193,9 +193,22 @@ def test_second_derivatives_of_a_kernel_are_those_of_its_function():
 
     with jax.enable_x64(True):
         many = x + 0.1 * np.arange(3.0)[:, None]
-        twice = jax.jacfwd(jax.jacfwd(of(function)))
-        for transformed in (jax.hessian, lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))):
-            np.testing.assert_allclose(
-                jax.vmap(transformed(of(KERNEL)))(many), jax.vmap(twice)(many), rtol=1e-9, atol=1e-9
-            )
-            np.testing.assert_allclose(transformed(of(KERNEL))(x), twice(x), rtol=1e-9, atol=1e-9)
+        # In one program: without `jit` every operation would be compiled by itself.
+        expected = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(of(function)))))(many)
+        found = jax.jit(jax.jacfwd(jax.jacfwd(of(KERNEL))))
+        np.testing.assert_allclose(jax.vmap(found)(many), expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found(x), expected[0], rtol=1e-9, atol=1e-9)
+
+
+def test_second_derivatives_of_a_kernel_need_no_jit():
+    """Of a short function: without `jit` each of its operations is a program of its own."""
+    cubes = KernelFunction(lambda args, instants: (args[0] ** 3 * args[1], ()))
+
+    def of(x):
+        return jnp.sum(cubes((x, jnp.asarray([2.0, -1.0])), np.zeros(1))[0])
+
+    with jax.enable_x64(True):
+        many = np.array([[1.0, 2.0], [-0.5, 3.0]])
+        expected = np.einsum("bi,ij->bij", 6.0 * many * [2.0, -1.0], np.eye(2))
+        np.testing.assert_allclose(jax.vmap(jax.hessian(of))(many), expected, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(jax.hessian(of)(many[0]), expected[0], rtol=1e-12, atol=1e-12)

@@ -118,25 +118,39 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize("code", STARTS.values(), ids=STARTS)
-def test_what_a_start_loads(code):
-    """Seconds of imports that a session may never need are left until they are used."""
-    code += "; import sys; print('loaded', *sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(ran.stdout.rpartition("loaded ")[2].split())
-    assert "fivjax" in loaded
-    assert not loaded & HEAVY
+COMPUTING = ("model", "contact", "steppers", "linear", "simulation", "cycles", "verdicts")
 
 
-@pytest.mark.parametrize("room", ["model", "contact", "steppers", "linear", "simulation", "cycles", "verdicts"])
-def test_rooms_of_computing_load_nothing_to_draw_or_store_with(room):
-    """What computes must not wait for what draws, stores or reads files."""
+def imports_of(room: str) -> str:
     names = [name for name in import_floors.modules() if import_floors.room(name) == room]
-    code = "import sys, importlib\n" + "".join(f"importlib.import_module({name!r})\n" for name in names)
-    ran = subprocess.run(
-        [sys.executable, "-c", code + "print(*sys.modules)"], capture_output=True, text=True, check=True
+    return "; ".join(f"importlib.import_module({name!r})" for name in names)
+
+
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, set[str]]:
+    """What a process has loaded after each of these steps, one after the other. Were something loaded too early, it would be
+    in the sets of all later steps, too."""
+    steps = STARTS | {room: imports_of(room) for room in COMPUTING}
+    code = "import importlib, sys\n" + "".join(
+        f"{step}\nprint('loaded', {name!r}, *sys.modules, sep='|')\n" for name, step in steps.items()
     )
-    assert not set(ran.stdout.split()) & HEAVY
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    lines = (line.split("|") for line in ran.stdout.splitlines() if line.startswith("loaded|"))
+    return {name: set(names) for _, name, *names in lines}
+
+
+@pytest.mark.parametrize("step", STARTS)
+def test_what_a_start_loads(loaded, step):
+    """Seconds of imports that a session may never need are left until they are used."""
+    assert "fivjax" in loaded[step]
+    assert not loaded[step] & HEAVY
+
+
+@pytest.mark.parametrize("room", COMPUTING)
+def test_rooms_of_computing_load_nothing_to_draw_or_store_with(loaded, room):
+    """What computes must not wait for what draws, stores or reads files."""
+    assert {name for name in import_floors.modules() if import_floors.room(name) == room} <= loaded[room]
+    assert not loaded[room] & HEAVY
 
 
 def test_what_notebooks_show_stands_where_it_is_looked_for():
