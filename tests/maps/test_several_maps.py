@@ -1,5 +1,6 @@
 """What is proved of several contacts: sliding for ever, limit cycles, maps; against the same of each contact alone."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,9 +27,9 @@ def together(friction):
 def proofs(scene, deviations):
     """Which of these deviations from sliding are proved to slide for ever."""
     with jax.enable_x64(True):
-        modes = sliding_modes(jax.tree.map(lambda leaf: leaf[None], linear_sliding(scene)))
+        modes = sliding_modes(jax.tree.map(lambda leaf: leaf[None], eqx.filter_jit(linear_sliding)(scene)))
         modes = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), modes)
-        mechanics = Mechanics(scene)
+        mechanics = eqx.filter_jit(Mechanics)(scene)
         one = jnp.ones(jnp.shape(mechanics.belt_speed))
         contact = Contact((Status.SLIDE * one).astype(jnp.int32), one)
         prove = jax.jit(jax.vmap(lambda y: slides_forever(mechanics, modes, contact, y, True)))
@@ -84,10 +85,14 @@ def test_free_directions_keep_the_section_and_the_contact_modes():
                 assert np.abs(y[[place, 6 + place]]).max() < 1e-14
 
 
+@eqx.filter_jit
+def uniquely(scene):
+    return slides_uniquely(Mechanics(scene))
+
+
 def unique(structure, mu):
-    scene = scene_of(structure, mu=mu)
     with jax.enable_x64(True):
-        return bool(slides_uniquely(Mechanics(scene)))
+        return bool(uniquely(scene_of(structure, mu=mu)))
 
 
 def test_friction_without_a_unique_answer_is_known_for_one_of_many_scenes():

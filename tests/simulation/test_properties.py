@@ -1,7 +1,7 @@
 """What must hold for any structure, law, load and state: invariants, and changes that change nothing."""
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -161,16 +161,27 @@ def test_a_later_start_of_the_pulse_is_the_same_motion_later(case, wait):
         np.testing.assert_allclose(second.displacement[-1], first.displacement[-1], rtol=0, atol=1e-6 * size)
 
 
+@eqx.filter_jit
+def chosen(scene, y):
+    """What the forces choose in a state: the contact, friction, normal force and slip velocity."""
+    mechanics, load = Mechanics(scene), scene.load.force
+    contact = physics.status_from_forces(mechanics, load, y)
+    return contact, *physics.contact_forces(mechanics, contact, load, y), physics.relative_velocity(mechanics, y)
+
+
+@eqx.filter_jit
+def landed(scene, y):
+    return physics.impact(Mechanics(scene), y)
+
+
 @MANY
-@given(cases(sizes=(2, 3, 4, 6)))
+@given(cases(sizes=(2, 3, 6)))
 def test_the_next_status_is_one_that_its_forces_allow(case):
     """From any state: what is chosen presses, holds within the cone, or is open."""
     with jax.enable_x64(True):
         scene = scene_of(case)
-        mechanics, y, load = Mechanics(scene), jnp.asarray(start_of(case)), scene.load.force
-        contact = physics.status_from_forces(mechanics, load, y)
-        friction, force = physics.contact_forces(mechanics, contact, load, y)
-        slip = float(physics.relative_velocity(mechanics, y))
+        y = start_of(case)
+        contact, friction, force, slip = chosen(scene, y)
         if contact.status == Status.DETACH:
             assert force == 0 and friction == 0
         else:
@@ -181,15 +192,15 @@ def test_the_next_status_is_one_that_its_forces_allow(case):
 
 
 @MANY
-@given(cases(sizes=(2, 3, 4, 6)))
+@given(cases(sizes=(2, 3, 6)))
 def test_an_impact_never_creates_energy_against_a_belt_at_rest(case):
     """Restitution 0: whatever the coupling of the coordinates, a landing on a belt that stands still takes energy."""
     with jax.enable_x64(True):
         scene = scene_of({**case, "restitution": 0.0, "belt_speed": 0.0})
-        mechanics, y = Mechanics(scene), start_of(case)
+        y = start_of(case)
         n, normal = len(y) // 2, normal_of(case)
         y[normal], y[n + normal] = 0.0, -abs(y[n + normal])
-        after = np.asarray(physics.impact(mechanics, jnp.asarray(y)))
+        after = np.asarray(landed(scene, y))
     mass = case["structure"]["mass"]
     before, behind = y[n:] @ mass @ y[n:], after[n:] @ mass @ after[n:]
     assert after[n + normal] == 0 and behind <= before * (1 + 1e-12)

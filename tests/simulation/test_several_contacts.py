@@ -1,6 +1,7 @@
 """Structures with several contacts, against single runs, closed forms and independent solvers.
 
-All fast tests share one compiled program: two contacts at the same places of six coordinates, lists of Coulomb laws, a pulse.
+Fast tests share two kernels, for lists of Coulomb laws and a pulse: two contacts at the same places of six coordinates, and with the
+ledger, whose kernel takes longer to compile by the square of its length, of four.
 """
 
 import inspect
@@ -78,8 +79,8 @@ def test_five_copies_move_like_one_each():
     assert agrees_with_copies(5, 0.35) > 100
 
 
-def agrees_with_reference(count, seed, *, events=20):
-    scene, model, y0 = coupled(count, seed)
+def agrees_with_reference(count, seed, *, events=20, each=EACH):
+    scene, model, y0 = coupled(count, seed, each=each)
     t1 = between_events(model, y0, events)
     expected, found = reference.events(model, y0, t1)
     run = fj.simulate(scene, t1, t1 / 20, y0=y0, energy=True)
@@ -96,16 +97,17 @@ def agrees_with_reference(count, seed, *, events=20):
     assert np.all(run.gap >= 0)
 
 
-@pytest.mark.parametrize("seed", [2, 3, 6])
+# Of the first twelve seeds those whose motion lasts longest.
+@pytest.mark.parametrize("seed", [9, 10, 11])
 def test_two_coupled_contacts_are_those_of_an_independent_solver(seed):
     """Stick, slip, lift-off and impacts that strike the other contact, against matrix exponentials with enumeration."""
-    agrees_with_reference(2, seed)
+    agrees_with_reference(2, seed, each=2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "seed"), [(3, 0), (3, 2), (5, 0), (5, 2)])
+@pytest.mark.parametrize(("count", "seed"), [(2, 2), (2, 3), (2, 6), (3, 0), (3, 2), (5, 0), (5, 2)])
 def test_more_coupled_contacts_are_those_of_an_independent_solver(count, seed):
-    """Three contacts by enumeration, five by pivoting."""
+    """With a coordinate beside each contact: two and three contacts by enumeration, five by pivoting."""
     agrees_with_reference(count, seed)
 
 
@@ -123,19 +125,14 @@ def test_a_time_stepping_scheme_converges_to_the_same_motion():
 def test_a_chain_of_equal_blocks_moves_as_one():
     """Blocks of 1 kg on springs of 1 N/m, coupled by a spring that equal motions do not stretch: the closed form of one block
     with F_s = 1 N, F_d = 0.5 N on a belt of 0.2 m/s."""
-    mass = np.eye(6)
-    stiffness = np.diag([1.0, 5.0, 9.0, 1.0, 5.0, 9.0])
-    stiffness[np.ix_([0, 3], [0, 3])] += 0.7 * np.array([[1, -1], [-1, 1]])
-    load = np.array([0.0, 0, -1, 0, 0, -1])
-    structure = fj.Structure(
-        mass, np.zeros((6, 6)), stiffness, load, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)]
-    )
+    stiffness = np.diag([1.0, 9.0, 1.0, 9.0])
+    stiffness[np.ix_([0, 2], [0, 2])] += 0.7 * np.array([[1, -1], [-1, 1]])
+    contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+    structure = fj.Structure(np.eye(4), np.zeros((4, 4)), stiffness, [0.0, -1, 0, -1], contacts=contacts)
     scene = scene_of(structure, mu=0.5, mu_static=1.0, belt=0.2, force=1.0)
     period = 8.902605408
-    y0 = np.zeros(12)
-    y0[[0, 3]], y0[[6, 9]] = 0.9, 0.2
-    run = fj.simulate(scene, 4 * period, period / 4, y0=y0, energy=True)
-    assert np.abs(run.displacement[:, 0] - run.displacement[:, 3]).max() < 1e-12
+    run = fj.simulate(scene, 4 * period, period / 4, y0=[0.9, 0.0, 0.9, 0.0, 0.2, 0.0, 0.2, 0.0], energy=True)
+    assert np.abs(run.displacement[:, 0] - run.displacement[:, 2]).max() < 1e-12
     assert np.array_equal(run.status[:, 0], run.status[:, 1])
     later = run.displacement[4:, 0]
     assert np.abs(later[4:] - later[:-4]).max() < 1e-9
@@ -164,15 +161,16 @@ def mirrored():
 def symmetric(cycles, rows):
     scene, _ = mirrored()
     t1 = cycles / 68.0
-    run = fj.simulate(scene, t1, t1 / rows, energy=True)
+    run = fj.simulate(scene, t1, t1 / rows)
     other = run.velocity[:, 3:] * np.array([-1.0, 1, 1])
-    assert int(run.energy.ledger.events[-1]) > cycles
+    # Fewer than there are: rows are a sixteenth of a cycle apart at least.
+    assert np.count_nonzero(np.diff(run.status[:, 0])) > min(cycles, rows // 4)
     return np.abs(run.velocity[:, :3] - other).max() / np.abs(run.velocity).max()
 
 
 def test_a_mirror_symmetric_pair_stays_symmetric():
     """Both lift, land and stick at the same instants, and the impact of one is felt by the other at once."""
-    assert symmetric(50, 40) < 1e-9
+    assert symmetric(50, 800) < 1e-9
 
 
 @pytest.mark.slow
@@ -193,8 +191,8 @@ def test_contacts_along_vectors_are_those_at_coordinates():
     assert np.allclose(fj.delassus(turned).matrix, fj.delassus(scene.structure).matrix, atol=1e-13)
     z0 = np.linalg.solve(mix, y0[:n]), np.linalg.solve(mix, y0[n:])
     t1 = between_events(model, y0, 6)
-    run = fj.simulate(scene, t1, t1 / 20, y0=y0, energy=True)
-    again = fj.simulate(scene_of(turned, mu=model.mu, belt=model.belt, force=1.0), t1, t1 / 20, y0=z0, energy=True)
+    run = fj.simulate(scene, t1, t1 / 20, y0=y0)
+    again = fj.simulate(scene_of(turned, mu=model.mu, belt=model.belt, force=1.0), t1, t1 / 20, y0=z0)
     assert np.abs(again.displacement @ mix.T - run.displacement).max() < 1e-10
     assert np.abs(again.slip_velocity - run.slip_velocity).max() < 1e-10
     assert np.abs(again.gap - run.gap).max() < 1e-10
@@ -203,8 +201,11 @@ def test_contacts_along_vectors_are_those_at_coordinates():
 
 def test_a_run_of_several_contacts_is_saved_and_drawn_with_one_panel_each(tmp_path):
     """Status, forces and ledger lines keep their contact in a file, and a picture shades each with its own status."""
-    scene, _ = mirrored()
-    run = fj.simulate(scene, 0.4, 0.01, energy=True)
+    own, _, y0 = coupled(2, 11, each=2)
+    scene = scene_of(own.structure, mu=0.3, belt=[0.7, -0.7], force=1.0)
+    run = fj.simulate(scene, 10.0, 0.25, y0=y0, energy=True)
+    alike = run.status[:, 0] == run.status[:, 1]
+    assert np.any(alike) and not np.all(alike)
     data = run.to_dataset()
     assert data["status"].dims == data["normal_force"].dims == ("t", "contact")
     assert np.allclose(data["stick_work_0"] + data["stick_work_1"], data["stick_work"], atol=1e-12)
@@ -215,13 +216,13 @@ def test_a_run_of_several_contacts_is_saved_and_drawn_with_one_panel_each(tmp_pa
     assert again.scene.structure.places == scene.structure.places
     assert len(fj.plot.response(run).axes) == 2
     # In the explorer, belts that run apart are in one panel, and statuses of the two are not drawn on each other.
-    draw = drawing_panels(0.4, 2)
+    draw = drawing_panels(10.0, 2)
     assert len(draw(run)) > 1000
     _, status, _, phase = inspect.getclosurevars(draw).nonlocals["canvas"].figure.axes
-    assert [float(line.get_ydata()[0]) for line in phase.lines[2:]] == [3.0, -3.0]
+    assert [float(line.get_ydata()[0]) for line in phase.lines[2:]] == [0.7, -0.7]
     first, second = (line.get_ydata() for line in status.lines)
     assert np.array_equal(np.round(first), run.status[:, 0]) and np.array_equal(np.round(second), run.status[:, 1])
-    assert np.all(first < second)
+    assert np.all(first[alike] < second[alike])
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ def march_of(form: Form):
             times: wp.array(dtype=real),
         ):
             time = real(0.0)
-            past = 0
+            past = int(0)
             for k in range(MOST):
                 while past < jumps.shape[0] and jumps[past] <= time:
                     past += 1

@@ -1,5 +1,6 @@
 """The two proofs: neither may hold where it should not, and both must hold soon where they can."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,8 @@ from fivjax.linear.linearisation import linear_sliding
 from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
 from tests.helpers import oracle
 from tests.helpers.catalogue import steady
+
+ENVELOPE_PEAK = eqx.filter_jit(envelope_peak)
 
 
 def brute_force_peak(shares, eigenvalues, t_end=40.0, points=400_001):
@@ -32,7 +35,7 @@ def test_the_envelope_is_a_bound_and_a_tight_one(apart):
         shares = rng.normal() / apart * np.array([1, -1]) + rng.normal(size=2) + 1j * rng.normal(size=2)
         with jax.enable_x64(True):
             table = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), envelope(eigenvalues[None], np.ones((1, 1, 2))))
-            bound = float(envelope_peak(jnp.asarray(shares), table))
+            bound = float(ENVELOPE_PEAK(jnp.asarray(shares), table))
         true = brute_force_peak(shares, eigenvalues)
         assert bound >= true * (1 - 1e-9)
         # What is lost: chords between instants, and the sum of sizes at the end of the horizon.
@@ -41,20 +44,23 @@ def test_the_envelope_is_a_bound_and_a_tight_one(apart):
 
 def modes_of(scene: fj.Scene):
     with jax.enable_x64(True):
-        linear = jax.tree.map(lambda leaf: leaf[None], linear_sliding(scene))
+        linear = jax.tree.map(lambda leaf: leaf[None], eqx.filter_jit(linear_sliding)(scene))
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), sliding_modes(linear))
+
+
+SLIDES_FOREVER = eqx.filter_jit(slides_forever)
 
 
 def prover(scene: fj.Scene):
     """A function: whether sliding from a state is proved."""
     with jax.enable_x64(True):
         contact = Contact(jnp.asarray(Status.SLIDE, jnp.int32), jnp.asarray(1.0))
-        mechanics, modes = Mechanics(scene), modes_of(scene)
+        mechanics, modes = eqx.filter_jit(Mechanics)(scene), modes_of(scene)
 
     def proved(q, v) -> bool:
         with jax.enable_x64(True):
-            y = jnp.concatenate([jnp.asarray(q), jnp.asarray(v)])
-            return bool(slides_forever(mechanics, modes, contact, y - modes.linear.equilibrium, True))
+            y = jnp.asarray(np.concatenate([q, v]) - np.asarray(modes.linear.equilibrium))
+            return bool(SLIDES_FOREVER(mechanics, modes, contact, y, True))
 
     return proved
 
