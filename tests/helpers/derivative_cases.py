@@ -71,7 +71,7 @@ def closed_forms(mode, method=None):
     )
     with jax.enable_x64(True):
         # Flights end at 0.452, 0.903, 1.129 and 1.242 s.
-        expected = np.asarray(jax.jacfwd(lambda x: bouncing_height(t1, 3, *x))(jnp.array([force, restitution])))
+        expected = np.asarray(jax.jit(jax.jacfwd(lambda x: bouncing_height(t1, 3, *x)))(np.array([force, restitution])))
     yield "bouncing mass, 3 bounces, in force and restitution", np.stack([d["force"], d["restitution"]], -1), expected
     values = {"mu": 0.5, "mu_static": 1.0, "force": 1.0, "belt_speed": 0.2, "stiffness": 1.0}
     x0, t1 = 0.9, 20.0
@@ -94,5 +94,5 @@ def closed_forms(mode, method=None):
         x = jnp.array(list(values.values()))
         found = compiled((jax.jacfwd if mode == "forward" else jax.jacrev)(run))(x)
         # Periods of 8.9026 s: slips for the third time from 18.3 s on.
-        expected = jax.jacfwd(lambda x: stick_slip(t1, 2, x0, *x))(x)
+        expected = jax.jit(jax.jacfwd(lambda x: stick_slip(t1, 2, x0, *x)))(x)
     yield "stick–slip block, 5 events, in " + ", ".join(values), np.asarray(found), np.asarray(expected)
