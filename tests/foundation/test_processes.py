@@ -1,5 +1,6 @@
 """Processes: forked ones, workers whose parent is gone, and how the program ends when it is told to."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -94,14 +95,33 @@ program()
 WAITS, IN_COMPILED_CODE = "time.sleep(60)", "hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
 
 
+@pytest.fixture
+def heeded():
+    """Processes heed Ctrl-C, which those that a shell starts in the background do not, nor what they start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def begun(code: str, **about):
+    """A process that runs this and has said that it has begun; whatever comes, it is gone in the end."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], env=VARIABLES, **pipes, **about) as running:
+        try:
+            assert running.stdout.readline() == "begun\n"
+            yield running
+        finally:
+            running.kill()
+
+
+@pytest.mark.usefixtures("heeded")
 @pytest.mark.parametrize(("work", "number"), [(WAITS, signal.SIGTERM), (IN_COMPILED_CODE, signal.SIGINT)])
 def test_a_signal_ends_a_command_wherever_it_is(work, number):
-    command = [sys.executable, "-c", BUSY.format(work=work)]
-    running = subprocess.Popen(command, env=VARIABLES, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert running.stdout.readline() == "begun\n"
-    began = time.monotonic()
-    running.send_signal(number)
-    _, said = running.communicate(timeout=30)
+    with begun(BUSY.format(work=work)) as running:
+        began = time.monotonic()
+        running.send_signal(number)
+        _, said = running.communicate(timeout=30)
     assert running.returncode == 128 + number
     assert time.monotonic() - began < PATIENCE + 3
     assert said.startswith("fivjax: Interrupted") and "Traceback" not in said
@@ -125,21 +145,19 @@ program()
 """
 
 
+@pytest.mark.usefixtures("heeded")
 @pytest.mark.parametrize(("module", "number"), [("tyro", signal.SIGTERM), ("fivjax.linear.critical", signal.SIGINT)])
 def test_a_signal_ends_a_command_during_imports(tmp_path, module, number):
     """Before a command is known, and within it."""
-    command = [sys.executable, "-c", IMPORTING.format(module=module)]
-    running = subprocess.Popen(
-        command, env=VARIABLES, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert running.stdout.readline() == "begun\n"
-    running.send_signal(number)
-    _, said = running.communicate(timeout=30)
+    with begun(IMPORTING.format(module=module), cwd=tmp_path) as running:
+        running.send_signal(number)
+        _, said = running.communicate(timeout=30)
     assert running.returncode == 128 + number
     assert said.startswith("fivjax: Interrupted") and "Traceback" not in said and said.count("\n") == 1
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("heeded")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("after", [3.0, 8.0, 15.0, 25.0])
 @pytest.mark.parametrize("workers", ["0", "2"])
