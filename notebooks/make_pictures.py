@@ -3,7 +3,7 @@
     python notebooks/make_pictures.py                  # all of them, in some minutes
     python notebooks/make_pictures.py 01_quickstart    # only these
 
-The explorer is not among them, because it needs a browser: `python tests/test_explorer_browser.py` takes its picture.
+The explorer is not among them, because it needs a browser: `python tests/notebook/test_explorer_browser.py` takes its picture.
 """
 
 import base64

@@ -13,8 +13,9 @@ CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle.
 LONGEST = (
-    "energy maps gradients cycles several_contacts simulate cea steppers attractor verdicts returns_by_kernels notebooks "
-    "tradeoff calibrate checkpoint properties reproduce types precision kernels basins branches"
+    "maps cea kernels gradients energy oracle several_contacts calibrate contact steppers tradeoff kernel_functions creeping "
+    "returns_by_kernels several_sliding cycles calibration_goodness attractor properties branches simulate extending "
+    "verdicts standstill proofs_side_by_side basins several_maps design smallest_kick reproduce sampling notebooks"
 )
 LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
 
@@ -41,6 +42,53 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 _FOLDER = pytest.StashKey[str]()
+
+
+# ------------------------------------------------------------------------------- what the suite compiles, if asked for
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--compiling", action="store_true", help="say in the end how long XLA's compiler worked")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Each process that runs tests notes the seconds of each of XLA's programs; those found compiled count by what it took
+    to read them."""
+    config = session.config
+    if not config.getoption("--compiling"):
+        return
+    config.stash[_SECONDS] = []
+    import jax
+
+    def heard(event: str, duration: float, **about) -> None:
+        if event.endswith("backend_compile_duration"):
+            config.stash[_SECONDS].append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(heard)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    output = getattr(session.config, "workeroutput", None)
+    if output is not None and _SECONDS in session.config.stash:
+        output["compiling"] = session.config.stash[_SECONDS]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node, error) -> None:
+    """What a worker has noted comes to the process that started it."""
+    if _SECONDS in node.config.stash:
+        node.config.stash[_SECONDS] += getattr(node, "workeroutput", {}).get("compiling", [])
+
+
+def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
+    if _SECONDS in config.stash:
+        seconds = config.stash[_SECONDS]
+        terminalreporter.write_line(
+            f"XLA's compiler: {sum(seconds):.0f} s in {len(seconds)} programs, over all workers"
+        )
+
+
+_SECONDS = pytest.StashKey[list]()
 
 
 @pytest.fixture

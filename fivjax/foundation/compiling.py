@@ -21,7 +21,7 @@ R = TypeVar("R")
 
 # Level 1 leaves out LLVM's costly optimisations. The fusion emitters are XLA's newer way to make kernels of fused operations;
 # the older way compiles much faster where there are many of them. Level 0 would save another fifth, but with the older way it
-# is wrong: in JAX 0.10 the derivative of minus a Hurwitz determinant was zero (`tests/test_cea.py`).
+# is wrong: in JAX 0.10 the derivative of minus a Hurwitz determinant was zero (`tests/linear/test_cea.py`).
 COMPILED_QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 

@@ -3,7 +3,8 @@
 In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device. LAPACK is called
 system by system instead. Worse, its calls can wait for each other for ever: those of jaxlib 0.10.0 to 0.10.2 share a batch out
 to XLA's pool of threads and wait for it, inside a thread of that pool. As many such calls at a time as the pool has threads,
-in one program or in several, hold all of them (`tests/test_standstill.py`). See `matrix_routines` for what is left to LAPACK.
+in one program or in several, hold all of them (`tests/foundation/test_standstill.py`). See `matrix_routines` for what is
+left to LAPACK.
 """
 
 import jax

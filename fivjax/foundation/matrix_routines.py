@@ -3,7 +3,8 @@
 Given a batch, the calls of jaxlib 0.10.0 to 0.10.2 can wait for each other for ever (see `linear_solve`). Given one matrix they
 wait for nothing. So on a CPU `jax.vmap` makes a loop over the matrices here.
 
-Nothing that steps trajectories calls these, and nothing else in fivjax calls LAPACK inside JAX (`tests/test_standstill.py`).
+Nothing that steps trajectories calls these, and nothing else in fivjax calls LAPACK inside JAX
+(`tests/foundation/test_standstill.py`).
 """
 
 from collections.abc import Callable

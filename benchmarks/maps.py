@@ -1,0 +1,289 @@
+"""Trajectories, maps and critical perturbations: errors against the oracle, seconds, memory, and maps of ten million cells.
+
+    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
+
+Each word picks one study; without any, all run (half an hour on two cores). `docs/measurements.md` states the figures. The reference
+is `tests/helpers/oracle.py`.
+
+Each study prints what its heading says, a line a case. Wall times are of warm maps unless a line says otherwise, and mean little on a
+busy machine; those of cores and the ratios of maps in turns do.
+"""
+
+import contextlib
+import itertools
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from unittest import mock
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import fivjax as fj
+
+MAP = {"mu": (0.05, 0.228), "p": (1.0, 4.0)}
+
+
+def scene(**changes) -> fj.Scene:
+    paper = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 3.0, fj.Pulse(100.0, 1.2))
+    return paper.replace(**changes)
+
+
+def errors() -> None:
+    """State error, relative to each coordinate's size, at 0.5 s (9 events) and 2 s (345 events): μ = 0.227, p = 1.3, 3 m/s."""
+    from tests.helpers import oracle  # not at the top: other studies measure the memory of this process
+
+    for t1, kind in ((0.1, "one status"), (0.5, "9 events"), (2.0, "345 events")):
+        reference = oracle.simulate(
+            oracle.paper_model(mu=0.227, belt_speed=3.0, p=1.3), t1, np.array([0.0, t1]), rtol=1e-13
+        )
+        exact = np.concatenate([reference.q[-1], reference.v[-1]])
+        methods = {"EventExact()": fj.EventExact()}
+        methods |= {f"WhereSwitched(Tsit5, dt={dt:g})": fj.WhereSwitched(dt=dt) for dt in (2e-4, 5e-5, 1e-5)}
+        for name, method in methods.items():
+            run = fj.simulate(scene(p=1.3), t1, t1, method)
+            state = np.concatenate([run.displacement[-1], run.velocity[-1]])
+            scale = np.where(exact == 0, 1.0, np.abs(exact))
+            print(f"{name:32s} t = {t1} s ({kind}): {np.max(np.abs(state - exact) / scale):.1e}")
+
+
+def table2() -> None:
+    """Table 2 and p_crit behind it."""
+    speeds = [0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0]
+    begin = time.perf_counter()
+    found = fj.critical_perturbation(scene(), belt_speed=speeds, p_range=(1.0, 1.3), tolerance=1e-7, progress=False)
+    print(f"{time.perf_counter() - begin:.0f} s, compilation included")
+    for speed in speeds:
+        row = found.sel(belt_speed=speed)
+        p = float(row["p_crit"])
+        print(
+            f"v = {speed:5g} m/s: p_crit = {p:.8f} ± {float(row['p_crit_error']):.0e}, first of 0.01: {np.ceil(100 * p) / 100}"
+        )
+
+
+def map_() -> None:
+    """The paper's map, 64 × 64, and 200 of its trajectories by the oracle."""
+    from tests.helpers import oracle
+
+    m = paper_map(64)
+    print("64 × 64:", {name: count for name, count in json.loads(m.attrs["counts"]).items() if count})
+    kinds = {0: "sliding", 1: "limit cycle"}
+    cells = np.random.default_rng(64).choice(m["verdict"].size, 200, replace=False)
+    agree = differ = open_ = 0
+    for cell in tqdm(cells, desc="oracle", disable=None):
+        i, j = np.unravel_index(cell, m["verdict"].shape)
+        verdict = int(m["verdict"][i, j])
+        model = oracle.paper_model(mu=float(m["mu"][i]), belt_speed=3.0, p=float(m["p"][j]))
+        kind = oracle.verdict(model, t_max=40.0).kind
+        open_ += verdict < 0
+        agree += verdict >= 0 and kind == kinds[verdict]
+        differ += verdict >= 0 and kind != kinds[verdict]
+    print(f"oracle: {agree} trajectories agree, {differ} differ, {open_} undecided")
+
+
+def speed() -> None:
+    """Maps of two sizes: wall time, that of all cores, and trajectory-cycles (one trajectory over 1/68 s) per second."""
+    for points, calls in ((64, ("first call", "warm", "warm", "warm")), (256, ("warm", "warm"))):
+        for call in calls:
+            begin, cores = time.perf_counter(), time.process_time()
+            m = paper_map(points)
+            wall, cores = time.perf_counter() - begin, time.process_time() - cores
+            undecided = np.asarray(m["verdict"] < 0)
+            cycles = 68 * np.where(np.isnan(m["decided_at"]), 20.0, m["decided_at"]).sum()
+            print(
+                f"{points} × {points}, {call}: {wall:.1f} s ({cores:.1f} s of cores), {cycles / wall:.2g} trajectory-cycles/s, "
+                f"{cycles / cores:.2g} per core; undecided {undecided.mean():.2%}, "
+                f"farthest from a boundary in p: {_farthest(m, undecided):.1g}",
+                flush=True,
+            )
+
+
+def refined() -> None:
+    """A warm map of 1009 × 1009 cells, 64 × 64 refined four times: wall time, the share computed, and what the audit says."""
+    paper_map(64)  # compiled
+    begin, cores = time.perf_counter(), time.process_time()
+    m = paper_map(64, refine=4)
+    wall, cores = time.perf_counter() - begin, time.process_time() - cores
+    print(
+        f"{m['verdict'].shape[0]} × {m['verdict'].shape[1]}: {wall:.1f} s ({cores:.1f} s of cores), "
+        f"{float(m['computed'].mean()):.1%} computed; {m.attrs['audit_wrong']} of {m.attrs['audit_cells']} audited cells wrong"
+    )
+
+
+def kernels() -> None:
+    """Warm maps with and without kernels, in turns: wall time, and whether their verdicts agree."""
+    paper_map(64), without_kernels(64)  # compiled
+    for _ in range(2):
+        walls, found = [], []
+        for make in (paper_map, without_kernels):
+            begin = time.perf_counter()
+            found.append(make(64))
+            walls.append(time.perf_counter() - begin)
+        one, other = (m["verdict"].values for m in found)
+        sizes = [np.where(np.asarray(m["verdict"]) == 1, m["amplitude"], 1.0) for m in found]
+        print(
+            f"64 × 64: {walls[0]:.1f} s by kernels, {walls[1]:.1f} s without, ratio {walls[0] / walls[1]:.2f}; "
+            f"verdicts that differ: {np.sum(one != other)}, amplitudes by "
+            f"{np.max(np.where(one == other, np.abs(sizes[0] / sizes[1] - 1), 0.0)):.1e} at most",
+            flush=True,
+        )
+
+
+def axes() -> None:
+    """Warm maps over two parameters without kicks, where trajectories share nothing, against that over friction and kick: at the
+    README's belt speed, where many limit cycles are tori, and at 1 m/s, where they are periodic.
+    """
+    pairs = {
+        "μ × belt speed": {"mu": (0.05, 0.228), "belt_speed": (0.5, 5.0)},
+        "k1 × k2": {"k1": (0.8e5, 1.2e5), "k2": (0.8e5, 1.2e5)},
+        "m1 × c1": {"m1": (0.4, 0.7), "c1": (0.5, 2.0)},
+    }
+    for speed in (3.0, 1.0):
+        base = scene(belt_speed=speed)
+
+        def seconds(ranges: dict, base=base) -> tuple[float, str]:
+            values = {name: np.linspace(*ends, 64) for name, ends in ranges.items()}
+            begin = time.perf_counter()
+            m = fj.bistability_map(base, progress=False, **values)
+            return time.perf_counter() - begin, m.attrs["counts"]
+
+        seconds(MAP)  # compiled
+        for what, ranges in pairs.items():
+            one, (other, counts) = seconds(MAP)[0], seconds(ranges)
+            print(
+                f"{what}, 64 × 64, {speed:g} m/s: {other:.1f} s, friction × kick {one:.1f} s, ratio {other / one:.1f}; {counts}",
+                flush=True,
+            )
+
+
+def without_kernels(points: int):
+    scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "maps.groups"))
+    with mock.patch(scope, return_value=False), mock.patch(sharing, return_value=False):
+        return paper_map(points)
+
+
+def _farthest(m, undecided: np.ndarray) -> float:
+    """How far in p an undecided trajectory is from the nearest change between sliding and limit cycle at its μ, at most."""
+    p, verdict, worst = np.asarray(m["p"]), np.asarray(m["verdict"].transpose("mu", "p")), 0.0
+    for row, open_ in zip(verdict, np.asarray(undecided), strict=True):
+        known = np.flatnonzero(row >= 0)
+        changes = [0.5 * (p[a] + p[b]) for a, b in itertools.pairwise(known) if row[a] != row[b]]
+        for trajectory in np.flatnonzero(open_):
+            worst = max(worst, min((abs(p[trajectory] - change) for change in changes), default=np.inf))
+    return worst
+
+
+def start() -> None:
+    """From the start of `fivjax map` to its end, 64 × 64: nothing compiled before, and with the compilation cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "XDG_CACHE_HOME": folder}
+        command = [Path(sys.executable).with_name("fivjax"), "map", "--overwrite", "--out", f"{folder}/map"]
+        for name in ("cold", "cached", "cached"):
+            begin = time.perf_counter()
+            subprocess.run(command, env=environment, check=True, capture_output=True)
+            print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
+
+
+def memory() -> None:
+    """The largest additional memory of a map, per trajectory, in a process that has compiled everything."""
+
+    paper_map(128)
+    with watched_memory() as highest:
+        before = highest[0]
+        paper_map(256)
+    print(f"{(highest[0] - before) / 1e3 / 256**2:.2f} kB per trajectory, 65,536 trajectories")
+
+
+def large() -> None:
+    """A map of ten million cells, 51 × 51 refined six times, by two processes into a Zarr store: time, memory, disk. The two
+    workers compile; this process only hands out and writes.
+    """
+    axes = {name: np.linspace(low, high, 51) for name, (low, high) in MAP.items()}
+    with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        store = Path(folder) / "large.zarr"
+        begin = time.perf_counter()
+        with watched_memory() as highest:
+            m = fj.bistability_map(scene(), **axes, refine=6, audit=1e-3, executor=pool, resume=store, progress=False)
+        disk = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
+        print(
+            f"{m['verdict'].size:,} cells, {float(m['computed'].mean()):.2%} of them computed: "
+            f"{time.perf_counter() - begin:.0f} s; store {disk / 1e6:.0f} MB, this process {highest[0] / 1e6:.0f} MB; "
+            f"{m.attrs['audit_wrong']} of {m.attrs['audit_cells']} audited cells wrong; {m.attrs['counts']}"
+        )
+
+
+@contextlib.contextmanager
+def watched_memory():
+    """The largest memory (bytes) of this process so far, as the only element of a list."""
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    highest, over = [resident()], threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.02):
+            highest[0] = max(highest[0], resident())
+
+    watching = threading.Thread(target=watch)
+    watching.start()
+    try:
+        yield highest
+    finally:
+        over.set()
+        watching.join()
+
+
+def steps() -> None:
+    """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
+    from fivjax.maps.following import Batch, begin
+    from fivjax.maps.groups import Task
+    from fivjax.steppers.propagation import Propagation
+
+    mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
+    with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
+        batch = Batch(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16), mu[:, None], pool)
+        trajectories = begin(batch, group, np.full((len(group), 1), 1.3))
+        kernels, prepared = batch.kernels, batch.shared.tree.prepared
+        kernels.follow(group, trajectories, steps)
+        found = []
+        for _ in range(5):
+            start = time.perf_counter()
+            kernels.follow(group, trajectories, steps)
+            found.append(time.perf_counter() - start)
+    table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / len(mu)
+    print(f"{1e6 * min(found) / (steps * len(group)):.2f} µs a trajectory-step")
+    print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
+
+
+def paper_map(points: int, **options):
+    axes = {name: np.linspace(low, high, points) for name, (low, high) in MAP.items()}
+    return fj.bistability_map(scene(), progress=False, **axes, **options)
+
+
+if __name__ == "__main__":
+    studies = {
+        "errors": errors,
+        "table2": table2,
+        "map": map_,
+        "speed": speed,
+        "refined": refined,
+        "kernels": kernels,
+        "axes": axes,
+        "start": start,
+        "memory": memory,
+        "large": large,
+        "steps": steps,
+    }
+    for name in sys.argv[1:] or studies:
+        print(f"--- {name}: {studies[name].__doc__}")
+        studies[name]()

@@ -1,0 +1,180 @@
+"""Branches of limit cycles against closed forms, against ODE solvers of another kind, and against trajectories."""
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+from tests.helpers import reference
+from tests.helpers.reference import cycles
+from tests.helpers.reference.cycles import stored
+
+REFERENCE = stored()
+
+
+def paper(belt_speed: float, mu: float) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), belt_speed=belt_speed, load=fj.ConstantLoad(100.0))
+
+
+def benchmark_a(belt_speed: float) -> fj.Scene:
+    structure = fj.Structure(np.eye(2), np.diag([0.1, 0.0]), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    return fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), belt_speed, fj.ConstantLoad(1.0))
+
+
+def specials(branch) -> list[str]:
+    return [name for name in branch.special.values if name]
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    return fj.limit_cycle(paper(1.0, 0.2))
+
+
+@pytest.fixture(scope="module")
+def branch(cycle):
+    """From the stable cycle at μ = 0.2 down over its fold, and up again along the unstable one."""
+    return fj.continue_cycle(cycle.scene, "mu", (0.16, 0.21), start=cycle, derivatives=True)
+
+
+def test_the_branch_passes_its_fold_and_names_what_happens_on_the_way(branch):
+    """The unstable cycle loses its lift-off, then its slip back; each is said, and both ends say why they are."""
+    assert set(specials(branch)) == {
+        "fold",
+        "grazing of N: lift-off removed",
+        "edge of the friction cone: slip removed",
+    }
+    assert branch.begins == branch.ends == "The bound mu = 0.21 is reached."
+    np.testing.assert_allclose(branch.parameter.values[[0, -1]], 0.21, rtol=1e-14)
+    fold = int(np.argmax(branch.special.values == "fold"))
+    assert not branch.stable.values[:fold].any() and branch.stable.values[fold + 1 :].all()
+    assert branch.word.values[0] == "stick – slide"
+    assert branch.word.values[-1] == "stick – slide – detach – slide – slide back"
+
+
+def test_the_fold_is_where_a_multiplier_is_one(branch):
+    fold = branch.isel(point=int(np.argmax(branch.special.values == "fold")))
+    assert abs(complex(fold.multipliers[0]) - 1) < 1e-9
+    assert float(fold.parameter) == pytest.approx(float(branch.parameter.min()), abs=1e-15)
+
+
+def test_special_points_have_the_derivatives_that_scaling_demands(branch):
+    """Forces, speeds and displacements scale together: no border in μ moves with load and belt speed by the same factor."""
+    for i in np.flatnonzero(branch.special.values != ""):
+        slope = branch.d_special.isel(point=i)
+        assert float(slope.sel(of="force")) * 100.0 == pytest.approx(-float(slope.sel(of="belt_speed")), rel=1e-6)
+        stiffer = {name: float(slope.sel(of=name)) for name in ("m1", "m2", "c1", "c2", "k1", "k2")}
+        values = dict(m1=0.53, m2=0.045, c1=1.0, c2=1.0, k1=100e3, k2=101e3)
+        # Time is measured anew: masses by s², dampers by s, and the belt by 1/s.
+        change = sum(share * values[n] * stiffer[n] for n, share in zip(values, (2, 2, 1, 1, 0, 0), strict=True))
+        assert change == pytest.approx(float(slope.sel(of="belt_speed")), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_cycle_at_gives_the_cycle_back(branch):
+    for i in (0, len(branch.point) // 2, len(branch.point) - 1):
+        cycle = fj.cycle_at(branch, i)
+        assert cycle.residual < 1e-10 and cycle.stable == bool(branch.stable[i])
+        assert cycle.period == pytest.approx(float(branch.period[i]), rel=1e-11)
+        assert np.min(np.abs(cycle.multipliers - branch.multipliers.values[i, 0])) < 1e-7
+    with pytest.raises(ValueError, match="`i` be the place of one of its points"):
+        fj.cycle_at(branch, 10**6)
+
+
+@pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
+def test_no_cycle_is_born_below_the_fold(branch):
+    """An independent solver started on the fold's cycle: 1e-4 above it goes on for ever, 1e-4 below it fades."""
+    fold = branch.isel(point=int(np.argmax(branch.special.values == "fold")))
+    mu = float(fold.parameter)
+    displacement, velocity = np.split(fold["state"].values, 2)
+    deviation = 1.02 * (displacement - fj.sliding_equilibrium(paper(1.0, mu))), 1.02 * velocity
+    scenes = [reference.paper_scene(mu=mu + by, belt_speed=1.0, deviation=deviation) for by in (1e-4, -1e-4)]
+    assert list(reference.fate(scenes).fate) == ["sustained", "slides"]
+
+
+def test_what_is_no_parameter_or_no_bound_is_refused():
+    scene = paper(1.0, 0.2)
+    with pytest.raises(ValueError, match="parameter"):
+        fj.continue_cycle(scene, "p", (0.0, 1.0))
+    with pytest.raises(ValueError, match="must hold the scene's own mu"):
+        fj.continue_cycle(scene, "mu", (0.3, 0.4))
+    with pytest.raises(ValueError, match="pair of numbers"):
+        fj.continue_cycle(scene, "mu", 0.3)
+    with pytest.raises(TypeError, match="whole number"):
+        fj.cycle_at(None, 1.5)
+
+
+@pytest.mark.slow
+def test_benchmark_a_s_unstable_branch_runs_from_the_hopf_point_to_the_grazing():
+    """Both ends have values of their own: a closed form, and a root that an ODE solver found."""
+    known = cycles.sliding_cycle(1.5)
+    scene = benchmark_a(1.5)
+    branch = fj.continue_cycle(scene, "belt_speed", (1.0, 2.0), ([known["lowest"], 0, 0, 0], 1), derivatives=True)
+    assert specials(branch) == ["amplitude meets the sliding equilibrium", "grazing of slip: stick inserted"]
+    hopf, grazing = (branch.isel(point=int(i)) for i in np.flatnonzero(branch.special.values != ""))
+    assert float(hopf.parameter) == pytest.approx(0.5 * np.log(10.0), abs=1e-12)
+    assert float(grazing.parameter) == pytest.approx(REFERENCE["benchmark_a"]["grazing_speed"], abs=1e-9)
+    # v = ln(N Δμ d / c) / d
+    assert float(hopf.d_special.sel(of="force")) == pytest.approx(0.5, rel=1e-7)
+    assert float(hopf.d_special.sel(of="mu_static")) == pytest.approx(1.0, rel=1e-7)
+    assert float(hopf.d_special.sel(of="decay")) == pytest.approx(0.25 - 0.25 * np.log(10.0), rel=1e-7)
+    # Beyond the grazing it is the stick–slip cycle, which goes back.
+    assert branch.stable.values[-1] and float(branch.parameter[-1]) == 1.0
+    assert branch.word.values[-1] == "stick – slide"
+
+
+def test_a_branch_is_drawn_and_saved(branch, cycle, tmp_path):
+    """Solid where stable, dashed where not, special points by name; several branches share one picture."""
+    assert branch.sliding_stable.all()
+    path = fj.save(branch, tmp_path / "branch.nc")
+    kept = fj.open(path)
+    np.testing.assert_array_equal(kept.multipliers, branch.multipliers)
+    (axes,) = fj.plot.branch({"1 m/s": branch, "again": kept}).axes
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert {"fold", "1 m/s", "again", "stable", "unstable"} <= set(texts)
+    assert fj.show(branch).axes[0].get_xlabel() == axes.get_xlabel()
+    with pytest.raises(TypeError, match="continue_cycle"):
+        fj.plot.branch(cycle)
+
+
+def test_the_command_writes_branch_and_picture(branch, monkeypatch, tmp_path, capsys):
+    from fivjax.cli import main
+
+    asked = []
+    monkeypatch.setattr("fivjax.cli.command_line.keep_compiled_code", lambda: None)
+    monkeypatch.setattr(fj, "continue_cycle", lambda scene, *rest, **_: asked.append((scene, *rest)) or branch)
+    out = str(tmp_path / "b")
+    assert main(["branch", "--over", "mu=0.1:0.3", "--each", "belt_speed=1:2:2", "--out", out]) == 0
+    assert [float(scene.belt_speed) for scene, *_ in asked] == [1.0, 2.0] and asked[0][1:] == ("mu", (0.1, 0.3))
+    said = capsys.readouterr().out
+    assert "fold" in said and "The bound mu = 0.21 is reached." in said
+    assert {path.name for path in tmp_path.iterdir()} == {"b-1.nc", "b-2.nc", "b.png"}
+
+
+def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):
+    """The saddle of this branch is unstable in one real direction: nothing is released beside it."""
+    assert fj.tori_along(branch).sizes["point"] == 0
+    with pytest.raises(ValueError, match="must come from"):
+        fj.tori_along(branch.drop_vars("multipliers"))
+
+
+@pytest.mark.slow
+def test_a_branch_over_restitution_begins_without_any():
+    """Ever more impacts follow each landing. A first step of Newton's method to one of them led a thousand periods on, and no
+    end of the branch was in sight.
+    """
+    branch = fj.continue_cycle(paper(1.0, 0.227), "restitution", (0.0, 0.2))
+    assert branch.begins == "The bound restitution = 0 is reached."
+    assert branch.ends == "The bound restitution = 0.2 is reached."
+    assert specials(branch).count("impact inserted") >= 10
+    scene = {**reference.of_scene(paper(1.0, 0.227)), "p": 3.0, "restitution": 0.2}
+    assert float(branch.amplitude[-1]) == pytest.approx(reference.fate([scene]).amplitude[0], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_torus_beside_a_branch_is_what_the_independent_solver_comes_to():
+    branch = fj.continue_cycle(paper(1.8, 0.227), "belt_speed", (1.79, 3.0), start=fj.limit_cycle(paper(1.8, 0.227)))
+    assert specials(branch) == ["Neimark–Sacker"]
+    tori = fj.tori_along(branch, points=2)
+    stored = next(one for one in REFERENCE["paper"]["peaks"] if one["belt_speed"] == 3.0)
+    assert tori["kind"].values[-1] == "torus" and float(tori["parameter"][-1]) == 3.0
+    assert float(tori["amplitude"][-1]) == pytest.approx(stored["peak_speed"], rel=2e-3)
+    fj.plot.branch(branch, tori=tori)

@@ -1,0 +1,221 @@
+"""JAX functions written out as C++ and computed by kernels: against JAX itself, with loops, branches, tables and tangents."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fivjax.foundation.kernel_functions import KernelFunction
+from fivjax.foundation.kernel_text import Form
+from fivjax.foundation.linear_solve import solve
+from fivjax.foundation.numpy_evaluation import by_numpy
+
+
+def with_loops(x, matrix, count):
+    """Loops of known and unknown length, branches, places that are unknown, arrays that are gone through by loops."""
+    size = x.shape[0]
+
+    def turn(carry):
+        k, y, far = carry
+        y = jax.lax.cond(k % 2 == 0, lambda y: jnp.sin(matrix @ y), lambda y: y[::-1] + 0.1 * y, y)
+        far = jax.lax.dynamic_update_index_in_dim(far, y[k % size], k % 3, 0)
+        return k + 1, y, far.at[k % 3].add(jnp.max(y))
+
+    _, y, far = jax.lax.while_loop(lambda carry: carry[0] < count, turn, (jnp.zeros((), jnp.int32), x, jnp.zeros(3)))
+    rows = jax.lax.scan(lambda a, b: (a + b, a * b), jnp.zeros(size), jnp.outer(x, y))[1]
+    batch = jnp.einsum("bij,bj->bi", jnp.stack([matrix, matrix.T, 2 * matrix]), rows[:3])
+    large = jnp.where(rows > 0, rows, matrix[:, :1] * rows)
+    taken = jnp.take_along_axis(rows, jnp.argmax(rows, axis=1)[:, None], axis=1)
+    return {
+        "y": y,
+        "far": jnp.concatenate([far, jnp.cumsum(y)]),
+        "batch": batch.sum(axis=0),
+        "large": jnp.max(large, axis=1) + jnp.sum(large.T, axis=1),
+        "taken": taken[:, 0],
+        "sorted": jnp.sort(jnp.stack([far[0], y[0], y[1], far[1]])),
+        "count": count + jnp.sum(rows > 0),
+    }
+
+
+def function(args, instants):
+    x, matrix, count = args
+
+    def row(total, t):
+        total = total + t * x
+        return total, {"total": total, "square": jnp.sum(total**2), "sign": total[0] > 0}
+
+    total, rows = jax.lax.scan(row, jnp.zeros_like(x), instants)
+    return {"total": total, **with_loops(x, matrix, count)}, rows
+
+
+KERNEL = KernelFunction(function)
+
+
+def given(size):
+    random = np.random.default_rng(size)
+    return random.normal(size=size), random.normal(size=(size, size)), np.int32(7)
+
+
+@pytest.mark.parametrize("size", [4, 9])
+def test_what_a_kernel_computes_is_what_jax_does(size):
+    args, instants = given(size), np.linspace(-1, 1, 6)
+    with jax.enable_x64(True):
+        expected = jax.jit(function)(args, instants)
+    found = KERNEL(args, instants)
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert own.dtype == other.dtype
+        np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-12)
+
+
+def loss(of, x, matrix, instants):
+    ends, rows = of((x, matrix, jnp.int32(5)), instants)
+    return jnp.sum(ends["y"] ** 2) + jnp.sum(ends["large"]) + jnp.sum(rows["square"]) + jnp.sum(ends["batch"])
+
+
+def test_its_derivatives_are_those_of_jax():
+    x, matrix, _ = given(4)
+    instants = np.linspace(-1, 1, 6)
+
+    # Bounded loops, so that JAX differentiates its own function in both modes.
+    def of_jax(x, matrix):
+        return loss(function, x, matrix, instants)
+
+    def of_kernel(x, matrix):
+        return loss(KERNEL, x, matrix, instants)
+
+    with jax.enable_x64(True):
+        expected = jax.jit(jax.jacfwd(of_jax, (0, 1)))(x, matrix)
+        for derivative in (jax.grad, jax.jacfwd):
+            for found in (derivative(of_kernel, (0, 1)), jax.jit(derivative(of_kernel, (0, 1)))):
+                for own, other in zip(found(x, matrix), expected, strict=True):
+                    np.testing.assert_allclose(own, other, rtol=1e-11, atol=1e-11)
+        # Only what is perturbed has a direction.
+        np.testing.assert_allclose(jax.grad(of_kernel)(x, matrix), expected[0], rtol=1e-11, atol=1e-11)
+
+
+def test_a_tangent_may_be_a_number_of_pythons():
+    kernel = KernelFunction(lambda args, instants: (args[0] ** 2, ()))
+    with jax.enable_x64(True):
+        square = jax.jit(lambda x: jax.jvp(lambda x: kernel((x,), np.zeros(1))[0], (x,), (1.0,)))
+        assert square(3.0) == (9.0, 6.0)
+
+
+def test_a_batch_is_what_single_calls_are():
+    _, matrix, count = given(4)
+    x, instants = np.random.default_rng(1).normal(size=(3, 2, 4)), np.linspace(0, 1, 3)
+
+    def of(x):
+        ends, rows = KERNEL((x, matrix, count), instants)
+        return ends["y"], rows["square"]
+
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(jax.vmap(of)))(x)
+        slopes = jax.vmap(jax.jacfwd(lambda x: of(x)[0]))(x[0])
+    for place in itertools.product(range(3), range(2)):
+        for own, other in zip(found, of(x[place]), strict=True):
+            np.testing.assert_array_equal(own[place], other)
+    with jax.enable_x64(True):
+        expected = jax.jacfwd(lambda x: of(x)[0])(x[0, 1])
+    np.testing.assert_array_equal(slopes[1], expected)
+    form, _ = Form.of((x[0, 0], matrix, count))
+    rows = np.array([np.concatenate([one.ravel(), matrix.ravel(), [count]]) for one in x.reshape(-1, 4)])
+    ends, _ = KERNEL.of_many(form, rows, instants)
+    np.testing.assert_array_equal(ends["y"].reshape(3, 2, 4), found[0])
+
+
+@pytest.mark.parametrize("size", [3, 7])
+def test_solutions_of_systems_have_tangents(size):
+    """Small systems are eliminated in a row, larger ones in a loop."""
+    random = np.random.default_rng(size)
+    matrix, right = random.normal(size=(size, size)) + 3 * np.eye(size), random.normal(size=(size, 2))
+    kernel = KernelFunction(lambda args, instants: (solve(*args), ()))
+
+    def of_kernel(matrix, right):
+        return jnp.sum(kernel((matrix, right), np.zeros(1))[0] ** 2)
+
+    def of_jax(matrix, right):
+        return jnp.sum(jnp.linalg.solve(matrix, right) ** 2)
+
+    with jax.enable_x64(True):
+        expected, found = (jax.grad(of, (0, 1))(matrix, right) for of in (of_jax, of_kernel))
+    for own, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-11, atol=1e-12)
+
+
+def test_what_a_kernel_cannot_do_is_said():
+    with pytest.raises(NotImplementedError, match=r"one `scan`"):
+        KernelFunction(lambda args, instants: (jnp.sum(instants), ()))((np.zeros(1),), np.zeros(3))
+    with pytest.raises(NotImplementedError, match="primitive `digamma`"):
+        KernelFunction(lambda args, instants: (jax.scipy.special.digamma(args[0]), ()))((np.ones(1),), np.zeros(3))
+
+
+def test_numpy_computes_what_jax_does():
+    args = given(4)
+    with jax.enable_x64(True):
+        expected = with_loops(*args)
+    found = by_numpy(with_loops)(*args)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert isinstance(own, np.ndarray | np.generic)
+        np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-13)
+
+
+def test_numpy_reads_and_writes_the_places_of_arrays_that_jax_does():
+    """Against JAX's own `gather` and `scatter`, by the forms of indexing that it writes them for."""
+    from fivjax.foundation.numpy_evaluation import by_numpy
+
+    a, where = np.arange(24.0).reshape(4, 6), np.array([2, 0, 3])
+    forms = [
+        lambda a, at: a[at],
+        lambda a, at: a[:, at],
+        lambda a, at: a[at, at],
+        lambda a, at: a[jnp.ix_(at, at)],
+        lambda a, at: jax.vmap(lambda row, i: row[i])(a[:3], at),
+        lambda a, at: jax.vmap(lambda row, i: jax.lax.dynamic_slice(row, (i,), (2,)))(a[:3], at),
+        lambda a, at: a.at[at].set(-1.0),
+        lambda a, at: a.at[:, at].set(jnp.arange(3.0)),
+        lambda a, at: a.at[at, 1].add(jnp.arange(3.0)),
+        lambda a, at: a.at[jnp.array([1, 1]), 1].add(2.0),
+        lambda a, at: a.at[at + 2, 0].set(-1.0),  # one of them outside
+        lambda a, at: jnp.argmax(a, axis=1) + jnp.max(a[:, ::-1], axis=1),
+        lambda a, at: jnp.take(a, at, axis=1, mode="clip"),
+    ]
+    for form in forms:
+        np.testing.assert_array_equal(by_numpy(form)(a, where), form(jnp.asarray(a), jnp.asarray(where)))
+
+
+def test_second_derivatives_of_a_kernel_are_those_of_its_function():
+    """By XLA's programs: `hessian`, and the derivative of a derivative under `vmap` and `jit`."""
+    x, matrix, count = given(3)
+    instants = np.linspace(0.1, 1.0, 4)
+
+    def of(run):
+        def loss(x):
+            ends, rows = run((x, matrix, count), instants)
+            return jnp.sum(ends["batch"]) + jnp.sum(rows["square"]) + jnp.sum(ends["total"] ** 2)
+
+        return loss
+
+    with jax.enable_x64(True):
+        many = x + 0.1 * np.arange(3.0)[:, None]
+        # In one program: without `jit` every operation would be compiled by itself.
+        expected = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(of(function)))))(many)
+        found = jax.jit(jax.jacfwd(jax.jacfwd(of(KERNEL))))
+        np.testing.assert_allclose(jax.vmap(found)(many), expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found(x), expected[0], rtol=1e-9, atol=1e-9)
+
+
+def test_second_derivatives_of_a_kernel_need_no_jit():
+    """Of a short function: without `jit` each of its operations is a program of its own."""
+    cubes = KernelFunction(lambda args, instants: (args[0] ** 3 * args[1], ()))
+
+    def of(x):
+        return jnp.sum(cubes((x, jnp.asarray([2.0, -1.0])), np.zeros(1))[0])
+
+    with jax.enable_x64(True):
+        many = np.array([[1.0, 2.0], [-0.5, 3.0]])
+        expected = np.einsum("bi,ij->bij", 6.0 * many * [2.0, -1.0], np.eye(2))
+        np.testing.assert_allclose(jax.vmap(jax.hessian(of))(many), expected, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(jax.hessian(of)(many[0]), expected[0], rtol=1e-12, atol=1e-12)

@@ -1,0 +1,226 @@
+"""Results on disk: whole or absent, opened again as they were, with the scene and the settings that made them."""
+
+import json
+import os
+import socket
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from jaxtyping import Array, Float
+
+import fivjax as fj
+from fivjax.foundation import whole_files
+from fivjax.io import files
+from fivjax.model.friction import AbstractFriction
+from fivjax.model.scene import IMPACT_LAWS
+from tests.helpers.refusing import refused
+
+
+@pytest.fixture(scope="module")
+def run() -> fj.Trajectory:
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=3.0, load=fj.Pulse(force=100.0, p=1.2))
+    return fj.simulate(scene, 0.05, 1e-3)
+
+
+def same(one: fj.Scene, other: fj.Scene) -> bool:
+    """Whether two scenes are the same to the last bit, by everything that a scene consists of."""
+    return bool(eqx.tree_equal(one, other))
+
+
+def empty(scene: fj.Scene) -> xr.Dataset:
+    """A dataset that holds nothing but its provenance."""
+    from fivjax.io.datasets import labelled
+
+    return labelled(xr.Dataset(), scene)
+
+
+def test_a_trajectory_is_saved_and_opened(run, tmp_path):
+    """What is opened is the dataset that the trajectory makes, bit for bit, and a trajectory again where one is wanted."""
+    path = fj.save(run, tmp_path / "run.nc")
+    found = fj.open(path)
+    xr.testing.assert_identical(found.drop_attrs(deep=False), run.to_dataset().drop_attrs(deep=False))
+    again = fj.Trajectory.from_dataset(found)
+    np.testing.assert_array_equal(again.velocity, run.velocity)
+    assert same(again.scene, run.scene) and again.meaning == run.meaning and again.settings == run.settings
+    assert found.fivjax.plot().axes
+
+
+def test_a_trajectory_says_how_it_was_computed(run):
+    """Without them, two saved runs that differ in method or step could not be told apart."""
+    said = json.loads(run.to_dataset().attrs["settings"])
+    assert said["method"].startswith("EventExact(") and said["dt_save"] == 1e-3 and said["t1"] == 0.05
+    assert said["start"] == "sliding equilibrium"
+    other = fj.simulate(run.scene, 0.05, 1e-3, fj.WhereSwitched(diffrax.Tsit5(), dt=1e-4), y0=np.zeros(6))
+    said = json.loads(other.to_dataset().attrs["settings"])
+    assert said["method"] == "WhereSwitched(Tsit5, dt=0.0001)" and said["dt"] == 1e-4
+    assert said["start"] == "given by y0"
+
+
+MATRICES = np.diag([1.0, 2.0, 0.1]), np.diag([0.1, 0.2, 0.3]), np.diag([1e5 / 3, 1e5, 1e5])
+STRUCTURES = {
+    "belt oscillator": fj.belt_oscillator(k1=1e5 / 3, theta=0.1),
+    "matrices": fj.Structure(*MATRICES, [0.0, 0.1, -1.0], tangential=1, normal=2),
+}
+PARTS = {
+    "constant": (fj.Coulomb(0.1 + 0.2), fj.ConstantLoad(1 / 3)),
+    "two coefficients": (fj.Coulomb(0.2, 0.3), fj.Pulse(100.0, 1.1, 0.07, 0.01)),
+    "falling": (fj.ExponentialDecay(0.3, 0.2, 1 / 7), fj.Pulse()),
+}
+
+
+@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+@pytest.mark.parametrize("parts", PARTS.values(), ids=PARTS)
+def test_a_scene_comes_back(structure, parts):
+    """A scene rebuilt from a dataset is the same to the last bit, for each kind of structure, friction law, load and impact."""
+    for law in IMPACT_LAWS:
+        scene = fj.Scene(structure, parts[0], -0.7, parts[1], restitution=0.1, impact_law=law)
+        assert same(fj.Scene.from_dataset(empty(scene)), scene)
+
+
+def test_a_structure_of_an_unknown_builder_comes_back_as_its_matrices():
+    """Only names of parameters are lost; refusing would lose the scene."""
+
+    def rig(k=1e5):
+        return fj.Structure.from_parameters(
+            lambda k: (*MATRICES, jnp.array([0.0, 0.0, -1.0])), {"k": k}, tangential=0, normal=2, builder=rig
+        )
+
+    scene = fj.Scene(rig(), fj.Coulomb(0.2), 3.0)
+    found = fj.Scene.from_dataset(empty(scene))
+    assert found.structure.parameters == {}
+    for name in ("mass", "damping", "stiffness", "load_direction"):
+        np.testing.assert_array_equal(getattr(found.structure, name), getattr(scene.structure, name))
+
+
+class Steady(AbstractFriction):
+    """A law of a user's own whose constructor takes its fields by name."""
+
+    level: Float[Array, ""]
+    constant = True
+
+    @property
+    def static(self):
+        return self.level
+
+    def __call__(self, slip_speed):
+        return self.level
+
+    def variation(self, slip_speed):
+        return 0 * slip_speed, 0 * slip_speed
+
+
+def test_a_law_of_ones_own_comes_back_where_it_is_defined():
+    """Its class is looked up by name; where it is not defined, a sentence says so instead of another law being taken."""
+    scene = fj.Scene(fj.belt_oscillator(), Steady(np.float64(0.25)), 3.0)
+    dataset = empty(scene)
+    assert isinstance(fj.Scene.from_dataset(dataset).friction, Steady)
+    dataset.attrs["scene"] = dataset.attrs["scene"].replace('"Steady"', '"Elsewhere"')
+    with refused(ValueError, "friction law", "`Elsewhere`", "Import or define"):
+        fj.Scene.from_dataset(dataset)
+
+
+def test_what_cannot_be_saved_or_opened_is_refused(tmp_path):
+    (tmp_path / "text.nc").write_text("not a dataset")
+    with refused(ValueError, "text.nc", "NetCDF"):
+        fj.open(tmp_path / "text.nc")
+    with refused(ValueError, "none.nc", "does not exist"):
+        fj.open(tmp_path / "none.nc")
+    with refused(TypeError, "`result`", "3 (int)"):
+        fj.save(3, tmp_path / "three.nc")
+    with refused(ValueError, "`dataset`", "scene"):
+        fj.Scene.from_dataset(xr.Dataset())
+    assert [path.name for path in tmp_path.iterdir()] == ["text.nc"]
+
+
+def test_nothing_on_disk_is_ever_half_written(run, tmp_path, monkeypatch):
+    """A write that breaks off, at whatever call, leaves the earlier file whole and nothing beside it."""
+    path = fj.save(run, tmp_path / "run.nc")
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    for name in ("fsync", "fchmod", "replace"):
+        with monkeypatch.context() as broken:
+            broken.setattr(files.os, name, full)
+            with pytest.raises(OSError, match="No space left"):
+                fj.save(run, path)
+            with pytest.raises(OSError, match="No space left"):
+                fj.save_figure(fj.plot.response(run), path, format="png")
+        assert path.read_bytes() == before
+        assert [found.name for found in tmp_path.iterdir()] == ["run.nc"]
+
+
+def test_a_file_is_written_through_links_and_keeps_its_permissions(tmp_path):
+    """As by any other program: a link stays a link, and what only its owner could read stays that owner's."""
+    (tmp_path / "far").mkdir()
+    files.save_text("old", tmp_path / "far" / "secret.md")
+    (tmp_path / "far" / "secret.md").chmod(0o600)
+    (tmp_path / "link.md").symlink_to("far/secret.md")
+    (tmp_path / "new.md").symlink_to("far/new.md")
+    for name in ("link.md", "new.md"):
+        assert files.save_text("new", tmp_path / name) == tmp_path / name
+        assert (tmp_path / name).is_symlink() and (tmp_path / name).read_text() == "new"
+    assert (tmp_path / "far" / "secret.md").stat().st_mode & 0o777 == 0o600
+    ordinary = tmp_path / "ordinary"
+    ordinary.touch()
+    assert (tmp_path / "far" / "new.md").stat().st_mode == ordinary.stat().st_mode
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "far",
+        "link.md",
+        "new.md",
+        "new.md",
+        "ordinary",
+        "secret.md",
+    ]
+
+
+def test_what_is_no_file_is_never_replaced_by_one(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "null").symlink_to("/dev/null")
+    (tmp_path / "round").symlink_to("round")
+    (tmp_path / "nowhere").symlink_to("none/file.md")
+    with socket.socket(socket.AF_UNIX) as opened:
+        opened.bind(str(tmp_path / "socket"))
+    before = {path.name: path.lstat() for path in tmp_path.iterdir()}
+    for name, kind in {
+        "fifo": "a FIFO",
+        "socket": "a socket",
+        "null": "a device",
+        "round": "leads back to itself",
+    }.items():
+        with refused(ValueError, "Output path", name, kind, "give another"):
+            files.save_text("text", tmp_path / name)
+    with refused(ValueError, "Output folder", "none", "does not exist"):
+        files.save_text("text", tmp_path / "nowhere")
+    assert {path.name: path.lstat() for path in tmp_path.iterdir()} == before
+
+
+def test_what_killed_savers_leave_is_removed_and_what_is_being_written_is_not(tmp_path):
+    handle, living = whole_files._begun(tmp_path, 0o600)
+    with whole_files.own_folder(tmp_path) as folder:
+        (tmp_path / ".fivjax.file.part").write_text("left")
+        (tmp_path / ".fivjax.folder.part").mkdir()
+        (tmp_path / ".fivjax.folder.part" / "file").write_text("left")
+        (tmp_path / ".hidden").write_text("of somebody else")
+        files.save_text("text", tmp_path / "text.md")
+        assert set(tmp_path.iterdir()) == {living, folder, tmp_path / ".hidden", tmp_path / "text.md"}
+    os.close(handle)
+    files.save_text("text", tmp_path / "text.md")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "text.md"]
+
+
+def test_a_scene_prints_its_values(run):
+    """Types and shapes alone (`f64[]`) do not tell two scenes apart."""
+    text = str(run.scene)
+    for part in ("belt_oscillator(m1=0.53", "k2=101000", "Coulomb(mu=0.227)", "belt_speed=3", "p=1.2", '"coulomb"'):
+        assert part in text
+    assert "f64" not in text + str(fj.Structure(*MATRICES, [0, 0, -1]))
+    assert "[0, 2, 0]" in str(fj.Structure(*MATRICES, [0, 0, -1]))
+    # What is printed is the call that makes the scene.
+    rebuilt = eval(text.replace("Scene(", "fj.Scene(", 1), {"fj": fj, **{name: getattr(fj, name) for name in dir(fj)}})
+    assert same(rebuilt, run.scene)

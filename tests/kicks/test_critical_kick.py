@@ -1,0 +1,78 @@
+"""Critical kicks by Newton's method, and their derivatives, against scaling laws and an independent solver."""
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+from tests.helpers import reference
+
+SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
+
+
+@pytest.fixture(scope="module")
+def critical():
+    """Two belt speeds with saddles of two kinds: one that sticks, one that takes off."""
+    return fj.critical_perturbation(
+        SCENE,
+        belt_speed=[1.0, 5.0],
+        p_range=(1.10, 1.20),
+        p_step=0.01,
+        tolerance=1e-4,
+        derivatives=True,
+        progress=False,
+    )
+
+
+@pytest.mark.slow
+def test_both_ends_are_proved_next_to_a_kick_that_is_exact(critical):
+    assert list(critical.kind.values) == ["manifold", "manifold"] and not any(critical.why_none.values)
+    assert np.all(critical.p_crit_low < critical.p_crit) and np.all(critical.p_crit < critical.p_crit_high)
+    np.testing.assert_allclose(critical.p_crit_high - critical.p_crit_low, 2e-9 * critical.p_crit, rtol=1e-6)
+    assert np.all(critical.newton_trajectories <= 6)
+
+
+@pytest.mark.slow
+def test_derivatives_in_the_belt_speed_have_closed_forms(critical):
+    """Where the saddle only slides and sticks, kicks scale with the belt speed; where it never reaches that, nothing does."""
+    by_speed = critical.d_p_crit.sel(parameter="belt_speed").values
+    assert by_speed[0] == pytest.approx(float(critical.p_crit[0]) - 1.0, abs=1e-10)
+    assert by_speed[0] == pytest.approx(0.1072058084, abs=1e-8)
+    assert by_speed[1] == pytest.approx(0.0, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_derivatives_obey_the_scaling_of_time_and_force(critical):
+    for row, speed in enumerate((1.0, 5.0)):
+        slope = critical.d_p_crit.isel(belt_speed=row)
+        # Displacements are forces over stiffness: N, and everything with it, scales.
+        assert 100.0 * float(slope.sel(parameter="force")) == pytest.approx(
+            -speed * float(slope.sel(parameter="belt_speed")), abs=1e-8
+        )
+        parameters = dict(
+            m1=(0.53, 2), m2=(0.045, 2), c1=(1.0, 1), c2=(1.0, 1), duration=(0.1, 1), belt_speed=(speed, -1)
+        )
+        change = sum(x * share * float(slope.sel(parameter=name)) for name, (x, share) in parameters.items())
+        assert change == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
+def test_a_derivative_is_the_difference_of_an_independent_solver_s_kicks(critical):
+    """The mass on the belt, where lift-off and impact lie on the way to the saddle."""
+    by, kicks = 1e-6, []
+    for m2 in (0.045 - by, 0.045 + by):
+        guess = float(critical.p_crit[1]) + float(critical.d_p_crit.sel(parameter="m2")[1]) * (m2 - 0.045)
+        low, high = guess - 1e-7, guess + 1e-7
+        while high - low > 1e-12:
+            tried = np.linspace(low, high, 10)[1:-1]
+            fates = reference.fate([reference.paper_scene(m2=m2, belt_speed=5.0, p=p) for p in tried]).fate
+            first = int(np.argmax(fates != "slides")) if np.any(fates != "slides") else len(tried)
+            low, high = (low if first == 0 else tried[first - 1]), (high if first == len(tried) else tried[first])
+        kicks.append(0.5 * (low + high))
+    found = float(critical.d_p_crit.sel(parameter="m2")[1])
+    assert (kicks[1] - kicks[0]) / (2 * by) == pytest.approx(found, rel=1e-5)
+
+
+def test_derivatives_are_refused_with_steps_that_are_not_exact():
+    with pytest.raises(ValueError, match="needs the method EventExact"):
+        fj.critical_perturbation(SCENE, derivatives=True, method=fj.WhereSwitched(dt=1e-5))

@@ -1,0 +1,65 @@
+"""A critical kick that just touches sticking, where static friction exceeds kinetic friction."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+import fivjax as fj
+from fivjax.kicks.critical_derivatives import differentiable
+from fivjax.kicks.touching import grazing_kick
+from tests.helpers import reference
+
+SCENE = fj.Scene(
+    fj.belt_oscillator(), fj.Coulomb(0.227, mu_static=0.5), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2)
+)
+# Where the touch lies by `touching`, after which nothing is left to find but the last digits.
+P_CRIT = 1.0962363003
+
+
+def touching(**changes) -> float:
+    """The kick whose linear sliding motion only just reaches the belt's speed, by matrix exponentials."""
+    scene = SCENE.replace(**changes)
+    linear = reference.linear(reference.of_scene(scene))
+    k = len(linear.matrix) // 2
+    free = [i for i in range(2 * k + 2) if i not in (scene.structure.normal, scene.structure.normal + k + 1)]
+    # Linear in p - 1: the state at the end of a kick of one more load, by the shift of the equilibrium.
+    shift = np.concatenate([linear.q_eq, np.zeros(k + 1)])[free]
+    duration = float(scene.load.duration)
+    begin = shift - expm(duration * linear.matrix) @ shift
+    values, vectors = np.linalg.eig(linear.matrix)
+    shares = vectors[k + 0] * np.linalg.solve(vectors, begin.astype(complex))
+    speed = lambda t: float(np.real(np.sum(shares * np.exp(values * t))))  # noqa: E731
+    times = np.linspace(0.0, 4.0, 400_001)
+    most = times[np.argmax(np.real(np.exp(np.outer(times, values)) @ shares))]
+    slope = lambda t: float(np.real(np.sum(values * shares * np.exp(values * t))))  # noqa: E731
+    at = brentq(slope, most - 1e-4, most + 1e-4, xtol=1e-14)
+    return 1 + float(scene.belt_speed) / speed(at)
+
+
+@pytest.mark.slow
+def test_the_kick_that_touches_is_that_of_linear_sliding():
+    """Newton's method on the touching condition, and its derivatives, against matrix exponentials and their differences."""
+    names = differentiable(SCENE)
+    # The next swing is as large within 6e-7: the first event of the upper kick is not at the swing that touches first.
+    found = grazing_kick(SCENE, (P_CRIT - 2e-6, P_CRIT + 3e-6), names)
+    assert found is not None and found.events == 0 and found.trajectories <= 6
+    assert found.p == pytest.approx(touching(), abs=1e-11)
+    for name in ("k1", "m2", "c2", "mu", "duration", "theta"):
+        value = float(SCENE.parameters[name])
+        # So little that the same swing is the largest.
+        by = 1e-7 * value
+        difference = (touching(**{name: value + by}) - touching(**{name: value - by})) / (2 * by)
+        assert found.d_p[name] == pytest.approx(difference, rel=1e-5)
+    assert found.d_p["belt_speed"] == pytest.approx(found.p - 1.0, abs=1e-11)
+    assert found.d_p["mu_static"] == found.d_p["restitution"] == 0.0
+    # Kicks on one side of it only do not part.
+    assert grazing_kick(SCENE, (P_CRIT - 3e-6, P_CRIT - 2e-6), names) is None
+
+
+@pytest.mark.slow
+def test_the_kind_is_named_and_both_sides_are_proved():
+    found = fj.critical_perturbation(SCENE, p_range=(1.0, 1.3), derivatives=True, progress=False).isel(belt_speed=0)
+    assert str(found.kind.values) == "grazing" and not str(found.why_none.values)
+    assert float(found.p_crit) == pytest.approx(P_CRIT, abs=1e-9)
+    assert float(found.p_crit_high - found.p_crit_low) == pytest.approx(2e-9 * P_CRIT, rel=1e-6)

@@ -1,0 +1,84 @@
+"""Basins of attraction: initial states, their verdicts and shares, against solvers that share no code."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.stats import binomtest
+
+import fivjax as fj
+from fivjax.maps.datasets import wilson
+from tests.helpers import oracle
+
+
+def paper(v=3.0, mu=0.2):
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), v, fj.Pulse(100.0, 1.2))
+
+
+@pytest.fixture(scope="module")
+def found():
+    scene = paper()
+    q = fj.sliding_equilibrium(scene)
+    return fj.basins(scene, x2=q[0] + np.linspace(-2e-3, 2e-3, 6), dx2=np.linspace(-2.5, 2.5, 6), progress=False)
+
+
+def test_initial_states_lead_where_an_independent_solver_says(found):
+    """Displaced and thrown, also faster than the belt; the other coordinates rest at the equilibrium."""
+    assert {0, 1} <= set(np.unique(found["verdict"]))
+    q = fj.sliding_equilibrium(paper())
+    model = oracle.paper_model(mu=0.2, belt_speed=3.0, p=1.0)
+    for i, j in ((0, 0), (1, 4), (2, 2), (3, 3), (4, 1), (5, 5)):
+        y0 = ([float(found["x2"][i]), q[1], 0.0], [float(found["dx2"][j]), 0.0, 0.0])
+        theirs = oracle.verdict(model, 20.0, y0=y0)
+        ours = int(found["verdict"][i, j])
+        assert (ours, theirs.kind) in ((0, "sliding"), (1, "limit cycle"))
+
+
+def test_shares_are_counted_with_their_interval(found):
+    sliding = int((found["verdict"] == 0).sum())
+    assert float(found["sliding_share"]) == sliding / 36
+    assert float(found["sliding_share"]) + float(found["share"].sum()) == pytest.approx(1.0)
+    for hits, total in ((sliding, 36), (0, 10), (10, 10), (3, 1000)):
+        theirs = binomtest(hits, total).proportion_ci(method="wilson")
+        np.testing.assert_allclose(wilson(hits, total)[1:], [theirs.low, theirs.high], atol=1e-12)
+
+
+def test_basins_are_drawn(found):
+    figure = fj.plot.basins(found)
+    assert "slides" in figure.axes[0].get_legend().get_texts()[0].get_text()
+
+
+def test_starts_that_make_no_sense_are_refused_before_anything_compiles():
+    scene = paper()
+    with pytest.raises(ValueError, match="Unknown axis `x3`; the states are x2, y1, y2, dx2, dy1, dy2"):
+        fj.basins(scene, x3=[0.0, 1.0])
+    with pytest.raises(ValueError, match="at least one displacement or velocity"):
+        fj.basins(scene, mu=[0.1, 0.2])
+    with pytest.raises(ValueError, match="Axis `y2` must not go below the belt, but holds -1 m"):
+        fj.basins(scene, y2=[-1.0, 0.0])
+    with pytest.raises(ValueError, match="`dy2` must not hold velocities into the belt"):
+        fj.basins(scene, dy2=[-1.0, 0.0])
+    with pytest.raises(ValueError, match="strictly increasing"):
+        fj.basins(scene, dx2=[1.0, 0.0])
+
+
+@pytest.mark.slow
+def test_the_basin_of_benchmark_a_ends_where_a_trajectory_first_sticks():
+    """Falling friction at 1.5 m/s: what meets the belt's speed where it can stick squeals, what never does comes to rest."""
+    speed = 1.5
+    structure = fj.Structure(
+        np.eye(2), np.diag([0.1, 0.1]), np.diag([1.0, 1.0]), [0.0, -1.0], tangential=0, normal=1, coordinates=("x", "y")
+    )
+    scene = fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), speed, fj.ConstantLoad(1.0))
+    b = fj.basins(scene, x=np.linspace(-0.9, 1.9, 9), dx=np.linspace(-1.4, 1.4, 9), t_max=500.0, progress=False)
+
+    def rate(_, z):
+        return [z[1], 0.5 + 0.5 * np.exp(-(speed - z[1]) / 0.5) - 0.1 * z[1] - z[0]]
+
+    def meets(_, z):
+        return speed - z[1]
+
+    meets.terminal = True
+    for i, x in enumerate(b["x"].values):
+        for j, dx in enumerate(b["dx"].values):
+            run = solve_ivp(rate, (0.0, 400.0), [x, dx], events=meets, rtol=1e-9, atol=1e-11)
+            assert int(b["verdict"][i, j]) == (1 if run.t_events[0].size else 0), (x, dx)

@@ -1,0 +1,348 @@
+"""Kernels: the same motion as by the oracle and by the series stepper, and the same maps as without kernels."""
+
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.contact import Mechanics, Status, status_from_forces
+from fivjax.foundation import warp_library
+from fivjax.foundation.compiling import compiled
+from fivjax.foundation.scalar_code import scalar_source
+from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, load, warp
+from fivjax.maps import groups as sharing
+from fivjax.maps.kernel_programs import programs
+from fivjax.maps.one_trajectory import next_step_end
+from fivjax.steppers import kernel_scope
+from fivjax.steppers.kernel_advance import stepping
+from fivjax.steppers.kernel_laws import Form
+from fivjax.steppers.kernel_matrices import matrices
+from fivjax.steppers.propagation import propagators
+from tests.helpers import oracle
+from tests.helpers.transients import CASES, scene_of
+
+# The most advances of a trajectory here.
+MOST = 5000
+
+
+@compiled
+def prepared(scene, y):
+    mechanics = Mechanics(scene)
+    return mechanics, propagators(mechanics), status_from_forces(mechanics, scene.load(0.0), y)
+
+
+@compiled
+def begun(method, scene, y):
+    mechanics = Mechanics(scene)
+    return method.prepare(mechanics), status_from_forces(mechanics, scene.load(0.0), y)
+
+
+def at_rest(scene) -> np.ndarray:
+    q = fj.sliding_equilibrium(scene)
+    return np.concatenate([q, np.zeros_like(q)])
+
+
+@compiled
+def advanced(method, prepared, scene, contact, y, t, t1):
+    end = jnp.minimum(next_step_end(scene.load, t, method.dt), t1)
+    after = method.advance(prepared, contact, scene.load(0.5 * (t + end)), y, end - t, True)
+    return after, jnp.where(after.h >= end - t, end, t + after.h)
+
+
+def marched(method, scene: fj.Scene, t1: float, y0=None):
+    """The state at `t1`, and (time, new status) of every status change on the way."""
+    with jax.enable_x64(True):
+        y = jnp.asarray(at_rest(scene) if y0 is None else y0, float)
+        (prepared, contact), t, seen = begun(method, scene, y), jnp.zeros(()), []
+        for _ in range(5000):
+            after, t = advanced(method, prepared, scene, contact, y, t, jnp.asarray(t1))
+            if int(after.contact.status) != int(contact.status):
+                seen.append((float(t), int(after.contact.status)))
+            y, contact = after.y, after.contact
+            if float(t) >= t1:
+                return np.asarray(y), seen
+        raise AssertionError("it did not arrive")
+
+
+MARCHES = {}
+
+
+def march_of(form: Form):
+    """A kernel that advances one trajectory and notes every advance."""
+    if form not in MARCHES:
+        wp, of = warp(), stepping(form)
+        real, t, advance = wp.float64, of.types, of.advance
+
+        @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
+        def march(
+            m: t.matrices,
+            mechanics: wp.array(dtype=t.mechanics),
+            interval: real,
+            states: wp.array(dtype=t.state),
+            modes: wp.array(dtype=t.mode),
+            jumps: wp.array(dtype=real),
+            loads: wp.array(dtype=real),
+            end: real,
+            times: wp.array(dtype=real),
+        ):
+            time = real(0.0)
+            past = int(0)
+            for k in range(MOST):
+                while past < jumps.shape[0] and jumps[past] <= time:
+                    past += 1
+                until = end
+                if past < jumps.shape[0]:
+                    until = wp.min(end, jumps[past])
+                if time < end:
+                    after = advance(m, mechanics[0], interval, 0, states[k], modes[k], loads[past], until - time)
+                    if after.h >= until - time:
+                        time = until
+                    else:
+                        time += after.h
+                    states[k + 1] = after.y
+                    modes[k + 1] = after.mode
+                    times[k + 1] = time
+
+        MARCHES[form] = march
+    return MARCHES[form], stepping(form).types
+
+
+def by_kernel(scene: fj.Scene, t1: float, y0=None, mode=None):
+    """The state at `t1`, (time, new status) of every status change on the way, and the duration of the first advance."""
+    wp = warp()
+    y = at_rest(scene) if y0 is None else np.asarray(y0, float)
+    with jax.enable_x64(True):
+        mechanics, windows, contact = jax.tree.map(np.asarray, prepared(scene, jnp.asarray(y)))
+        jumps = np.asarray(scene.load.jumps)
+        middles = [jumps[0] - 1, *(0.5 * (jumps[1:] + jumps[:-1])), jumps[-1] + 1]
+        loads = np.array([float(scene.load(jnp.asarray(t))) for t in middles])
+    march, t = march_of(Form.of(mechanics))
+    table = matrices(
+        jax.tree.map(lambda leaf: leaf[None], windows), len(y) // 2, mechanics.tangential, mechanics.normal
+    )
+    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(mechanics)])[None]
+    states, modes, times = np.zeros((MOST + 1, len(y))), np.zeros((MOST + 1, 2)), np.full(MOST + 1, np.nan)
+    states[0], modes[0], times[0] = y, (contact.status, contact.direction) if mode is None else mode, 0.0
+
+    def array(data, kind):
+        return wp.array(data, dtype=kind, device="cpu", copy=False)
+
+    given = [
+        array(table.ravel(), wp.float64),
+        array(numbers, t.mechanics),
+        wp.float64(float(windows.interval)),
+        *(array(states, t.state), array(modes, t.mode), array(jumps, wp.float64), array(loads, wp.float64)),
+        *(wp.float64(t1), array(times, wp.float64)),
+    ]
+    load(march.module, ["cpu"])
+    wp.launch(march, dim=1, inputs=given, device="cpu")
+    count = int(np.sum(np.isfinite(times)))
+    assert times[count - 1] == t1, "it did not arrive"
+    changed = 1 + np.flatnonzero(modes[1:count, 0] != modes[: count - 1, 0])
+    return states[count - 1], [(times[k], int(modes[k, 0])) for k in changed], times[1]
+
+
+def random_motion(seed: int) -> tuple[fj.Scene, np.ndarray]:
+    """Any symmetric structure of two to five coordinates, pressed on firmly enough to touch, on a belt that runs either way; and a
+    state in the air.
+    """
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 4
+
+    def definite(scale):
+        root = rng.normal(size=(n, n))
+        return scale * (root @ root.T / n + np.eye(n))
+
+    mass = np.diag(rng.uniform(0.2, 2.0, n))
+    normal, tangential = rng.permutation(n)[:2]
+    direction = np.where(np.arange(n) == normal, -1.0, 0.3 * rng.normal(size=n))
+    mu = rng.uniform(0.05, 0.6)
+    scene = fj.Scene(
+        fj.Structure(mass, definite(0.3), definite(1e3), direction, tangential=int(tangential), normal=int(normal)),
+        fj.Coulomb(mu, mu * rng.uniform(1.0, 1.5)),
+        belt_speed=rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 1.0),
+        load=fj.Pulse(50.0, rng.uniform(0.0, 4.0), duration=0.3),
+        restitution=rng.choice([0.0, 0.4]),
+    )
+    y0 = np.zeros(2 * n)
+    y0[normal] = 0.05
+    y0[n:] = 3 * rng.normal(size=n)
+    return scene, y0
+
+
+def light_mass() -> fj.Scene:
+    """A mass that a load holds 1 m above the belt: in the air it swings about there with one radian per second."""
+    # Contact, friction and load of the kind that a random structure of two coordinates has been compiled with.
+    structure = fj.Structure(np.eye(2), np.zeros((2, 2)), np.eye(2), [0.0, 1.0], tangential=0, normal=1)
+    return fj.Scene(structure, fj.Coulomb(0.1, 0.1), 1.0, fj.Pulse(1.0, 1.0, duration=1e3), restitution=0.0)
+
+
+def lowest_later(amplitude: float, t: float) -> np.ndarray:
+    """The state from which that mass is lowest at `t`, by its amplitude (m) below the rest position."""
+    return np.array([0.0, 1 - amplitude * np.cos(t), 0.0, -amplitude * np.sin(t)])
+
+
+def touches_at(amplitude: float, t: float):
+    """When it touches the belt on the way there: two roots a distance of 2 acos(1/amplitude) apart are as well conditioned as the
+    root of their depth.
+    """
+    return pytest.approx(t - np.arccos(1 / amplitude), abs=1e-15 / (amplitude - 1) ** 0.5 + 1e-14)
+
+
+# Each number of coordinates, and each choice of two for the contact, is compiled anew: these are of one kind.
+SEEDS = (0, 12, 28)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name != "falling friction"])
+def test_states_and_events_agree_with_the_oracle(name):
+    """SciPy's `solve_ivp` with events and restarts, written apart from the package."""
+    parameters, t1 = CASES[name]
+    reference = oracle.simulate(oracle.paper_model(**parameters), t1, np.array([0.0, t1]), rtol=1e-12)
+    y, seen, _ = by_kernel(scene_of(parameters), t1)
+    np.testing.assert_allclose(y[:3], reference.q[-1], atol=1e-9 * np.abs(reference.q).max())
+    np.testing.assert_allclose(y[3:], reference.v[-1], atol=1e-9 * np.abs(reference.v).max())
+    assert len(seen) >= 2
+
+
+@pytest.mark.parametrize("seed", [*SEEDS, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
+def test_any_structure_moves_as_by_the_series_stepper(seed):
+    """Two to five coordinates, static friction above dynamic, rebounds, belts both ways: event by event."""
+    scene, y0 = random_motion(seed)
+    fast, fast_events, _ = by_kernel(scene, 2.0, y0)
+    exact, exact_events = marched(fj.EventExact(), scene, 2.0, y0)
+    assert [status for _, status in fast_events] == [status for _, status in exact_events]
+    assert exact_events
+    np.testing.assert_allclose([t for t, _ in fast_events], [t for t, _ in exact_events], atol=1e-9)
+    np.testing.assert_allclose(fast, exact, atol=1e-9 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-9])
+def test_a_touch_between_two_samples_is_found_and_a_miss_is_none(depth):
+    """A detached mass whose lowest point lies between two samples, a little below the belt or a little above it."""
+    scene = light_mass()
+    with jax.enable_x64(True):
+        interval = float(prepared(scene, jnp.zeros(4))[1].interval)
+    lowest_at = 4.37 * interval
+    for touches, amplitude in ((True, 1 + depth), (False, 1 - depth)):
+        flying = (float(Status.DETACH), 1.0)
+        _, _, first = by_kernel(scene, lowest_at + 2 * interval, lowest_later(amplitude, lowest_at), flying)
+        if touches:
+            assert first == touches_at(amplitude, lowest_at)
+        else:
+            assert first > lowest_at
+
+
+def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch):
+    """Verdicts, attractors and amplitudes: sliding, cycles and tori, coexisting ones too."""
+    axes = dict(mu=[0.15, 0.2, 0.227], p=np.linspace(0.0, 3.0, 9))
+    scene = paper_scene.replace(belt_speed=3.0)
+    found = fj.bistability_map(scene, **axes, progress=False)
+    for module in (sharing, kernel_scope):
+        monkeypatch.setattr(module, "is_installed", lambda: False)
+    kernel_scope._tell_once.cache_clear()
+    with pytest.warns(UserWarning, match="pip install warp-lang"):
+        expected = fj.bistability_map(scene, **axes, progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it is said once
+        assert not kernel_scope.has_kernel(scene, fj.EventExact())
+    np.testing.assert_array_equal(found.verdict, expected.verdict)
+    cycles = found.verdict.values == fj.Verdict.LIMIT_CYCLE
+    assert np.any(cycles) and not np.all(cycles)
+    np.testing.assert_allclose(found.amplitude.values[cycles], expected.amplitude.values[cycles], rtol=2e-3)
+
+
+def test_a_map_over_masses_by_kernels_is_that_of_each_structure(paper_scene):
+    """A mass has to be positive, also in what is compiled before its values are looked at."""
+    p = [1.0, 2.0]
+    found = fj.bistability_map(paper_scene, m1=[0.45, 0.55], p=p, progress=False)
+    for m1, row in zip(found["m1"].values, found.verdict.transpose("m1", "p"), strict=True):
+        alone = fj.bistability_map(paper_scene.replace(m1=float(m1)), p=p, progress=False)
+        np.testing.assert_array_equal(row, alone.verdict)
+    assert len(np.unique(found.verdict)) == 2
+
+
+def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "warp", None)
+    warp_library._initialised.cache_clear()
+    with pytest.raises(ImportError, match="pip install warp-lang"):
+        warp()
+    monkeypatch.undo()
+    assert warp() is not None
+
+
+def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
+    monkeypatch.setattr(warp(), "get_cuda_devices", lambda: [type("Device", (), {"alias": "cuda:0"})()])
+    assert gpus_for(LEAST_ON_GPUS) == ["cuda:0"] or jax.config.jax_platforms == "cpu"
+    assert gpus_for(LEAST_ON_GPUS - 1) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(type(jax.config), "jax_platforms", "cpu", raising=False)
+        assert gpus_for(LEAST_ON_GPUS) == []
+
+
+@pytest.mark.slow
+def test_kernels_compile_for_a_gpu(paper_scene, tmp_path):
+    """There is none here; the compiler for them is part of Warp."""
+    with jax.enable_x64(True):
+        mechanics, *_ = prepared(paper_scene, jnp.zeros(6))
+    of = programs(Form.of(mechanics))
+    before = dict(of.module.options)
+    try:
+        warp().compile_aot_module(of.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    finally:
+        of.module.options.update(before)
+    (code,) = tmp_path.glob("*.ptx")
+    assert {"followed", "returned"} <= set(re.findall(r"entry programs__locals__([a-z]+)_", code.read_text()))
+
+
+def everything(x, y):
+    """Most of what the laws of contact are made of."""
+    matrix = jnp.arange(6.0).reshape(2, 3) - x[0]
+    parts = [
+        matrix @ y,
+        jnp.where(x > 0, jnp.sqrt(jnp.abs(x)), jnp.exp(-x)),
+        jnp.sign(y) * jnp.maximum(y, x[1]),
+        jnp.minimum(jnp.sqrt(y), 1.0),
+        y.at[1:].add(x),
+        y.at[0].set(x[1])[::-1],
+        jnp.stack([jnp.sum(y), jnp.max(y), jnp.any(y > 1).astype(float), jnp.all(y < 9).astype(float)]),
+        jnp.clip(y, -1.0, 1.0) ** 3 / (1.0 + jnp.log1p(0.0) + x[0] ** 2),
+        (jnp.floor(y).astype(jnp.int32) * 2 != 4).astype(float),
+        jnp.where(jnp.array([True, False, True]), y, -y)[np.array([2, 0])],
+        jnp.stack([y, -y], axis=1).T.reshape(3, 2)[:, ::2].ravel(),
+        *jnp.split(jnp.outer(y[:2], jnp.ones(2)).ravel(), [1]),
+    ]
+    return jnp.concatenate(parts)
+
+
+def test_arithmetic_written_out_is_that_of_jax():
+    wp = warp()
+    source, size = scalar_source(everything, x=2, y=3)
+    two, three, found_type = (wp.types.vector(length, wp.float64) for length in (2, 3, size))
+
+    @wp.func_native(f"wp::vec_t<{size}, wp::float64> found;\n{source}\nreturn found;")
+    def written(x: two, y: three) -> found_type: ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate(x: wp.array(dtype=two), y: wp.array(dtype=three), found: wp.array(dtype=found_type)):
+        i = wp.tid()
+        found[i] = written(x[i], y[i])
+
+    random = np.random.default_rng(0)
+    x, y = 3 * random.normal(size=(50, 2)), 3 * random.normal(size=(50, 3))  # where negative, not a number
+    y[0], x[1] = 0.0, 0.0
+    found = wp.zeros(50, dtype=found_type, device="cpu")
+    load(evaluate.module, ["cpu"])
+    wp.launch(
+        evaluate,
+        dim=50,
+        inputs=[wp.array(x, dtype=two, device="cpu"), wp.array(y, dtype=three, device="cpu"), found],
+        device="cpu",
+    )
+    with jax.enable_x64(True):
+        expected = np.array([everything(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(x, y, strict=True)])
+    assert np.any(np.isnan(expected))
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-13, atol=1e-13)
