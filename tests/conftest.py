@@ -11,9 +11,10 @@ import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 
-# Files that take longest. They come first: one of them begun last would leave the other workers idle.
+# Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
+# compiles come a while after it, or two workers would compile that at the same time.
 LONGEST = (
-    "maps cea kernels gradients energy oracle several_contacts calibrate contact steppers tradeoff kernel_functions creeping "
+    "maps cea gradients energy oracle several_contacts calibrate contact steppers tradeoff kernels kernel_functions creeping "
     "returns_by_kernels several_sliding cycles calibration_goodness attractor properties branches simulate extending "
     "verdicts standstill proofs_side_by_side basins several_maps design smallest_kick reproduce sampling notebooks"
 )
