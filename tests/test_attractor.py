@@ -19,6 +19,7 @@ from fivjax.attractors.tori import (
     capturing_tori,
     goes_on,
     is_drifting,
+    smooth_mean,
 )
 from fivjax.attractors.tube import Tube
 from fivjax.maps.capture import Capture
@@ -408,3 +409,11 @@ def test_the_papers_torus_captures_and_a_row_alone_is_the_row_of_a_map(paper_sce
     )
     assert theirs.fate.tolist() == ["slides", "sustained"]
     assert whole["amplitude"].sel(mu=0.227, p=1.5).item() == pytest.approx(theirs.amplitude[1], rel=0.01)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.3])
+def test_the_smooth_mean_of_a_quasi_periodic_sequence_is_its_mean(start):
+    """Of a constant and a beat without a common period; an equal mean of as many would be wrong by a thousandth."""
+    turns = start + GOLDEN * np.arange(512)
+    values = np.stack([1 + np.cos(2 * np.pi * turns), np.sin(4 * np.pi * turns)], axis=-1)
+    assert np.abs(smooth_mean(values) - [1.0, 0.0]).max() < 1e-9
