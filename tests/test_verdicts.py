@@ -195,3 +195,15 @@ def test_proved_sticking_never_ends_and_is_proved_where_the_cone_opens():
             assert lasts or not holds
             held, ended = held + holds, ended + (not lasts)
         assert held >= 9 and ended >= 9
+
+
+def test_the_table_of_chords_has_the_largest_distance_of_a_parabola_from_its_chord():
+    """Between two instants a time h apart, that of s (h - s) / 2, whose second derivative is one; by its values at 1001 places."""
+    eigenvalues = np.array([[-1.0 + 400j, -2.0 + 400j]])
+    table = envelope(eigenvalues, np.ones((1, 1, 2)))
+    # The first mode grows like exp(t / 2) against the mean of both.
+    instants = 2 * np.log(np.abs(table.growth[0, 0, :, 0]))
+    steps = np.diff(instants)
+    inside = np.linspace(0.0, 1.0, 1001)[:, None] * steps
+    largest = np.max(inside * (steps - inside) / 2, axis=0)
+    np.testing.assert_allclose(table.chord[0, 0], largest, rtol=1e-9, atol=1e-15)
