@@ -9,7 +9,7 @@ import reference
 import fivjax as fj
 from fivjax.attractors import tube
 from fivjax.attractors.catalogue import Catalogue
-from fivjax.attractors.cycles import CROSSINGS, StableCycle
+from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.tori import (
     LONGER,
@@ -480,3 +480,16 @@ def test_a_cycle_of_many_crossings_that_attracts_weakly_counts_for_a_motion_that
     apart = np.linalg.norm(cycle.points[:, None, :2] - circle_13, axis=2)
     assert np.all(np.sort(np.argmin(apart, axis=1)) == np.arange(13)) and np.min(apart, axis=1).max() < 1e-9
     assert cycle.multiplier == pytest.approx((1 - 1e-3) ** 13, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_a_cycle_is_known_if_one_of_its_points_is_met_to_a_millionth_of_its_size(size):
+    """In weighted coordinates, whatever the units: sizes of 0.1 mm and of 10 km are told apart as well."""
+    maps = SimpleNamespace(weights=np.array([2.0, 1.0]))
+    points = size * np.array([[1.0, 0.5], [-0.3, 0.4]]) / maps.weights
+    one = StableCycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
+    length = size * np.hypot(0.3, 0.4)
+    for away, new in ((0.0, False), (0.9e-6, False), (1.1e-6, True)):
+        moved = points[1:] + np.array([[0.0, away * length]])
+        assert is_new(maps, one._replace(points=moved), [one]) is new  # type: ignore[arg-type]
+    assert is_new(maps, one, [])  # type: ignore[arg-type]
