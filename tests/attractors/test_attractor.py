@@ -1,27 +1,32 @@
 """Attractors of a map: what motions trace, what is computed and checked of it, and which trajectories it captures."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import fivjax as fj
 from fivjax.attractors import tube
 from fivjax.attractors.catalogue import Catalogue
-from fivjax.attractors.cycles import CROSSINGS, StableCycle
+from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.tori import (
     LONGER,
     TRACED,
     Torus,
+    Traced,
+    _cycles_repeated,
     _holds_one_of,
     _in_clusters,
     _on_one_torus,
     capturing_tori,
     goes_on,
     is_drifting,
+    smooth_mean,
 )
 from fivjax.attractors.tube import Tube
 from fivjax.maps.capture import Capture
-from fivjax.section.return_maps import Section
+from fivjax.section.return_maps import Images, Section
 from tests.helpers import reference
 
 STATES = 256
@@ -408,3 +413,83 @@ def test_the_papers_torus_captures_and_a_row_alone_is_the_row_of_a_map(paper_sce
     )
     assert theirs.fate.tolist() == ["slides", "sustained"]
     assert whole["amplitude"].sel(mu=0.227, p=1.5).item() == pytest.approx(theirs.amplitude[1], rel=0.01)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.3])
+def test_the_smooth_mean_of_a_quasi_periodic_sequence_is_its_mean(start):
+    """Of a constant and a beat without a common period; an equal mean of as many would be wrong by a thousandth."""
+    turns = start + GOLDEN * np.arange(512)
+    values = np.stack([1 + np.cos(2 * np.pi * turns), np.sin(4 * np.pi * turns)], axis=-1)
+    assert np.abs(smooth_mean(values) - [1.0, 0.0]).max() < 1e-9
+
+
+class Locked:
+    """A return map of a circle that is locked to 5 turns in 13 returns, where neighbours close in by a thousandth a return."""
+
+    weights, normal, sliding = np.ones(6), 2, np.ones(1)
+    structure = SimpleNamespace(contacts=[None])
+
+    def once(self, y):
+        phase, radius = np.arctan2(y[:, 1], y[:, 0] - 4), np.hypot(y[:, 0] - 4, y[:, 1])
+        phase, radius = phase + 10 * np.pi / 13 - 1e-3 * np.sin(13 * phase) / 13, 0.5 + 0.5 * (radius - 0.5)
+        after = np.zeros_like(y)
+        after[:, 0], after[:, 1] = 4 + radius * np.cos(phase), radius * np.sin(phase)
+        return after
+
+    def returns(self, group, at, crossings, kept=1):
+        crossings = np.broadcast_to(crossings, len(group))
+        path = [at.y]
+        for count in range(int(np.max(crossings))):
+            path.append(np.where((count < crossings)[:, None], self.once(path[-1]), path[-1]))
+        nothing = np.zeros(len(group))
+        return Images(
+            at._replace(y=path[-1]), nothing.astype(int), 1.0 * crossings, np.stack(path[-kept:], axis=1), nothing
+        )
+
+    def path(self, group, at, count):
+        images = self.returns(group, at, count, count)
+        return images.at, images.path
+
+    def derived(self, group, at, crossings):
+        images, slopes = self.returns(group, at, crossings), np.zeros((len(group), 6, 6))
+        for place in range(6):
+            away = 1e-6 * (np.arange(6) == place)
+            ahead, behind = (self.returns(group, at._replace(y=at.y + sign * away), crossings).at.y for sign in (1, -1))
+            slopes[:, :, place] = (ahead - behind) / 2e-6
+        return images.at, images.time, slopes
+
+    def moves(self, group, y):
+        return np.ones(len(group), bool)
+
+    def free_directions(self, status):
+        return np.eye(6)[:, [0, 1, 4]]
+
+    def peaks(self, group, at, crossings):
+        return np.ones(len(group))
+
+
+def test_a_cycle_of_many_crossings_that_attracts_weakly_counts_for_a_motion_that_repeats_it():
+    """Other motions are better said to be on a torus. The cycle is where 13 times the angle is no longer turned back or on."""
+    maps, at = Locked(), Section(np.zeros((1, 6)), np.ones(1, np.int32), np.ones(1))
+    at.y[0, :2] = 4 + 0.5 * np.cos(0.003), 0.5 * np.sin(0.003)
+    _, states = maps.path(np.zeros(1, int), at, TRACED)
+    found = _cycles_repeated(maps, np.zeros(1, int), {0: Traced(states[0], 1.0, 1.0)}, [[]])  # type: ignore[arg-type]
+    assert [row for row, _ in found] == [0]
+    (_, cycle), angle = found[0], 2 * np.pi * np.arange(13) / 13
+    circle_13 = np.stack([4 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)], axis=-1)
+    apart = np.linalg.norm(cycle.points[:, None, :2] - circle_13, axis=2)
+    assert np.all(np.sort(np.argmin(apart, axis=1)) == np.arange(13)) and np.min(apart, axis=1).max() < 1e-9
+    assert cycle.multiplier == pytest.approx((1 - 1e-3) ** 13, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_a_cycle_is_known_if_one_of_its_points_is_met_to_a_millionth_of_its_size(size):
+    """In weighted coordinates, whatever the units: sizes of 0.1 mm and of 10 km are told apart as well."""
+    maps = SimpleNamespace(weights=np.array([2.0, 1.0]))
+    points = size * np.array([[1.0, 0.5], [-0.3, 0.4]]) / maps.weights
+    one = StableCycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
+    length = size * np.hypot(0.3, 0.4)
+    for away, new in ((0.0, False), (0.9e-6, False), (1.1e-6, True)):
+        moved = points[1:] + np.array([[0.0, away * length]])
+        assert is_new(maps, one._replace(points=moved), [one]) is new  # type: ignore[arg-type]
+    assert is_new(maps, one, [])  # type: ignore[arg-type]

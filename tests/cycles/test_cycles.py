@@ -1,14 +1,18 @@
 """Limit cycles against closed forms, against ODE solvers of another kind (`reference/cycles.json`), and against trajectories."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
+from fivjax.attractors.closing import close
 from fivjax.contact import Contact
 from fivjax.cycles import search
 from fivjax.cycles.around import Round, word
 from fivjax.cycles.torus import off_the_curve
+from fivjax.section.return_maps import Section
 from tests.helpers import reference
 from tests.helpers.reference.cycles import stored
 
@@ -325,3 +329,29 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
     later = reference.trajectory(start, 1.01 * cycle.period, times=[cycle.period])
     back = np.concatenate([later.q[0] - later.q_eq, later.v[0]])
     np.testing.assert_allclose(back, y, atol=1e-9 * np.max(np.abs(y)))
+
+
+@pytest.mark.parametrize("patient", [False, True])
+def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
+    """Newton's method for arctan(5 (x - 2)) = 0 overshoots from 2.5, to where nothing returns: half the step does better."""
+    asked = []
+
+    def derived(group, at, crossings):
+        x = at.y[:, 0]
+        asked.append(x.tolist())
+        returns = np.abs(x - 2) < 0.9
+        y, slope = at.y.copy(), 1 - 5 / (1 + 25 * (x - 2) ** 2)
+        y[:, 0] = np.where(returns, x - np.arctan(5 * (x - 2)), np.nan)
+        jacobian = np.zeros((len(x), 2, 2))
+        jacobian[:, 0, 0] = slope
+        return at._replace(y=y), np.ones(len(x)), jacobian
+
+    maps = SimpleNamespace(weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived)
+    starts = np.array([[2.5, 0.0], [0.5, 0.0]])
+    guess = Section(starts, np.ones(2, np.int32), np.ones(2))
+    closed = close(maps, np.zeros(2, int), guess, 1, patient)  # type: ignore[arg-type]
+    assert closed.found.tolist() == [True, False]
+    assert closed.at.y[0, 0] == pytest.approx(2.0, abs=1e-10)
+    # One step too far, and none from where nothing returns.
+    assert abs(asked[1][0] - 2) > 0.9 and asked[2][0] == pytest.approx(0.5 * (2.5 + asked[1][0]))
+    assert [len(x) for x in asked[:2]] == [2, 1]

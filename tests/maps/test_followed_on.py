@@ -10,10 +10,14 @@ from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
 import fivjax as fj
+from fivjax.attractors import long_run
 from fivjax.attractors.catalogue import Attractors, Catalogue
-from fivjax.attractors.long_run import fates
+from fivjax.attractors.long_run import Fates, fates
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.neighbourhood import LARGEST
+from fivjax.attractors.search import _continue_from_seeds
+from fivjax.attractors.tori import Torus
+from fivjax.attractors.tube import Tube
 from fivjax.maps import jobs
 from fivjax.maps.capture import later
 from fivjax.maps.one_trajectory import Progress
@@ -176,3 +180,35 @@ def test_a_cycle_that_slides_all_the_time_captures_whoever_comes_to_it():
         if end == decided + 10.0:
             assert peak == pytest.approx(m["amplitude"].values[0], rel=LARGEST)
     np.testing.assert_allclose(m["amplitude"], peak, rtol=1e-3)
+
+
+def test_where_the_first_come_to_nothing_the_others_are_not_followed_onward(monkeypatch):
+    """Of two groups: in one the first motions are chaotic, so it is worthwhile; in the other they are still undecided."""
+    asked = []
+
+    def long_fates(catalogue, motions, onward, slides):
+        asked.append((motions.group.tolist(), onward.tolist()))
+        nothing = np.zeros(len(motions.group), int)
+        return Fates(motions.group == 0, {}, nothing > 0, motions.at, 0.0 * nothing, nothing)
+
+    monkeypatch.setattr(long_run, "_long_fates", long_fates)
+    y = np.stack([np.tile([1.1, 1.3, 1.5, 1.7], 2), *np.zeros((3, 8))], axis=1)
+    catalogue = Catalogue(Line(), {g: Attractors([], []) for g in range(2)}, lambda _: None)  # type: ignore[arg-type]
+    at = Section(y, np.ones(8, np.int32), np.ones(8))
+    found = fates(catalogue, Motions(np.repeat([0, 1], 4), at))
+    assert asked == [([0, 0, 1, 1], [True] * 4), ([0, 0, 1, 1], [True] * 2 + [False] * 2)]
+    assert found.chaotic.tolist() == [True] * 4 + [False] * 4
+
+
+def test_what_comes_from_a_torus_nearby_to_a_known_cycle_is_not_asked_for_a_torus(monkeypatch):
+    """A group whose neighbour has the cycle and a torus: the motion from the torus ends on the cycle."""
+    known = {g: Attractors([], []) for g in range(2)}
+    catalogue = Catalogue(Line(), known, lambda _: None)  # type: ignore[arg-type]
+    near = Section(np.array([[3.9999, 0.0, 0.0, 0.0]]), np.ones(1, np.int32), np.ones(1))
+    assert set(fates(catalogue, Motions(np.zeros(1, int), near)).attractor) == {0}
+    known[0].tori.append(Torus(Tube(np.array([[3.5, 0.0, 0.0, 0.0], [3.999, 0.0, 0.0, 0.0]]), 0.04), 1.0, 1.0))
+    asked = []
+    monkeypatch.setattr(Catalogue, "add_tori", lambda self, motions, tubes=(): asked.append(motions))
+    _continue_from_seeds(catalogue, {1: 0})
+    assert [cycle.points[0, 0] for cycle in known[1].cycles] == pytest.approx([4.0])
+    assert not asked

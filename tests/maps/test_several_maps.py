@@ -209,3 +209,13 @@ def test_the_saddle_cycle_of_one_of_two_contacts_is_its_own():
     assert found.unstable_directions == own.unstable_directions == 1
     assert found.period == pytest.approx(own.period, rel=1e-10)
     assert found.amplitude == pytest.approx(own.amplitude, rel=1e-10)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_nothing_is_proved_of_a_contact_slower_than_what_the_bounds_on_friction_are_made_for(place):
+    """They hold above half of the belt's speed, be the friction as good as constant and the other contact at rest."""
+    scene = together(fj.ExponentialDecay(0.1, 0.1 - 1e-6, 0.5))
+    shares = np.array([0.0, 0.02, 0.1, 0.51, 0.6, 0.9])
+    y = np.zeros((len(shares), 12))
+    y[:, 6 + scene.structure.contacts[place].tangential] = -3.0 * shares
+    assert proofs(scene, y).tolist() == [True] * 3 + [False] * 3

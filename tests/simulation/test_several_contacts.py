@@ -12,6 +12,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.notebook.panels import drawing_panels
+from fivjax.steppers.section import section_weights
 from tests.helpers import several_contacts_reference as reference
 from tests.helpers.several_contacts import EACH, copies, scene_of
 
@@ -410,3 +411,11 @@ def test_one_contact_along_vectors_in_derivatives_maps_and_cycles():
     np.testing.assert_allclose(np.kron(np.eye(2), TURN) @ mine.state, right.state, atol=1e-12)
     end = mine.trajectory(4)
     np.testing.assert_allclose(np.concatenate([end.displacement[-1], end.velocity[-1]]), mine.state, atol=1e-10)
+
+
+@pytest.mark.parametrize("count", range(2, 13))
+def test_weights_of_the_section_lie_far_apart_however_many_there_are(count):
+    """Of so many in [1, 2), all would be 1/count apart at best, and are more than half of that: no two contacts cancel."""
+    weights = np.sort(section_weights(count))
+    assert weights[0] == 1.0 and weights[-1] < 2.0
+    assert np.min(np.diff(np.append(weights, 2.0))) > 0.5 / count

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
@@ -21,7 +22,7 @@ from fivjax.steppers import kernel_scope
 from fivjax.steppers.kernel_advance import stepping
 from fivjax.steppers.kernel_laws import Form
 from fivjax.steppers.kernel_matrices import matrices
-from fivjax.steppers.propagation import propagators
+from fivjax.steppers.propagation import INTERVALS, ORDER, propagators
 from tests.helpers import oracle
 from tests.helpers.transients import CASES, scene_of
 
@@ -347,3 +348,27 @@ def test_arithmetic_written_out_is_that_of_jax():
         expected = np.array([everything(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(x, y, strict=True)])
     assert np.any(np.isnan(expected))
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-13, atol=1e-13)
+
+
+def test_control_points_between_samples_are_those_of_the_cubic_with_the_gap_and_its_rate_at_both():
+    """Of a detached mass, whose gap at the samples and between them is known by SciPy's matrix exponential."""
+    scene, n = light_mass(), 2
+    with jax.enable_x64(True):
+        found = jax.tree.map(np.asarray, prepared(scene, jnp.zeros(2 * n))[1])
+    inverse = np.linalg.inv(scene.structure.mass)
+    rates = np.zeros((2 * n + 2, 2 * n + 2))
+    rates[:n, n : 2 * n] = np.eye(n)
+    rates[n : 2 * n, :n] = -inverse @ np.asarray(scene.structure.stiffness)
+    rates[n : 2 * n, n : 2 * n] = -inverse @ np.asarray(scene.structure.damping)
+    rates[n : 2 * n, 2 * n] = inverse @ np.asarray(scene.structure.load_direction)
+    h, gap = float(found.interval), scene.structure.normal
+    # The columns of the detached mode come last: all of (state, load, 1).
+    rows = found.window[2 * ORDER : 2 * ORDER + 6 * INTERVALS, -(2 * n + 2) :].reshape(3, INTERVALS, 2, -1)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        start = np.concatenate([rng.normal(size=2 * n + 1), [1.0]])
+        states = np.array([expm(rates * h * i) @ start for i in range(INTERVALS + 1)])
+        values, slopes = states[:, gap], h * states[:, n + gap]
+        expected = values[1:], values[:-1] + slopes[:-1] / 3, values[1:] - slopes[1:] / 3
+        for guard in range(2):
+            np.testing.assert_allclose(rows[:, :, guard] @ start, expected, atol=1e-12 * np.abs(states).max())

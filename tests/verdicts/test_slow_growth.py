@@ -23,12 +23,12 @@ def _scene(above, p=1.001, belt_speed=3.0):
     return fj.Scene(STRUCTURE, fj.Coulomb(mu), belt_speed, fj.Pulse(100.0, p, 0.1))
 
 
-def _skipped(scene, contact_direction=1.0):
+def _skipped(scene, contact_direction=1.0, size=1e-5):
     with jax.enable_x64(True):
         linear = jax.tree.map(lambda leaf: np.asarray(leaf)[None], linear_sliding(scene))
         modes = jax.tree.map(lambda leaf: leaf[0], sliding_modes(linear))
         mechanics = mechanics_about_sliding(scene)
-        z = jnp.zeros(6).at[sliding_states(3, mechanics.normal)].set(1e-5 * np.array([1.0, -0.5, 3.0, 20.0]))
+        z = jnp.zeros(6).at[sliding_states(3, mechanics.normal)].set(size * np.array([1.0, -0.5, 3.0, 20.0]))
         contact = Contact(np.int32(1), np.float64(contact_direction))
         y, time = slid_on(mechanics, modes, contact, z, np.bool_(True))
         return linear, mechanics, np.asarray(z), np.asarray(y), float(time)
@@ -153,3 +153,16 @@ def test_attractors_that_take_thousands_of_periods_are_decided(name):
     assert there.any()
     np.testing.assert_allclose(m["amplitude"].values[there], fate.amplitude[there], rtol=5e-3)
     assert not m["chaotic"].values.any()
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-5, 1e-4, 1.25e-4, 1e-3])
+def test_as_long_is_skipped_as_the_sum_of_all_modes_stays_within_the_margins(size):
+    """With the growth of the fastest, and no longer, be it many times that in which it grows e-fold or half of that."""
+    linear, mechanics, z, _, time = _skipped(_scene(1e-5), size=size)
+    rates, vectors = np.linalg.eig(linear.matrix[0])
+    modal = np.linalg.solve(vectors, z[sliding_states(3, mechanics.normal)])
+    margins = linear.slip_margin[0], linear.pressing_margin[0]
+    sums = [np.sum(np.abs(row[0] @ vectors * modal)) for row in (linear.slip, linear.pressing)]
+    # How often the margins hold the sums, and for how long they still do.
+    room = min(margin / most for margin, most in zip(margins, sums, strict=True))
+    assert time == pytest.approx(0.999 * max(np.log(room), 0.0) / rates.real.max(), rel=1e-6)

@@ -1,15 +1,19 @@
 """The two proofs: neither may hold where it should not, and both must hold soon where they can."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status
 from fivjax.linear.linearisation import linear_sliding
 from fivjax.verdicts.sliding_proof import envelope, envelope_peak, slides_forever, sliding_modes
+from fivjax.verdicts.sticking_proof import sticking_drift, sticks_forever
 from tests.helpers import oracle
 from tests.helpers.catalogue import steady
 
@@ -146,3 +150,66 @@ def test_what_comes_back_under_a_long_kick_is_no_limit_cycle():
     m = one_kick(scene, 0.02)
     assert int(m["verdict"]) == fj.Verdict.SLIDING
     assert float(m["last_event"]) == pytest.approx(5.28, abs=0.01)
+
+
+def test_proved_sticking_never_ends_and_is_proved_where_the_cone_opens():
+    """A structure that jams, while it sticks by the matrix exponential of its one free coordinate r.
+
+    The belt carries it along, and without a deviation r follows. It is then proved to stick for ever where both distances to
+    the edges of the cone are positive, and nowhere else; with a deviation never where it would slip later on.
+    """
+    scene = fj.Scene(fj.belt_oscillator(theta=-0.8, m2=0.5), fj.Coulomb(0.3, 1.3), 0.5, fj.ConstantLoad(100.0))
+    m, c, k, f = map(np.asarray, scene.structure.matrices)
+    t, r, n = 0, 1, 2
+    assert (scene.structure.tangential, scene.structure.normal) == (t, n)
+
+    def margins(x, place, rate):
+        q, v = np.array([x, place, 0.0]), np.array([0.5, rate, 0.0])
+        a = np.zeros(3)
+        a[r] = (100.0 * f[r] - c[r] @ v - k[r] @ q) / m[r, r]
+        force = m @ a + c @ v + k @ q - 100.0 * f
+        return 1.3 * force[n] + np.array([1.0, -1.0]) * force[t]
+
+    rate = -k[r, t] / k[r, r] * 0.5
+    with jax.enable_x64(True):
+        drift, mechanics = jax.jit(lambda: (sticking_drift(scene), Mechanics(scene)))()
+        contact = Contact(jnp.asarray(Status.STICK, jnp.int32), jnp.asarray(1.0))
+        of_state = jax.jit(lambda y: sticks_forever(drift, mechanics, contact, y))
+
+        def proved(x, beside=0.0, faster=0.0):
+            place = (100.0 * f[r] - k[r, t] * x - c[r, t] * 0.5 - c[r, r] * rate) / k[r, r] + beside
+            start = place, rate + faster
+            return bool(of_state(jnp.array([x, start[0], 0.0, 0.5, start[1], 0.0]))), start
+
+        # Without a deviation the margins are those of a straight line in x.
+        on_drift = [margins(x, *proved(x)[1]) for x in (0.0, 1.0)]
+        edge = np.max(-on_drift[0] / (on_drift[1] - on_drift[0]))
+        places = edge + np.array([-1.0, -1e-3, -1e-6, 1e-6, 1e-3, 1.0])
+        assert [proved(x)[0] for x in places] == [False] * 3 + [True] * 3
+        # With r, its rate, x and 1 as the state of the sticking motion.
+        step = np.zeros((4, 4))
+        step[0, 1], step[2, 3] = 1.0, 0.5
+        step[1] = np.array([-k[r, r], -c[r, r], -k[r, t], 100.0 * f[r] - c[r, t] * 0.5]) / m[r, r]
+        step, x, held, ended = expm(1e-3 * step), edge + 1e-3, 0, 0
+        # Beside the drift, faster than it, and both.
+        for size, (beside, faster) in itertools.product(np.geomspace(1e-5, 1e-2, 12), [(1, 0), (0, 400), (-1, 400)]):
+            holds, (place, speed) = proved(x, size * beside, size * faster)
+            state, lasts = np.array([place, speed, x, 1.0]), True
+            for _ in range(1000):
+                lasts &= bool(np.all(margins(state[2], state[0], state[1]) > 0))
+                state = step @ state
+            assert lasts or not holds
+            held, ended = held + holds, ended + (not lasts)
+        assert held >= 9 and ended >= 9
+
+
+def test_the_table_of_chords_has_the_largest_distance_of_a_parabola_from_its_chord():
+    """Between two instants a time h apart, that of s (h - s) / 2, whose second derivative is one; by its values at 1001 places."""
+    eigenvalues = np.array([[-1.0 + 400j, -2.0 + 400j]])
+    table = envelope(eigenvalues, np.ones((1, 1, 2)))
+    # The first mode grows like exp(t / 2) against the mean of both.
+    instants = 2 * np.log(np.abs(table.growth[0, 0, :, 0]))
+    steps = np.diff(instants)
+    inside = np.linspace(0.0, 1.0, 1001)[:, None] * steps
+    largest = np.max(inside * (steps - inside) / 2, axis=0)
+    np.testing.assert_allclose(table.chord[0, 0], largest, rtol=1e-9, atol=1e-15)
