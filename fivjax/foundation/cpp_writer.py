@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 
+import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 

@@ -1,7 +1,10 @@
 """How the package is laid out: which way imports run, how long modules are, what is public, what a start loads."""
 
 import ast
+import builtins
+import dis
 import importlib
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -159,3 +162,22 @@ def test_what_notebooks_show_stands_where_it_is_looked_for():
 
     for module, name in SHOWN_BY:
         assert getattr(importlib.import_module(module), name).__module__ == module
+
+
+def names_read(code):
+    """The names of its module that a function reads, or one inside of it. What is read outside of functions, importing shows."""
+    yield from (one.argval for one in dis.get_instructions(code) if one.opname == "LOAD_GLOBAL")
+    for inner in filter(inspect.iscode, code.co_consts):
+        yield from names_read(inner)
+
+
+def test_every_name_that_a_function_reads_is_there():
+    """The linter cannot tell them from shapes in annotations."""
+    missing = set()
+    for path in Path(fj.__file__).parent.rglob("*.py"):
+        name = ".".join(path.relative_to(Path(fj.__file__).parents[1]).with_suffix("").parts).removesuffix(".__init__")
+        if not name.endswith("__main__"):
+            known = {*vars(importlib.import_module(name)), *vars(builtins)}
+            read = names_read(compile(path.read_text(), str(path), "exec"))
+            missing |= {(name, one) for one in read if one not in known}
+    assert not missing
