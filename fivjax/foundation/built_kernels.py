@@ -23,6 +23,8 @@ WIDTHS = (1, 2, 4, 8, 16)
 MOST_SIDE_BY_SIDE = 2**14
 # Parts of a call's work for each thread, because some trajectories take longer.
 AT_A_TIME = 4
+# Trajectories that are shared out among threads if the caller has none of its own: to wake them takes as long as some steps.
+LEAST_IN_THREADS = 32
 # The arrays of every kernel, with their axes: over trajectories, then as said.
 GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
@@ -86,10 +88,11 @@ class Kernel:
         def run(part: tuple[int, int]) -> None:
             wp.launch(kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
 
-        if lanes == 1:
+        if pool is None:
+            pool = _threads() if lanes >= LEAST_IN_THREADS else None
+        if pool is None or lanes == 1:
             run((0, lanes))
             return
-        pool = _threads() if pool is None else pool
         parts = min(lanes, AT_A_TIME * workers())
         for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
             pass

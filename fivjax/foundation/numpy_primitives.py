@@ -164,7 +164,10 @@ def _broadcast(array, shape, along):
     own = [1] * len(shape)
     for axis, size in zip(along, np.shape(array), strict=True):
         own[axis] = size
-    return np.broadcast_to(np.reshape(array, own), shape)
+    # A view of a small array takes five times as long to make as a copy.
+    found = np.empty(shape, array.dtype)
+    found[...] = np.reshape(array, own)
+    return found
 
 
 def _selected(which, cases):
