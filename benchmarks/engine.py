@@ -125,13 +125,12 @@ def bulk() -> None:
     import fivjax as fj
     from fivjax.foundation.kernel_text import Form
     from fivjax.simulation import motion
+    from tests.helpers.several_contacts import copies
 
     lanes, times = 512, np.array([[0.0, 1.0]])
     one = fj.belt_oscillator()
-    parts = [np.kron(np.eye(2), np.asarray(matrix)) for matrix in (one.mass, one.damping, one.stiffness)]
-    load = np.tile(np.asarray(one.load_direction), 2)
     # Beside the first contact one with another belt speed, or events of both were at one instant.
-    two = fj.Structure(*parts, load, contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)])
+    two = copies(2)
     kinds = {
         "constant friction": lambda mu, v, pulse: fj.Scene(one, fj.Coulomb(mu), v, pulse),
         "falling friction": lambda mu, v, pulse: fj.Scene(one, fj.ExponentialDecay(mu, 0.9 * mu, 0.5), v, pulse),

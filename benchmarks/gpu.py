@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import fivjax as fj
+from tests.helpers.several_contacts import copies
 
 ROUNDING = 1e-9
 FREQUENCY = 68.0  # of the belt oscillator, Hz
@@ -31,11 +32,7 @@ def scene_of(kind: str) -> fj.Scene:
         return fj.Scene(one, fj.Coulomb(0.227), 3.0, load)
     if kind == "falling":
         return fj.Scene(one, fj.ExponentialDecay(0.227, 0.14, 0.5), 3.0, load)
-    parts = [np.kron(np.eye(2), np.asarray(matrix)) for matrix in (one.mass, one.damping, one.stiffness)]
-    two = fj.Structure(
-        *parts, np.tile(np.asarray(one.load_direction), 2), contacts=[fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)]
-    )
-    return fj.Scene(two, fj.Coulomb(0.227), [3.0, 3.009], load)
+    return fj.Scene(copies(2), fj.Coulomb(0.227), [3.0, 3.009], load)
 
 
 def axes_of(kind: str, points: int) -> dict[str, np.ndarray]:
