@@ -49,10 +49,11 @@ class Kernel:
     @property
     def kernel(self):
         """What Warp launches; compiled at its first launch, because JAX may ask for shapes and call only the derivatives."""
-        with ONE_AT_A_TIME:
-            if self._kernel is None:
-                self._kernel = _compiled(self.text.source, self.text.widths, self.directions, self.width)
-            return self._kernel
+        if self._kernel is None:
+            with ONE_AT_A_TIME:
+                if self._kernel is None:
+                    self._kernel = _compiled(self.text.source, self.text.widths, self.directions, self.width)
+        return self._kernel
 
     def launched(self, given, instants, dots=None, pool: Executor | None = None):
         """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
