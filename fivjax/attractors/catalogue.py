@@ -11,9 +11,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..section.return_maps import ReturnMaps
+from .approach import Approach, approaches
 from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, capturing_cycles, is_new, stable_cycles
 from .motions import Motions, far_apart
-from .tori import TUBES, Torus, capturing_tori, tori_from
+from .returning import captured_by_tubes
+from .tori import TUBES, Torus, holds_one_of, tori_from
+
+# By what a motion has been captured: a cycle's neighbourhood or approach, or a torus.
+Captor = StableCycle | Approach | Torus
 
 
 class Attractors(NamedTuple):
@@ -21,6 +26,7 @@ class Attractors(NamedTuple):
 
     cycles: list[StableCycle]
     tori: list[Torus]
+    approaches: list[Approach]  # to some of the cycles
 
     @property
     def locked(self) -> bool:
@@ -29,13 +35,18 @@ class Attractors(NamedTuple):
         """
         return any(len(cycle.points) > CROSSINGS for cycle in self.cycles)
 
-    def copy(self) -> "Attractors":
-        return Attractors(list(self.cycles), list(self.tori))
+    @classmethod
+    def none(cls) -> "Attractors":
+        """Nothing is known yet."""
+        return cls([], [], [])
 
-    def add_cycle(self, maps: ReturnMaps, cycle: StableCycle) -> None:
-        """Add a cycle if it is new."""
-        if is_new(maps, cycle, self.cycles):
-            self.cycles.append(cycle)
+    def copy(self) -> "Attractors":
+        return Attractors(*(list(own) for own in self))
+
+    def keep_apart(self, maps: ReturnMaps) -> None:
+        """Leave out approaches in whose tubes other cycles lie: what they capture may come to those."""
+        others = [(one, [cycle for cycle in self.cycles if cycle is not one.cycle]) for one in self.approaches]
+        self.approaches[:] = [one for one, cycles in others if not holds_one_of(maps, one.tube, cycles)]
 
 
 class Catalogue(NamedTuple):
@@ -46,16 +57,36 @@ class Catalogue(NamedTuple):
     maps: ReturnMaps
     of_group: dict[int, Attractors]
     report: Callable[[int], None]
+    from_afar: bool = False  # whether cycles capture from far away, too, by their approaches
 
     def add_cycles(self, motions: Motions, recurrence: Recurrence = AT_FIRST) -> Bool[np.ndarray, " m"]:
         """Adds the stable cycles that these motions are near to (`cycles.stable_cycles`), and tells which of the motions are
         near to one, new or known.
         """
         near, known = np.zeros(len(motions.group), bool), {g: one.cycles for g, one in self.of_group.items()}
-        for g, rows, cycle in stable_cycles(self.maps, motions, known, recurrence):
+        found = stable_cycles(self.maps, motions, known, recurrence)
+        for _, rows, _ in found:
             near[rows] = True
-            self.of_group[g].add_cycle(self.maps, cycle)
+        self._add([(g, cycle) for g, _, cycle in found])
         return near
+
+    def _add(self, new: list[tuple[int, StableCycle]]) -> None:
+        """Adds those of these cycles of groups that are new, each with its approach."""
+        added = []
+        for g, cycle in new:
+            if is_new(self.maps, cycle, self.of_group[g].cycles):
+                self.of_group[g].cycles.append(cycle)
+                added.append((g, cycle))
+        if not self.from_afar or not added:
+            return
+        groups = np.array([g for g, _ in added])
+        for g, one in zip(
+            groups.tolist(), approaches(self.maps, groups, [c for _, c in added], self.report), strict=True
+        ):
+            if one is not None:
+                self.of_group[g].approaches.append(one)
+        for g in np.unique(groups).tolist():
+            self.of_group[g].keep_apart(self.maps)
 
     def add_tori(self, motions: Motions, tubes=TUBES[:1]) -> None:
         """Adds the tori that these motions are on, and the cycles of locked ones."""
@@ -64,8 +95,7 @@ class Catalogue(NamedTuple):
         tori, locked = tori_from(self.maps, motions, cycles, tori, self.report, tubes)
         for row, torus in tori.items():
             known[row].tori.append(torus)
-        for row, cycle in locked:
-            known[row].add_cycle(self.maps, cycle)
+        self._add([(int(motions.group[row]), cycle) for row, cycle in locked])
 
     def add_tori_by_turns(self, motions: Motions, usable: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         """The same from the usable motions, one of each group after the other, while there are some that none of the known
@@ -86,7 +116,7 @@ class Catalogue(NamedTuple):
 
     def captures(
         self, motions: Motions, asked: Bool[np.ndarray, " m"], latest: Float[np.ndarray, "m 2n"] | None = None
-    ) -> dict[int, StableCycle | Torus]:
+    ) -> dict[int, Captor]:
         """The known attractors of their groups by which motions have been captured, by row. Only those that are `asked` count;
         `latest` are their last crossings (`cycles.capturing_cycles`), unless they are on the section.
         """
@@ -99,9 +129,9 @@ class Catalogue(NamedTuple):
         own = [(part, self.of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True)]
         cycles = [(part, cycle) for part, known in own for cycle in known.cycles]
         place = capturing_cycles(self.maps, motions, latest, cycles)
-        found: dict[int, StableCycle | Torus] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
-        tori = [(part[place[part] < 0], torus) for part, known in own for torus in known.tori]
-        return found | capturing_tori(self.maps, motions, latest, tori)
+        found: dict[int, Captor] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
+        tubes = [(part[place[part] < 0], one) for part, known in own for one in (*known.tori, *known.approaches)]
+        return found | captured_by_tubes(self.maps, motions, latest, tubes)
 
     def only(self, groups) -> "Catalogue":
         """The catalogue of these groups; what is added to it is added to the whole."""

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
-from .catalogue import Catalogue
+from .catalogue import Captor, Catalogue
 from .creeping import creep
-from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle
+from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Recurrence
 from .divergence import long_divergence
 from .motions import Motions, far_apart
-from .tori import AT_A_TIME, TUBES, Torus, is_drifting
+from .tori import AT_A_TIME, TUBES, is_drifting
 from .tube import HOME
 
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
@@ -32,7 +32,7 @@ class Fates(NamedTuple):
     """
 
     chaotic: Bool[np.ndarray, " m"]
-    attractor: dict[int, StableCycle | Torus]
+    attractor: dict[int, Captor]
     without_events: Bool[np.ndarray, " m"]
     at: Section
     time: Float[np.ndarray, " m"]  # s
@@ -43,7 +43,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
     """What becomes of these motions; their loads are final. The catalogue gets the attractors that are found."""
     maps, group = catalogue.maps, motions.group
     at, events, time, *_ = maps.returns(*motions, 1)
-    attractor: dict[int, StableCycle | Torus] = {}
+    attractor: dict[int, Captor] = {}
     chaotic, quiet = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
@@ -91,7 +91,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     followed = long_divergence(maps, motions)
     now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
     run = _Underway(Motions(group, now), time, events)
-    attractor: dict[int, StableCycle | Torus] = {}
+    attractor: dict[int, Captor] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
     for turn in range(TIMES + 1):

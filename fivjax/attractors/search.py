@@ -38,13 +38,13 @@ def search_groups(
     def by_releases(groups: list[int]) -> None:
         for start in range(0, len(groups), TOGETHER):
             part = groups[start : start + TOGETHER]
-            found.update((g, Attractors([], [])) for g in part)
+            found.update((g, Attractors.none()) for g in part)
             _by_releases(catalogue.only(part), equilibrium, np.array(part))
             complete(part)
 
     by_releases(sorted({seed for seed in seeds.values() if seed not in found}))
     seeded = sorted(g for g in seeds if g not in found)
-    found |= {g: Attractors([], []) for g in seeded}
+    found |= {g: Attractors.none() for g in seeded}
     for start in range(0, len(seeded), TOGETHER):
         part = seeded[start : start + TOGETHER]
         _continue_from_seeds(catalogue, {g: seeds[g] for g in part})

@@ -3,7 +3,7 @@ and how high they go.
 
 A set counts as a torus by these checks, each with its tolerance beside it: the motion goes on and repeats nothing
 (`goes_on`), drifts no more (`is_drifting`), and its amplitude has settled (`_settled_amplitude`); whatever starts on the
-edge of a tube about the set comes back (`_tubes_returned_to`); and motions that start there go about the same set without
+edge of a tube about the set comes back (`returning`); and motions that start there go about the same set without
 parting (`_attracting_tubes`, `_on_one_torus`).
 """
 
@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import ReturnMaps
 from . import tube
 from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
 from .divergence import growth_rates
 from .motions import NOMINATED, Motions, section_at
+from .returning import BACK_TO, starts_on_edges, tubes_returned_to
 from .tube import Tube, thin, tree_of
 
 # Radii of the tube about a set that is tried as a torus, each with the number of its states: the narrower, the more are needed.
@@ -26,9 +27,6 @@ TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
 TRACED, LONGER, LONGEST = 2048, 4096, 12288
 # So many states at a time: after each, motions that have come to a torus that is known are left out.
 AT_A_TIME = 512
-# Starts on a tube's edge are back when they are in this share of it, which is less than what captures: next to a slow fade
-# there is a direction in which they come back hardly at all.
-BACK_TO = 0.25
 # In chaos neighbours part by so much per return, and more.
 CHAOTIC_FROM = 0.05
 # Motions whose extent, or whose distance from others, is below this share of their size differ by rounding only.
@@ -85,7 +83,7 @@ def tori_from(
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
             tried = [(row, Tube(thin(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
-            tried = [(row, one) for row, one in tried if not _holds_one_of(maps, one, cycles[row])]
+            tried = [(row, one) for row, one in tried if not holds_one_of(maps, one, cycles[row])]
             if not tried:
                 continue
             new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
@@ -114,32 +112,6 @@ def _cycles_repeated(
     known = {int(group[row]): cycles[row] for row in rows}
     near = stable_cycles(maps, Motions(own, at), known, Recurrence(MOST_CROSSINGS, settled=True))
     return [(rows[k], cycle) for _, which, cycle in near for k in which]
-
-
-def capturing_tori(
-    maps: ReturnMaps,
-    motions: Motions,
-    latest: Float[np.ndarray, "m 2n"],
-    known: list[tuple[Int[np.ndarray, " r"], Torus]],
-) -> dict[int, Torus]:
-    """The tori that motions have come to, by row. `known` are tori, each with the rows that may have come to it; as for
-    `cycles.capturing_cycles`, `latest` tells which to ask, and their next crossings decide.
-    """
-    near = []
-    for rows, torus in known:
-        within = 0.5 + maps.known_to / torus.tube.radius
-        near.append(rows[torus.tube.holds(maps.weights * latest[rows], within)])
-    asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
-    if not len(asked):
-        return {}
-    _, paths = maps.path(*motions.rows(asked), tube.HOME)
-    found: dict[int, Torus] = {}
-    for (_, torus), rows in zip(known, near, strict=True):
-        open_ = np.array([row for row in rows if row not in found], int)
-        if len(open_):
-            ends = maps.weights * np.moveaxis(paths[np.searchsorted(asked, open_)], 1, 0)
-            found |= dict.fromkeys(open_[torus.tube.home(ends)].tolist(), torus)
-    return found
 
 
 def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: int) -> dict[int, Traced]:
@@ -258,7 +230,8 @@ def _trace_around(maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[i
     rows = [row for row, one in traced.items() if _in_clusters(one.states)]
     if not rows:
         return {}
-    own, at = _starts(maps, group[rows], [Tube(traced[row].states, tube.RADIUS) for row in rows])
+    own, about = np.repeat(group[rows], tube.STARTS), [Tube(traced[row].states, tube.RADIUS) for row in rows]
+    at = starts_on_edges(maps, group[rows], about)
     _, paths = maps.path(own, maps.returns(own, at, 48).at, TRACED // tube.STARTS)
     states = (maps.weights * paths).reshape(len(rows), TRACED, -1)
     return {
@@ -276,8 +249,8 @@ def _attracting_tubes(
     report,
 ) -> tuple[dict[int, Tube], list[tuple[int, StableCycle]]]:
     """Which of these tubes, each with its row, are about tori; and the cycles of tori that are locked."""
-    own = np.array([groups[row] for row, _ in tubes])
-    back, last = _tubes_returned_to(maps, own, [one for _, one in tubes], report)
+    own, each = np.array([groups[row] for row, _ in tubes]), [one for _, one in tubes]
+    back, last = tubes_returned_to(maps, own, each, starts_on_edges(maps, own, each), report)
     if not len(back):
         return {}, []
     # So many of the starts are followed further: first from the edge of the tube to the torus.
@@ -313,43 +286,9 @@ def _attracting_tubes(
     return dict(tubes[back[k]] for k in kept), cycles
 
 
-def _holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
+def holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
     """Whether a stable cycle lies in the inner half of a tube: motions there may come to that instead."""
     return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
-
-
-def _tubes_returned_to(
-    maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube], report
-) -> tuple[Int[np.ndarray, " t"], Section]:
-    """From the edges of which tubes all starts come back, within so many crossings; and where the starts are then, tube by
-    tube. The first few starts tell most sets that do not attract.
-    """
-    weights, count, first, within = maps.weights, tube.STARTS, 4, 1536
-    own, last = _starts(maps, group, tubes)
-    back, ok = np.zeros(len(own), bool), np.ones(len(tubes), bool)
-    smallest = np.array([np.min(np.linalg.norm(one.states, axis=1)) for one in tubes])
-    place, of_tube = np.arange(len(own)) % count, np.arange(len(own)) // count
-    for among in (place < first, place >= first):
-        running = np.flatnonzero(among & ok[of_tube])
-        crossed = 0
-        while crossed < within and len(running):
-            report(0)
-            # Most are back soon; the others are looked at in growing steps.
-            further = min(max(tube.HOME, crossed // 2), within - crossed)
-            crossed += further
-            image = maps.returns(own[running], last.rows(running), further, tube.HOME)
-            last.put(running, image.at)
-            ends = weights * np.moveaxis(image.path, 1, 0)
-            # One that fades, or fails, does not come back.
-            with np.errstate(invalid="ignore"):
-                lost = ~(np.linalg.norm(ends[-1], axis=1) > 0.5 * smallest[of_tube[running]])
-            ok[of_tube[running[lost]]] = False
-            for k in np.unique(of_tube[running]):
-                mine = of_tube[running] == k
-                back[running[mine]] = tubes[k].home(ends[:, mine], BACK_TO)
-            running = running[ok[of_tube[running]] & ~back[running]]
-        ok[of_tube[among & ~back]] = False
-    return np.flatnonzero(ok), last
 
 
 def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
@@ -369,11 +308,3 @@ def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:
     missed = np.median(tree_of(early).query(late)[0], axis=1)
     rounding = ROUNDING * tube.mean_size(whole)
     return bool(np.max(apart) <= 0.2 * extent(whole) and np.all(missed <= 8.0 * np.array(steps) + rounding))
-
-
-def _starts(maps: ReturnMaps, group: Int[np.ndarray, " s"], tubes: list[Tube]) -> tuple[Int[np.ndarray, " m"], Section]:
-    """The starts on the edge of each of these tubes, with their groups."""
-    own, size = np.repeat(group, tube.STARTS), maps.structure.size
-    section, gaps = maps.section / maps.weights[size:], np.atleast_1d(maps.normal)
-    starts = np.concatenate([one.starts(section, gaps) for one in tubes])
-    return own, section_at(starts / maps.weights, maps.normal, maps.sliding[own])

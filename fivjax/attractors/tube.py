@@ -56,6 +56,16 @@ class Tube:
         random = np.random.default_rng(0).normal(size=chosen.shape)
         kind = np.arange(STARTS) % 4
         away = np.where((kind == 0)[:, None], chosen, np.where((kind == 1)[:, None], -chosen, random))
+        return self.displaced(chosen, away, section, gaps)
+
+    def displaced(
+        self,
+        chosen: Float[np.ndarray, "m 2n"],
+        away: Float[np.ndarray, "m 2n"],
+        section: Float[np.ndarray, " n"],
+        gaps: Int[np.ndarray, " c"],
+    ) -> Float[np.ndarray, "m 2n"]:
+        """Those of the states displaced to the tube's edge in these directions, as far as the section and the contact allow."""
         # A gap this small is a rounding error of contact.
         least = 1e-6 * self.size
         open_ = chosen[:, gaps] > least

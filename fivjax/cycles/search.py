@@ -189,7 +189,7 @@ def attractors_met(maps: ReturnMaps, scene: Scene, states: Float[np.ndarray, "m 
         stage("searching")
 
     stage("releasing motions")
-    found = Attractors([], [])
+    found = Attractors.none()
     catalogue, group = Catalogue(maps, {0: found}, report), np.zeros(len(states), int)
     motions = search_from(catalogue, Motions(group, maps.in_contact(group, states)))
     families = in_families(maps, motions)

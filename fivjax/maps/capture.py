@@ -11,7 +11,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..attractors.catalogue import Attractors, Catalogue
+from ..attractors.approach import Approach
+from ..attractors.catalogue import Attractors, Captor, Catalogue
 from ..attractors.cycles import Recurrence, StableCycle
 from ..attractors.divergence import long_divergence
 from ..attractors.long_run import fates
@@ -24,7 +25,7 @@ from ..steppers.event_exact import EventExact
 from .following import Batch, bounds
 from .job_files import JobState
 from .one_trajectory import Progress
-from .results import CHAOTIC, NO_ATTRACTOR
+from .results import APPROACHED, CHAOTIC, NO_ATTRACTOR, PERIODIC, TORUS
 from .series_kernels import SeriesKernels
 
 
@@ -32,7 +33,7 @@ class Late(NamedTuple):
     """What becomes of trajectories whose time is over."""
 
     chaotic: Bool[np.ndarray, " m"]
-    attractor: dict[int, StableCycle | Torus]  # by row
+    attractor: dict[int, Captor]  # by row
     sliding: Int[np.ndarray, " r"]  # rows of those that slide for ever
     now: Progress  # all trajectories when that is so, which may be long after their time was over
 
@@ -62,7 +63,7 @@ class Capture:
         self.most_time = 20000.0 * np.asarray(batch.shared.tree.modes.slowest_period)
 
     def _catalogue(self, maps: ReturnMaps, known: dict[int, Attractors]) -> Catalogue:
-        return Catalogue(maps, known, self.report)
+        return Catalogue(maps, known, self.report, from_afar=True)
 
     def _return_maps(self) -> ReturnMaps:
         batch, tree, kernels = self.batch, self.batch.shared.tree, self.batch.kernels
@@ -132,7 +133,7 @@ class Capture:
             constants = 12.0 * cycle.period / (1 - cycle.multiplier)
             self.settled_by[g] = max(self.settled_by[g], min(constants, self.most_time[g]))
 
-    def entered(self, pending: np.ndarray, now: Progress, undecided: np.ndarray) -> dict[int, StableCycle | Torus]:
+    def entered(self, pending: np.ndarray, now: Progress, undecided: np.ndarray) -> dict[int, Captor]:
         """The attractors that have captured trajectories, by row."""
         if self.maps is None:
             return {}
@@ -191,12 +192,13 @@ def later(
     return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 
-def attractor_columns(count: int, attractor: dict[int, StableCycle | Torus], chaotic: np.ndarray):
+def attractor_columns(count: int, attractor: dict[int, Captor], chaotic: np.ndarray):
     """Kind, amplitude, period, multiplier, reach and contraction of the attractor of each of so many trajectories."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
     amplitude, period, multiplier, reach, contraction = np.full((5, count), np.nan)
-    for row, one in attractor.items():
-        kind[row] = isinstance(one, Torus)
+    for row, captor in attractor.items():
+        one = captor.cycle if isinstance(captor, Approach) else captor
+        kind[row] = APPROACHED if one is not captor else TORUS if isinstance(one, Torus) else PERIODIC
         amplitude[row], period[row], reach[row] = one.amplitude, one.period, one.reach
         contraction[row] = one.contraction
         multiplier[row] = one.multiplier if isinstance(one, StableCycle) else np.nan

@@ -17,7 +17,7 @@ from .crossing import first_crossings
 from .groups import kernels_by
 from .plan import Grid
 from .refinement import Audit, Refined
-from .results import CHAOTIC, Verdicts
+from .results import APPROACHED, CHAOTIC, PERIODIC, TORUS, Verdicts
 
 # Trajectories whose attractors are told apart at a time: that takes much memory.
 AT_A_TIME = 2**18
@@ -30,7 +30,8 @@ def time_limit(t_max: float | None) -> dict[str, float]:
 
 def _proofs(verdicts: Verdicts) -> np.ndarray:
     """What each verdict rests on."""
-    verdict, captured = verdicts.verdict, np.where(verdicts.attractor_kind == 1, Proof.TUBE, Proof.ELLIPSOID)
+    verdict, kind = verdicts.verdict, verdicts.attractor_kind
+    captured = np.select([kind == TORUS, kind == APPROACHED], [Proof.TUBE, Proof.APPROACH], Proof.ELLIPSOID)
     proofs = {Verdict.SLIDING: Proof.BOUND, Verdict.LIMIT_CYCLE: captured, Verdict.UNBOUNDED: Proof.GROWTH}
     chosen = [verdict == one for one in proofs]
     return np.select(chosen, [np.broadcast_to(one, verdict.shape) for one in proofs.values()], Proof.NONE).astype(
@@ -124,6 +125,7 @@ def attractor_table(
     from its index.
     """
     on_one = np.flatnonzero(verdicts.verdict == Verdict.LIMIT_CYCLE)
+    kind = np.where(verdicts.attractor_kind == APPROACHED, PERIODIC, verdicts.attractor_kind)
     group = groups(on_one)
     order = np.argsort(group, kind="stable")
     on_one, group = on_one[order], group[order]
@@ -135,7 +137,7 @@ def attractor_table(
                 group[part],
                 verdicts.amplitude[rows],
                 verdicts.attractor_period[rows],
-                verdicts.attractor_kind[rows],
+                kind[rows],
             ]
         )
         order = np.lexsort((columns[2], columns[1], columns[3], columns[0]))
@@ -149,7 +151,7 @@ def attractor_table(
     return place, {
         "attractor_amplitude": verdicts.amplitude[chosen],
         "attractor_period": verdicts.attractor_period[chosen],
-        "attractor_kind": np.array(["periodic", "torus"])[verdicts.attractor_kind[chosen]],
+        "attractor_kind": np.array(["periodic", "torus"])[kind[chosen]],
         "attractor_multiplier": verdicts.attractor_multiplier[chosen],
         "attractor_reach": verdicts.attractor_reach[chosen],
         "attractor_contraction": verdicts.attractor_contraction[chosen],

@@ -101,12 +101,13 @@ def _may_be_concluded(
     shared: Shared, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
 ) -> np.ndarray:
     """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
-    steps: those whose mode has not changed in it, and those that have not moved, are too large or are not finite. Cheap.
-    `began` and `events` are the time (s) and the number of events before the round.
+    steps: those whose mode has not changed in it, after the last jump of the load, and those that have not moved, are too large
+    or are not finite. Cheap. `began` and `events` are the time (s) and the number of events before the round.
     """
     yardstick = np.max(np.abs(shared.weights * shared.modes.linear.equilibrium), axis=1)
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
-    return (now.events == events) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * yardstick[group])
+    quiet = np.True_ if now.steps is None else np.all(now.steps.jumps <= now.t[:, None], axis=1)
+    return (quiet & (now.events == events)) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * yardstick[group])
 
 
 def _conclude(
@@ -118,7 +119,7 @@ def _conclude(
         return _conclude_block(task.scene, task.method, task.names, task.history, *block)
 
     # They are few of each group (a critical kick has a dozen), and what they share is little.
-    return in_blocks(function, shared, group, flatten((columns, now, began)), 1, batch.pool, size=32)
+    return in_blocks(function, shared, group, flatten((columns, now, began)), 8, batch.pool, size=64)
 
 
 def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..attractors.approach import Approach
 from ..attractors.catalogue import Attractors
 from ..attractors.cycles import StableCycle
 from ..attractors.neighbourhood import Neighbourhood
@@ -30,15 +31,19 @@ def to_bytes(found: dict[bytes, Attractors]) -> bytes:
     """The attractors of groups, by the groups' parameters, as bytes."""
     arrays, index = {}, []
     for number, (key, one) in enumerate(found.items()):
-        index.append([key.hex(), len(one.cycles), len(one.tori)])
+        place = {id(cycle): k for k, cycle in enumerate(one.cycles)}
+        approached = [place[id(approach.cycle)] for approach in one.approaches]
+        index.append([key.hex(), len(one.cycles), len(one.tori), approached])
         for k, cycle in enumerate(one.cycles):
             fields = {**cycle._asdict(), **{f"n_{name}": part for name, part in cycle.neighbourhood._asdict().items()}}
             del fields["neighbourhood"]
             arrays |= {f"{number}.{k}.{name}": np.asarray(value) for name, value in fields.items()}
         for k, torus in enumerate(one.tori):
-            fields = {**torus._asdict(), "states": torus.tube.states, "radius": torus.tube.radius}
+            fields = {**torus._asdict(), **_of_tube(torus.tube)}
             del fields["tube"]
             arrays |= {f"{number}.torus{k}.{name}": np.asarray(value) for name, value in fields.items()}
+        for k, approach in enumerate(one.approaches):
+            arrays |= {f"{number}.approach{k}.{name}": value for name, value in _of_tube(approach.tube).items()}
     content = io.BytesIO()
     np.savez_compressed(content, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)
     return content.getvalue()
@@ -49,20 +54,26 @@ def from_bytes(content: bytes) -> dict[bytes, Attractors]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     found = {}
-    for number, (key, cycles, tori) in enumerate(json.loads(arrays["index"].tobytes())):
+    for number, (key, cycles, tori, approached) in enumerate(json.loads(arrays["index"].tobytes())):
 
         def of(kind, prefix, own=number, **others):
             names = [name for name in kind._fields if name not in others]
             return kind(**others, **{name: _plain(arrays[f"{own}.{prefix}{name}"]) for name in names})
 
-        def tube(k, own=number):
-            return Tube(*(_plain(arrays[f"{own}.torus{k}.{name}"]) for name in ("states", "radius")))
+        def tube(prefix, own=number):
+            return Tube(*(_plain(arrays[f"{own}.{prefix}{name}"]) for name in ("states", "radius")))
 
+        own = [of(StableCycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)]
         found[bytes.fromhex(key)] = Attractors(
-            [of(StableCycle, f"{k}.", neighbourhood=of(Neighbourhood, f"{k}.n_")) for k in range(cycles)],
-            [of(Torus, f"torus{k}.", tube=tube(k)) for k in range(tori)],
+            own,
+            [of(Torus, f"torus{k}.", tube=tube(f"torus{k}.")) for k in range(tori)],
+            [Approach(own[place], tube(f"approach{k}.")) for k, place in enumerate(approached)],
         )
     return found
+
+
+def _of_tube(tube: Tube) -> dict[str, np.ndarray]:
+    return {"states": tube.states, "radius": np.asarray(tube.radius)}
 
 
 def _plain(value: np.ndarray):

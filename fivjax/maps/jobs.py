@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..attractors.catalogue import Attractors
-from ..attractors.cycles import CROSSINGS, MORE_CROSSINGS, StableCycle
-from ..attractors.tori import Torus
+from ..attractors.catalogue import Attractors, Captor
+from ..attractors.cycles import CROSSINGS, MORE_CROSSINGS
 from ..foundation.flattened import Flattened
 from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
@@ -126,7 +125,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             in_time = now.t - now.skipped < np.maximum(limit, capture.settled_by)[group[pending]]
         else:
             in_time = now.t < limit[group[pending]]
-        entered: dict[int, StableCycle | Torus] = {}
+        entered: dict[int, Captor] = {}
         if done > known_from:
             entered = capture.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[list(entered)] = Verdict.LIMIT_CYCLE

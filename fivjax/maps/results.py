@@ -8,8 +8,9 @@ from ..simulation.energy import exchanged
 from ..verdicts.verdict import Verdict
 from .one_trajectory import Progress
 
-# `attractor_kind` of a trajectory that no attractor has captured, and of such a one whose neighbours diverge exponentially.
-NO_ATTRACTOR, CHAOTIC = -1, 2
+# `attractor_kind` of a trajectory: no attractor has captured it; a cycle has, or a torus; none has, and its neighbours diverge
+# exponentially; and a cycle has, by its approach.
+NO_ATTRACTOR, PERIODIC, TORUS, CHAOTIC, APPROACHED = -1, 0, 1, 2, 3
 
 
 class Verdicts(NamedTuple):
@@ -17,7 +18,7 @@ class Verdicts(NamedTuple):
 
     verdict: np.ndarray
     amplitude: np.ndarray  # m/s
-    attractor_kind: np.ndarray  # of the attractor: 0 periodic, 1 torus; else `NO_ATTRACTOR` or `CHAOTIC`
+    attractor_kind: np.ndarray  # see above
     attractor_period: np.ndarray  # s
     attractor_multiplier: np.ndarray  # size of the largest
     attractor_reach: np.ndarray  # of the neighbourhood that it draws in, relative to its size

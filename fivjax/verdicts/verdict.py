@@ -63,6 +63,7 @@ class Proof(enum.IntEnum):
     ELLIPSOID = 2
     TUBE = 3
     GROWTH = 4
+    APPROACH = 5
 
 
 RESTS_ON = {
@@ -73,5 +74,7 @@ RESTS_ON = {
     "contract into itself by the factor `attractor_contraction`",
     Proof.TUBE: "a tube about a torus: all starts on its edge came back to the share `attractor_contraction` of it, and half "
     "of it, `attractor_reach`, captures",
+    Proof.APPROACH: "a tube about paths that lead into such an ellipsoid: all starts on its edge came back to a quarter of it, "
+    "and half of it captures",
     Proof.GROWTH: "it sticks and is pressed on ever harder, or has grown a billionfold",
 }

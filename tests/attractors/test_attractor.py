@@ -10,17 +10,17 @@ from fivjax.attractors import tube
 from fivjax.attractors.catalogue import Catalogue
 from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new
 from fivjax.attractors.motions import Motions
+from fivjax.attractors.returning import captured_by_tubes
 from fivjax.attractors.tori import (
     LONGER,
     TRACED,
     Torus,
     Traced,
     _cycles_repeated,
-    _holds_one_of,
     _in_clusters,
     _on_one_torus,
-    capturing_tori,
     goes_on,
+    holds_one_of,
     is_drifting,
     smooth_mean,
 )
@@ -119,15 +119,17 @@ def test_a_torus_captures_what_stays_in_half_its_tube():
     radii = 0.5 + half * np.array([0.0, 0.9, -0.9, 1.1, -1.1, 3.0])
     states = np.stack([4 + radii, 0 * radii], axis=-1) / maps.weights
     at = Section(states, np.zeros(6, np.int32), np.ones(6))
-    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.arange(6), torus)])  # type: ignore[arg-type]
+    found = captured_by_tubes(maps, Motions(np.zeros(6, int), at), states, [(np.arange(6), torus)])  # type: ignore[arg-type]
     assert found == dict.fromkeys((0, 1, 2), torus)
     assert maps.asked == [5]
     # One whose last crossing is not known, and another torus, which has been asked about first.
     states = np.where(np.arange(6)[:, None] == 0, np.nan, states)
     other = torus._replace(amplitude=2.0)
-    found = capturing_tori(maps, Motions(np.zeros(6, int), at), states, [(np.array([1]), other), (np.arange(6), torus)])  # type: ignore[arg-type]
+    found = captured_by_tubes(
+        maps, Motions(np.zeros(6, int), at), states, [(np.array([1]), other), (np.arange(6), torus)]
+    )  # type: ignore[arg-type]
     assert found == {1: other, 2: torus}
-    assert capturing_tori(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
+    assert captured_by_tubes(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
 
 
 def circle(radius=0.5, count=STATES):
@@ -299,8 +301,8 @@ def test_a_set_that_holds_a_known_cycle_is_no_torus():
     on_it = np.array([[4.5, 0.0], [3.5, 0.01]]) / Maps.weights
     for points, expected in ((on_it, True), (on_it * [[1.0, 1.0], [1.2, 1.0]], False)):
         cycle = StableCycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
-        assert _holds_one_of(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
-    assert not _holds_one_of(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
+        assert holds_one_of(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
+    assert not holds_one_of(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
 
 
 MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)

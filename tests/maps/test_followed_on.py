@@ -78,7 +78,7 @@ def test_what_is_proved_after_the_time_is_over_has_its_own_time_and_events():
     """
     x0 = np.array([1.01, 1.2, 3.9999])
     y = np.stack([x0, *np.zeros((3, 3))], axis=1)
-    known = {0: Attractors([], []), 1: Attractors([], [])}
+    known = {0: Attractors.none(), 1: Attractors.none()}
     at = Section(y, np.ones(3, np.int32), np.ones(3))
     catalogue = Catalogue(Line(), known, lambda _: None)  # type: ignore[arg-type]
     found = fates(catalogue, Motions(np.array([0, 1, 1]), at))
@@ -193,7 +193,7 @@ def test_where_the_first_come_to_nothing_the_others_are_not_followed_onward(monk
 
     monkeypatch.setattr(long_run, "_long_fates", long_fates)
     y = np.stack([np.tile([1.1, 1.3, 1.5, 1.7], 2), *np.zeros((3, 8))], axis=1)
-    catalogue = Catalogue(Line(), {g: Attractors([], []) for g in range(2)}, lambda _: None)  # type: ignore[arg-type]
+    catalogue = Catalogue(Line(), {g: Attractors.none() for g in range(2)}, lambda _: None)  # type: ignore[arg-type]
     at = Section(y, np.ones(8, np.int32), np.ones(8))
     found = fates(catalogue, Motions(np.repeat([0, 1], 4), at))
     assert asked == [([0, 0, 1, 1], [True] * 4), ([0, 0, 1, 1], [True] * 2 + [False] * 2)]
@@ -202,7 +202,7 @@ def test_where_the_first_come_to_nothing_the_others_are_not_followed_onward(monk
 
 def test_what_comes_from_a_torus_nearby_to_a_known_cycle_is_not_asked_for_a_torus(monkeypatch):
     """A group whose neighbour has the cycle and a torus: the motion from the torus ends on the cycle."""
-    known = {g: Attractors([], []) for g in range(2)}
+    known = {g: Attractors.none() for g in range(2)}
     catalogue = Catalogue(Line(), known, lambda _: None)  # type: ignore[arg-type]
     near = Section(np.array([[3.9999, 0.0, 0.0, 0.0]]), np.ones(1, np.int32), np.ones(1))
     assert set(fates(catalogue, Motions(np.zeros(1, int), near)).attractor) == {0}

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
+from fivjax.attractors.approach import Approach
 from fivjax.attractors.catalogue import Attractors
 from fivjax.attractors.cycles import StableCycle
 from fivjax.attractors.neighbourhood import Neighbourhood
@@ -141,9 +142,10 @@ def test_attractors_come_back_from_a_file_bit_for_bit():
     rng = np.random.default_rng(0)
     near = Neighbourhood(rng.normal(size=6), 1, -1.0, rng.normal(size=(6, 6)), 0.1, 0.7, 256)
     cycle = StableCycle(rng.normal(size=(2, 6)), 0.1, 0.5, 3.0, near)
+    other = cycle._replace(period=0.2)
     found = {
-        b"one": Attractors([cycle, cycle], []),
-        b"two": Attractors([], [Torus(Tube(rng.normal(size=(9, 6)), radius), 2.0, 0.3) for radius in (0.04, 0.01)]),
+        b"one": Attractors([cycle, other], [], [Approach(other, Tube(rng.normal(size=(5, 6)), 0.04))]),
+        b"two": Attractors([], [Torus(Tube(rng.normal(size=(9, 6)), radius), 2.0, 0.3) for radius in (0.04, 0.01)], []),
     }
     again = from_bytes(to_bytes(found))
     assert list(again) == list(found)
@@ -151,7 +153,10 @@ def test_attractors_come_back_from_a_file_bit_for_bit():
     for mine, theirs in zip(again[b"two"].tori, found[b"two"].tori, strict=True):
         np.testing.assert_array_equal(mine.tube.states, theirs.tube.states)
         assert (mine.tube.radius, *mine[1:]) == (theirs.tube.radius, *theirs[1:])
-    for mine in again[b"one"].cycles:
-        for part, theirs in zip((*mine[:-1], *mine[-1]), (*cycle[:-1], *near), strict=True):
+    (approach,), (first, second) = again[b"one"].approaches, again[b"one"].cycles
+    assert approach.cycle is second
+    np.testing.assert_array_equal(approach.tube.states, found[b"one"].approaches[0].tube.states)
+    for mine, whole in ((first, cycle), (second, other)):
+        for part, theirs in zip((*mine[:-1], *mine[-1]), (*whole[:-1], *near), strict=True):
             np.testing.assert_array_equal(part, theirs)
             assert type(part) is type(theirs)

@@ -1,0 +1,96 @@
+"""Approaches to cycles: what they capture comes to the cycle, and nothing beyond an unstable one is captured."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import fivjax as fj
+from fivjax.attractors import catalogue
+from fivjax.attractors.approach import approaches
+from fivjax.attractors.catalogue import Attractors, Catalogue
+from fivjax.attractors.cycles import StableCycle
+from fivjax.attractors.motions import Motions
+from fivjax.attractors.neighbourhood import Neighbourhood
+from fivjax.section.return_maps import Images, Section
+
+STABLE, GROWTH = 4.0, 0.2
+
+
+class Line:
+    """A return map of which one coordinate is free, in place of `ReturnMaps`: away from an unstable cycle, to a stable one."""
+
+    weights, known_to, normal, sliding = np.ones(4), 1e-6, 1, np.ones(1)
+    structure, section = SimpleNamespace(size=2, contacts=[None]), np.array([1.0, 0.0])
+
+    def __init__(self, unstable):
+        self.unstable = unstable
+
+    def returns(self, group, at, crossings, kept=1, peaks=False):
+        crossings = np.broadcast_to(crossings, len(group))
+        y, path = at.y.copy(), np.full((len(group), kept, 4), np.nan)
+        for k in range(int(np.max(crossings, initial=0))):
+            going = k < crossings
+            # What has left is far away, and stays there.
+            x = np.maximum(y[going, 0], -1.0)
+            y[going, 0] = x + GROWTH * (x - self.unstable) * (STABLE - x)
+            path[going] = np.concatenate([path[going, 1:], y[going, None]], axis=1)
+        nothing = np.zeros(len(group))
+        return Images(at._replace(y=y), nothing.astype(np.int32), nothing, path, nothing)
+
+    def path(self, group, at, count):
+        found = self.returns(group, at, count, count)
+        return found.at, found.path
+
+
+def cycle_of(unstable: float) -> StableCycle:
+    """The stable cycle, with a neighbourhood that is much smaller than what it attracts."""
+    y, multiplier = np.array([STABLE, 0.0, 0.0, 0.0]), 1 - GROWTH * (STABLE - unstable)
+    return StableCycle(y[None], 0.1, multiplier, STABLE, Neighbourhood(y, 1, 1.0, np.eye(4), 1e-4, multiplier, 1))
+
+
+@pytest.mark.parametrize(("unstable", "nearest"), [(0.5, 3.0), (3.5, 3.76), (3.7, None), (3.95, None)])
+def test_an_approach_ends_before_an_unstable_cycle(unstable, nearest):
+    """A tube is drawn in only where its edge is, too; a closer unstable cycle leaves a shorter approach, or none."""
+    maps, cycle = Line(unstable), cycle_of(unstable)
+    (found,) = approaches(maps, np.zeros(1, int), [cycle], lambda count: None)  # type: ignore[arg-type]
+    assert (found is None) == (nearest is None)
+    known = Attractors([cycle], [], [] if found is None else [found])
+    x = np.concatenate([np.linspace(0.0, 8.0, 801), unstable + 1e-6 * np.arange(-5, 6)])
+    y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
+    motions = Motions(np.zeros(len(x), int), Section(y, np.ones(len(x), np.int32), np.ones(len(x))))
+    captured = Catalogue(maps, {0: known}, lambda count: None).captures(motions, np.ones(len(x), bool))  # type: ignore[arg-type]
+    rows = np.array(list(captured), int)
+    assert np.all(x[rows] > unstable)
+    if found is not None:
+        assert found.cycle is cycle and np.min(found.tube.states[:, 0]) >= nearest
+        # The cycle's neighbourhood alone has nobody but who starts in it.
+        assert len(rows) > 20 * np.sum(np.abs(x - STABLE) <= 1e-4)
+
+
+def test_an_approach_with_another_cycle_in_it_is_left_out():
+    maps, cycle = Line(0.5), cycle_of(0.5)
+    (found,) = approaches(maps, np.zeros(1, int), [cycle], lambda count: None)  # type: ignore[arg-type]
+    assert found is not None
+    other = cycle._replace(points=cycle.points - np.array([0.05, 0.0, 0.0, 0.0]))
+    far = cycle._replace(points=cycle.points - np.array([3.9, 0.0, 0.0, 0.0]))
+    for cycles, kept in (([cycle, far], 1), ([cycle, far, other], 0)):
+        known = Attractors(cycles, [], [found])
+        known.keep_apart(maps)  # type: ignore[arg-type]
+        assert len(known.approaches) == kept
+
+
+def test_a_map_by_approaches_says_what_it_says_by_neighbourhoods_alone(monkeypatch):
+    """Every verdict and every amplitude, of cycles of one crossing and of locked tori; in less time of the motion."""
+    axes = {"mu": np.array([0.2, 0.28]), "p": np.linspace(1.5, 3.0, 5), "belt_speed": np.array([1.0, 3.0])}
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=1.0, load=fj.Pulse(100.0, 1.2))
+    fast = fj.bistability_map(scene, progress=False, **axes)
+    monkeypatch.setattr(catalogue, "approaches", lambda maps, group, cycles, report: [None] * len(cycles))
+    slow = fj.bistability_map(scene, progress=False, **axes)
+    for name in ("verdict", "amplitude"):
+        np.testing.assert_array_equal(fast[name], slow[name])
+    by_approach = fast["proof"] == fj.Proof.APPROACH
+    assert not np.any(slow["proof"] == fj.Proof.APPROACH) and np.sum(by_approach) >= 8
+    assert np.all(slow["proof"].values[by_approach.values] == fj.Proof.ELLIPSOID)
+    earlier = (fast["decided_at"] / slow["decided_at"]).values[by_approach.values]
+    assert np.all(earlier <= 1) and np.median(earlier) < 0.7
