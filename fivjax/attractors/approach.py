@@ -1,12 +1,11 @@
 """The approach to a stable cycle: a tube about paths that lead into it, which captures from further away than its ellipsoid.
 
 The ellipsoid in which a cycle's return map contracts (`neighbourhood`) ends where motions begin to pass through other events.
-Next to a grazing that is near, though motions come in from far away. So motions are started about the cycle and followed until
-its ellipsoid has them; the states through which they come make a set. What starts on the edge of a tube about that set is
-followed, too: if all of it comes back to well within the tube, and stays there, the tube is drawn in as one about a torus is
-(`tori`), and with it to the cycle. A trajectory is captured once its crossings in a row lie in half of the tube.
-
-This holds for a cycle on a locked torus as well: the paths then go about the torus.
+Next to a grazing that is near, though motions come in from far away; and on a locked torus they creep along the torus first. So
+motions are started about the cycle. Some of them, pilots, are followed until its ellipsoid has them, the others until they have
+come to where the pilots were. The states through which they come make a set. What starts on the edge of a tube about that set
+is followed, too: if all of it comes back to well within the tube, and stays there, the tube is drawn in as one about a torus
+is (`tori`), and with it to the cycle. A trajectory is captured once its crossings in a row lie in half of the tube.
 """
 
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps
+from ..section.return_maps import ReturnMaps, Section
 from . import tube
 from .cycles import CROSSINGS, StableCycle, capturing_cycles
 from .motions import Motions
@@ -27,16 +26,14 @@ class Ways(NamedTuple):
 
     away: float  # their distance from it in the beginning, relative to its size
     settling: int  # returns before states count
-    kept: int  # returns whose states count
-    led: int  # of `STARTS` motions so many have to lead into the cycle
+    kept: int  # returns whose states count; of pilots all do
 
 
-# Into a cycle of few crossings; the furthest distance from which all lead in counts. And about a torus that is locked to a
-# cycle of many, along which it takes long.
-ABOUT = Ways(0.25, 0, 48, tube.STARTS), Ways(0.06, 0, 48, tube.STARTS)
-LOCKED = (Ways(tube.RADIUS, 48, 128, 4),)
-# The most returns in which motions are followed until they lead into a cycle.
-LONGEST = 16384
+ABOUT = Ways(0.1, 0, 32)
+# About a torus that is locked to a cycle of many crossings: along it motions take long.
+LOCKED = Ways(tube.RADIUS, 48, 128)
+# Motions that are followed until they lead into a cycle, and the most returns in which they do.
+PILOTS, LONGEST = 4, 16384
 
 
 class Approach(NamedTuple):
@@ -51,32 +48,36 @@ def approaches(
 ) -> list[Approach | None]:
     """The approaches to cycles, each of its `group`; None where a tube about none was seen to be drawn in."""
     found: list[Approach | None] = [None] * len(cycles)
-    # Where the neighbourhood is as wide as half of the tube, that says enough.
-    small = [k for k, cycle in enumerate(cycles) if cycle.reach < 0.5 * tube.RADIUS]
+    # Where motions come from the edge of a tube to the neighbourhood in fewer returns than this, that says enough.
+    worthwhile = 96
+    small = [k for k, cycle in enumerate(cycles) if _returns_from(cycle, 0.5 * tube.RADIUS) > worthwhile]
     locked = [k for k in small if len(cycles[k].points) > CROSSINGS]
-    for chosen, kinds in ([k for k in small if k not in locked], ABOUT), (locked, LOCKED):
-        for ways in kinds:
-            chosen = [k for k in chosen if found[k] is None]
-            if not chosen:
-                break
-            report(0)
-            states = _ways_in(maps, group[chosen], [cycles[k] for k in chosen], ways)
-            tried = [
-                (k, Approach(cycles[k], Tube(own, tube.RADIUS)))
-                for k, own in zip(chosen, states, strict=True)
-                if own is not None
-            ]
-            own = group[[k for k, _ in tried]]
-            for place in _drawn_in(maps, own, [one for _, one in tried], report).tolist():
-                k, found[k] = tried[place]
+    for chosen, ways in ([k for k in small if k not in locked], ABOUT), (locked, LOCKED):
+        if not chosen:
+            continue
+        report(0)
+        states = _ways_in(maps, group[chosen], [cycles[k] for k in chosen], ways, report)
+        led = [k for k, one in zip(chosen, states, strict=True) if one is not None]
+        tried = [
+            Approach(cycles[k], Tube(one, tube.RADIUS))
+            for k, one in zip(chosen, states, strict=True)
+            if one is not None
+        ]
+        for place in _drawn_in(maps, group[led], tried, report).tolist():
+            found[led[place]] = tried[place]
     return found
 
 
+def _returns_from(cycle: StableCycle, away: float) -> float:
+    """Returns in which motions so far from a cycle, relative to its size, come to its neighbourhood by its multiplier."""
+    return np.log(max(away / cycle.reach, 1.0)) * len(cycle.points) / (1 - cycle.multiplier)
+
+
 def _ways_in(
-    maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], ways: Ways
+    maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], ways: Ways, report
 ) -> list[Float[np.ndarray, "k 2n"] | None]:
     """The weighted states through which motions come into each cycle that start about it, the first of all motions first; None
-    where they do not.
+    where they do not: pilots come into its neighbourhood, and the others to where those have been.
     """
     count, size = tube.STARTS, len(maps.weights)
     about = [Tube(np.resize(maps.weights * cycle.points, (count, size)), ways.away) for cycle in cycles]
@@ -84,30 +85,56 @@ def _ways_in(
     if ways.settling:
         at = maps.returns(own, at, ways.settling).at
     at, paths = maps.path(own, at, ways.kept)
-    done, each = ways.settling + ways.kept, np.arange(len(own)).reshape(-1, count)
-    ok = np.all(np.isfinite(paths).reshape(len(cycles), -1), axis=1)
-    # Twice as long as it takes to come in by the cycle's multiplier.
-    nearer = np.log(np.maximum([ways.away / cycle.reach for cycle in cycles], np.e))
-    needed = [len(cycle.points) * factor for cycle, factor in zip(cycles, nearer, strict=True)]
-    within = done + tube.HOME + 2 * np.array(needed) / [1 - cycle.multiplier for cycle in cycles]
+    paths = np.swapaxes((maps.weights * paths).reshape(len(cycles), count, ways.kept, size), 1, 2)
+    each = np.arange(len(own)).reshape(-1, count)
+    onward = _led_in(maps, Motions(own, at), each[:, :PILOTS], cycles, ways)
+    led = {k: states for k, states in enumerate(onward) if states is not None and np.all(np.isfinite(paths[k]))}
+    found: list[Float[np.ndarray, "k 2n"] | None] = [None] * len(cycles)
+    if led:
+        rows = list(led)
+        tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), *led[k]]), tube.RADIUS) for k in rows]
+        others = at.rows(each[rows, PILOTS:].ravel())
+        for place in tubes_returned_to(maps, group[rows], tubes, others, report)[0].tolist():
+            k = rows[place]
+            found[k] = np.concatenate([paths[k].reshape(-1, size), *led[k]])
+    return found
+
+
+def _led_in(
+    maps: ReturnMaps, motions: Motions, each: Int[np.ndarray, "c pilots"], cycles: list[StableCycle], ways: Ways
+) -> list[list[Float[np.ndarray, "k 2n"]] | None]:
+    """Further weighted states of pilots, which have these rows for each cycle, until they are in its neighbourhood; None where
+    they do not come there in twice the time that the cycle's multiplier says.
+    """
+    within = np.array([ways.kept + tube.HOME + 2 * _returns_from(cycle, ways.away) for cycle in cycles])
+    states: list[list | None] = [[] for _ in cycles]
     # Of a torus that is locked weakly it is enough that it is drawn in: on a closed curve that has a periodic motion all others
     # come to such ones.
-    led = np.where((within <= LONGEST) | (ways.led == count), ways.led, 0)
-    left = np.repeat(ok, count) & (np.arange(len(own)) % count < np.repeat(led, count))
+    weakly = np.array([len(cycle.points) > CROSSINGS for cycle in cycles]) & (within > LONGEST)
+    within = np.minimum(within, LONGEST)
+    left = np.zeros(len(motions.group), bool)
+    left[each[~weakly]] = True
+    of, at, done = np.zeros(len(left), int), Section(*(part.copy() for part in motions.at)), ways.kept
+    of[each] = np.arange(len(cycles))[:, None]
     while True:
         asked = [(rows[left[rows]], cycle) for rows, cycle in zip(each, cycles, strict=True)]
-        left[capturing_cycles(maps, Motions(own, at), at.y, asked) >= 0] = False
-        # One that is late tells of all of its cycle.
-        ok &= ~np.any(left[each], axis=1) | (done < np.minimum(within, LONGEST))
-        left &= np.repeat(ok, count)
+        left[capturing_cycles(maps, Motions(motions.group, at), at.y, asked) >= 0] = False
+        for k in np.unique(of[left]).tolist():
+            # One that is late tells of all.
+            if done >= within[k] or not np.all(np.isfinite(at.y[each[k]])):
+                states[k] = None
+                left[each[k]] = False
         rows = np.flatnonzero(left)
         if not len(rows):
-            break
+            return states
         further = max(tube.HOME, done // 4)
-        at.put(rows, maps.returns(own[rows], at.rows(rows), further).at)
+        ends, paths = maps.path(motions.group[rows], at.rows(rows), further)
+        at.put(rows, ends)
+        for row, path in zip(rows.tolist(), maps.weights * paths, strict=True):
+            part = states[of[row]]
+            assert part is not None
+            part.append(path)
         done += further
-    states = np.swapaxes((maps.weights * paths).reshape(len(cycles), count, ways.kept, size), 1, 2)
-    return [one.reshape(-1, size) if good else None for one, good in zip(states, ok, strict=True)]
 
 
 def _drawn_in(maps: ReturnMaps, group: Int[np.ndarray, " a"], tried: list[Approach], report) -> Int[np.ndarray, " d"]:

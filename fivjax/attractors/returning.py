@@ -21,7 +21,7 @@ def tubes_returned_to(
     """To which tubes all `starts` come back, within so many crossings; and where the starts are then, tube by tube. The first
     few starts tell most sets that do not attract.
     """
-    weights, count, first, within = maps.weights, tube.STARTS, 4, 1536
+    weights, count, first, within = maps.weights, len(starts.y) // len(tubes), 4, 1536
     own, last = np.repeat(group, count), Section(*(part.copy() for part in starts))
     back, ok = np.zeros(len(own), bool), np.ones(len(tubes), bool)
     smallest = np.array([np.min(np.linalg.norm(one.states, axis=1)) for one in tubes])

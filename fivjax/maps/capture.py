@@ -63,7 +63,7 @@ class Capture:
         self.most_time = 20000.0 * np.asarray(batch.shared.tree.modes.slowest_period)
 
     def _catalogue(self, maps: ReturnMaps, known: dict[int, Attractors]) -> Catalogue:
-        return Catalogue(maps, known, self.report, from_afar=True)
+        return Catalogue(maps, known, self.report, self.batch.task.from_afar)
 
     def _return_maps(self) -> ReturnMaps:
         batch, tree, kernels = self.batch, self.batch.shared.tree, self.batch.kernels

@@ -64,6 +64,7 @@ class Task(NamedTuple):
     limits: Limits = Limits()
     width: int = 1  # trajectories of a group in a row of a block
     many: bool = False  # whether there are so many trajectories that fully optimised code repays its compilation
+    from_afar: bool = True  # whether groups have so many that it repays to find the approaches to cycles
 
     @property
     def by_kernel(self) -> bool:

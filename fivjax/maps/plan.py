@@ -238,6 +238,8 @@ def plan_of(
         # costs four times as much as one in a full row.
         width=side_by_side if in_rows <= 4 * total else 1,
         many=total >= MANY,
+        # To find an approach takes about as long as to follow so many trajectories to a cycle's neighbourhood.
+        from_afar=of_group >= 32,
     )
     waiting = set(later)
     first = [number for number in range(len(jobs)) if number not in waiting]

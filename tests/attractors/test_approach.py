@@ -14,7 +14,7 @@ from fivjax.attractors.motions import Motions
 from fivjax.attractors.neighbourhood import Neighbourhood
 from fivjax.section.return_maps import Images, Section
 
-STABLE, GROWTH = 4.0, 0.2
+STABLE, GROWTH = 4.0, 0.01
 
 
 class Line:
@@ -49,9 +49,9 @@ def cycle_of(unstable: float) -> StableCycle:
     return StableCycle(y[None], 0.1, multiplier, STABLE, Neighbourhood(y, 1, 1.0, np.eye(4), 1e-4, multiplier, 1))
 
 
-@pytest.mark.parametrize(("unstable", "nearest"), [(0.5, 3.0), (3.5, 3.76), (3.7, None), (3.95, None)])
+@pytest.mark.parametrize(("unstable", "nearest"), [(0.5, 3.6), (3.2, 3.6), (3.5, None), (3.95, None)])
 def test_an_approach_ends_before_an_unstable_cycle(unstable, nearest):
-    """A tube is drawn in only where its edge is, too; a closer unstable cycle leaves a shorter approach, or none."""
+    """A tube is drawn in only where its edge is, too: next to an unstable cycle there is none."""
     maps, cycle = Line(unstable), cycle_of(unstable)
     (found,) = approaches(maps, np.zeros(1, int), [cycle], lambda count: None)  # type: ignore[arg-type]
     assert (found is None) == (nearest is None)
@@ -81,16 +81,16 @@ def test_an_approach_with_another_cycle_in_it_is_left_out():
 
 
 def test_a_map_by_approaches_says_what_it_says_by_neighbourhoods_alone(monkeypatch):
-    """Every verdict and every amplitude, of cycles of one crossing and of locked tori; in less time of the motion."""
-    axes = {"mu": np.array([0.2, 0.28]), "p": np.linspace(1.5, 3.0, 5), "belt_speed": np.array([1.0, 3.0])}
-    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=1.0, load=fj.Pulse(100.0, 1.2))
+    """Every verdict and every amplitude, of cycles on locked tori; in less time of the motion."""
+    axes = {"mu": np.array([0.165, 0.28]), "p": np.linspace(1.5, 3.0, 32)}
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=3.0, load=fj.Pulse(100.0, 1.2))
     fast = fj.bistability_map(scene, progress=False, **axes)
     monkeypatch.setattr(catalogue, "approaches", lambda maps, group, cycles, report: [None] * len(cycles))
     slow = fj.bistability_map(scene, progress=False, **axes)
     for name in ("verdict", "amplitude"):
         np.testing.assert_array_equal(fast[name], slow[name])
     by_approach = fast["proof"] == fj.Proof.APPROACH
-    assert not np.any(slow["proof"] == fj.Proof.APPROACH) and np.sum(by_approach) >= 8
+    assert not np.any(slow["proof"] == fj.Proof.APPROACH) and np.sum(by_approach) >= 40
     assert np.all(slow["proof"].values[by_approach.values] == fj.Proof.ELLIPSOID)
     earlier = (fast["decided_at"] / slow["decided_at"]).values[by_approach.values]
     assert np.all(earlier <= 1) and np.median(earlier) < 0.7
