@@ -24,9 +24,10 @@ COMPILED_FOR_TESTS = (
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
 LONGEST = (
-    "maps cea gradients energy oracle several_contacts calibrate contact steppers tradeoff kernels kernel_functions creeping "
-    "returns_by_kernels several_sliding cycles calibration_goodness attractor properties branches simulate extending "
-    "verdicts standstill proofs_side_by_side basins several_maps design smallest_kick reproduce sampling notebooks"
+    "maps gradients oracle kernels several_contacts energy cea creeping steppers calibrate properties contact cycles "
+    "kernel_functions calibration_goodness branches tradeoff simulate extending attractor several_sliding verdicts "
+    "returns_by_kernels notebooks basins damaged_stores checkpoint smallest_kick kept_programs reproduce standstill design "
+    "several_maps proofs_side_by_side nearby_cycle sampling"
 )
 LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
 

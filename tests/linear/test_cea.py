@@ -489,9 +489,9 @@ def test_a_slope_is_right_with_the_options_that_compile_quickly(options):
 
     with jax.enable_x64(True):
         mu = jnp.asarray(0.99)
-        value, slope = jax.jit(
-            lambda mu: jax.jvp(instability, (mu,), (jnp.ones_like(mu),)), compiler_options=options
-        )(mu)
+        value, slope = jax.jit(lambda mu: jax.jvp(instability, (mu,), (jnp.ones_like(mu),)), compiler_options=options)(
+            mu
+        )
     assert value == pytest.approx(instability(0.99), rel=1e-12)
     assert slope == pytest.approx(reference.difference(instability, 0.99, 1e-5), rel=1e-6)
 
