@@ -11,7 +11,7 @@ from ..model.scene import Scene
 from ..model.structure import Structure
 from .critical import stability_limit
 from .mode_coupling import coalescence
-from .mode_following import HALVINGS, LOOKS, Sampler
+from .mode_following import HALVINGS, LOOKS, Sampler, match_modes
 from .several_contacts import free_coordinates, one_contact
 from .system import with_axes
 

@@ -21,7 +21,7 @@ from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real
 from .contact_point import ContactPoint, directions, resolve_contacts
-from .matrix_checks import check_matrix, check_shapes
+from .matrix_checks import check_matrix, check_names, check_shapes
 from .printing import as_call
 
 
