@@ -39,12 +39,12 @@ import diffrax, jax.numpy as jnp
 diffrax.diffeqsolve(diffrax.ODETerm(lambda t, y, args: -y), diffrax.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(6)).ys.block_until_ready()
 """
 CALLS = {
-    "simulate": SCENE + "fj.simulate(scene, 1.0)",
-    "grad of a loss on simulate": DERIVATIVE,
-    "limit_cycle": SCENE + "fj.limit_cycle(scene)",
-    "saddle_cycle": SCENE + "fj.saddle_cycle(scene)",
-    "critical_perturbation, derivatives": SCENE + "fj.critical_perturbation(scene, derivatives=True)",
-    "continue_cycle": SCENE + "fj.continue_cycle(scene, 'mu', (0.2, 0.25))",
+    "`simulate`, 1 s": SCENE + "fj.simulate(scene, 1.0)",
+    "`jax.grad` of a loss on it": DERIVATIVE,
+    "`limit_cycle`": SCENE + "fj.limit_cycle(scene)",
+    "`saddle_cycle`": SCENE + "fj.saddle_cycle(scene)",
+    "`critical_perturbation`, with derivatives": SCENE + "fj.critical_perturbation(scene, derivatives=True)",
+    "`continue_cycle`, μ from 0.2 to 0.25": SCENE + "fj.continue_cycle(scene, 'mu', (0.2, 0.25))",
 }
 
 
@@ -58,13 +58,13 @@ def cpu_seconds(code: str, cache: str) -> float:
 
 
 def first(names) -> None:
-    print("| first call in a fresh process | CPU, s | in first solves of diffrax | with nothing built, s | the same |")
-    print("|---|---|---|---|---|")
+    print("| first call in a fresh process | CPU with kernels kept, in solves of diffrax | with nothing built |")
+    print("|---|---|---|")
     for name in names:
         with tempfile.TemporaryDirectory() as cache:
             own = [(cpu_seconds(CALLS[name], cache), cpu_seconds(DIFFRAX, cache)) for _ in range(2)]
         (built, solve), (kept, again) = own
-        print(f"| {name} | {kept:.2f} | {kept / again:.2f} | {built:.2f} | {built / solve:.2f} |", flush=True)
+        print(f"| {name} | {kept:.1f} s, {kept / again:.1f} | {built:.1f} s, {built / solve:.1f} |", flush=True)
 
 
 def finished(function, *args) -> None:
@@ -94,8 +94,12 @@ def warm() -> None:
 
     for _ in range(120):
         fj.simulate(scene, 0.01)
-    print(f"simulate, 1 s, 10,001 rows: {milliseconds(lambda: fj.simulate(scene, 1.0)):.2f} ms")
-    print(f"simulate, 1 s, 101 rows: {milliseconds(lambda: fj.simulate(scene, 1.0, 1e-2)):.2f} ms")
+    print("| later calls | figure |")
+    print("|---|---|")
+    print(
+        f"| `simulate`, 1 s of motion, 146 events, 10,001 rows | {milliseconds(lambda: fj.simulate(scene, 1.0)):.2f} ms |"
+    )
+    print(f"| the same with 101 rows | {milliseconds(lambda: fj.simulate(scene, 1.0, 1e-2)):.2f} ms |")
     with jax.enable_x64(True):
         for count in (2, len(names)):
             some = names[7 : 7 + count] if count == 2 else names
@@ -107,15 +111,15 @@ def warm() -> None:
 
             both = jax.jit(jax.value_and_grad(of))
             taken = milliseconds(functools.partial(finished, both, values))
-            print(f"value and gradient by {count}, jitted: {taken:.2f} ms")
+            print(f"| value and gradient of a loss on 1 s, jitted, by {count} parameters | {taken:.2f} ms |")
     searches = {
-        "limit_cycle": lambda: fj.limit_cycle(scene),
-        "saddle_cycle": lambda: fj.saddle_cycle(scene),
-        "critical_perturbation, derivatives": lambda: fj.critical_perturbation(scene, derivatives=True),
-        "continue_cycle, mu 0.2 to 0.25": lambda: fj.continue_cycle(scene, "mu", (0.2, 0.25)),
+        "`limit_cycle`, with the neighbourhood that it draws in": lambda: fj.limit_cycle(scene),
+        "`saddle_cycle`": lambda: fj.saddle_cycle(scene),
+        "`critical_perturbation`, with derivatives": lambda: fj.critical_perturbation(scene, derivatives=True),
+        "`continue_cycle`, 31 points": lambda: fj.continue_cycle(scene, "mu", (0.2, 0.25)),
     }
     for name, call in searches.items():
-        print(f"{name}: {milliseconds(call, 5):.0f} ms", flush=True)
+        print(f"| {name} | {milliseconds(call, 5):.0f} ms |", flush=True)
 
 
 def bulk() -> None:
@@ -134,23 +138,28 @@ def bulk() -> None:
     kinds = {
         "constant friction": lambda mu, v, pulse: fj.Scene(one, fj.Coulomb(mu), v, pulse),
         "falling friction": lambda mu, v, pulse: fj.Scene(one, fj.ExponentialDecay(mu, 0.9 * mu, 0.5), v, pulse),
-        "two contacts": lambda mu, v, pulse: fj.Scene(two, fj.Coulomb(mu), [v, 1.003 * v], pulse),
+        "two contacts, six coordinates": lambda mu, v, pulse: fj.Scene(two, fj.Coulomb(mu), [v, 1.003 * v], pulse),
     }
     ranges = {
-        "mixed": ((0.15, 0.2275), (1.0, 3.0), (1.1, 1.6)),
-        "on the cycle": ((0.22, 0.2275), (1.0, 1.5), (1.25, 1.6)),
-        "quiet": ((0.05, 0.15), (2.9, 3.0), (1.1, 1.3)),
+        "of random scenes": ((0.15, 0.2275), (1.0, 3.0), (1.1, 1.6)),
+        "on limit cycles": ((0.22, 0.2275), (1.0, 1.5), (1.25, 1.6)),
+        "without events": ((0.05, 0.15), (2.9, 3.0), (1.1, 1.3)),
     }
     how = motion.How(fj.EventExact(), False)
+    print(
+        f"| cycles of vibration per CPU second, 512 trajectories in one call (`engine bulk`) | {' | '.join(ranges)} |"
+    )
+    print("|---" * (1 + len(ranges)) + "|")
     for kind, make in kinds.items():
-        for what, ends in ranges.items():
+        told: dict[int, list[str]] = {0: [], 2: []}
+        for ends in ranges.values():
             rng, rows, form = np.random.default_rng(3), [], None
             for mu, v, p in zip(*(rng.uniform(*end, lanes) for end in ends), strict=True):
                 scene = make(float(mu), float(v), fj.Pulse(100.0, float(p)))
                 start = np.append(fj.sliding_equilibrium(scene), np.zeros(scene.structure.size))
                 form, arrays = Form.of((scene, start, np.asarray(4000, np.int32), how))
                 rows.append(np.concatenate([np.ravel(array).astype(float) for array in arrays]))
-            given, told = np.array(rows), []
+            given = np.array(rows)
             numbers = [array.size for array in form.arrays]
             # The derivatives by friction and belt speed, for constant friction.
             moved = [jax.tree.leaves((scene, start))[place] for place in range(len(numbers) - 1)]
@@ -164,8 +173,13 @@ def bulk() -> None:
                     else:
                         motion._by_kernel.of_many(form, given, times)
                     best = min(best, time.process_time() - begin)
-                told.append(f"{68 * lanes / best:.3g}{' with two directions' * bool(directions)}")
-            print(f"{kind}, {what}: {', '.join(told)} cycles per CPU s", flush=True)
+                told[directions].append(f"{68 * lanes / best:.1e}".replace("e+0", "e"))
+        for directions, figures in told.items():
+            if figures:
+                print(
+                    f"| {'the same with derivatives in two directions' if directions else kind} | {' | '.join(figures)} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

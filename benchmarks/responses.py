@@ -3,10 +3,11 @@
     python -m benchmarks.responses
 
 256 responses of half a second (34 cycles each) with 201 rows, for frictions between 0.2 and 0.227. Each row: wall time in ms, cycles
-of all responses per second, and that relative to the C++ (`tests/helpers/reference`, one call a scene in one thread, the same rows; fivjax has all cores).
-Best of five; compilation is not counted.
+of all responses per second, and that relative to the C++ (`tests/helpers/reference`, one call a scene in one thread, the same rows;
+fivjax has all cores). Best of five; compilation is not counted.
 """
 
+import os
 import time
 
 import jax
@@ -51,20 +52,22 @@ def main() -> None:
     scenes = [reference.of_scene(SCENE.replace(mu=float(mu))) for mu in FRICTIONS]
     by_hand = best(lambda: [reference.trajectory(scene, DURATION, times, 2000, 2000) for scene in scenes])
     cycles = LANES * DURATION * FREQUENCY
-    print(f"C++, one thread: {1e3 * by_hand:.1f} ms, {cycles / by_hand:.3g} cycles/s")
+    print(
+        f"| `jit` of `vmap` of {LANES} responses of {DURATION:g} s with {ROWS} rows, {os.cpu_count()} cores (`responses`) | time | "
+        "cycles per second | relative to hand-written C++ in one thread |"
+    )
+    print("|---|---|---|---|")
     ways = {
         "values": velocity,
-        "value and derivative by friction, forward": lambda mu, k1: jax.jvp(lambda mu: velocity(mu, k1), (mu,), (1.0,)),
-        "value and two derivatives, forward": both,
-        "gradient by two, reverse": jax.grad(loss, (0, 1)),
+        "and the derivative by friction, forward": lambda mu, k1: jax.jvp(lambda mu: velocity(mu, k1), (mu,), (1.0,)),
+        "and the derivatives by friction and stiffness, forward": both,
+        "the gradient of a loss by both, reverse": jax.grad(loss, (0, 1)),
     }
     for name, function in ways.items():
         compiled = jax.jit(jax.vmap(function))
         seconds = best(lambda compiled=compiled: jax.block_until_ready(compiled(FRICTIONS, STIFFNESSES)))
-        print(
-            f"{name}: {1e3 * seconds:.1f} ms, {cycles / seconds:.3g} cycles/s, {by_hand / seconds:.2f} of C++",
-            flush=True,
-        )
+        rate = f"{cycles / seconds:.1e}".replace("e+0", "e")
+        print(f"| {name} | {1e3 * seconds:.0f} ms | {rate} | {by_hand / seconds:.1f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -56,10 +56,10 @@ from .model.sparse_structure import SparseStructure as SparseStructure
 from .model.structure import Structure as Structure
 from .notebook.display import show as show
 from .notebook.explore import explorer as explorer
-from .paper.report import reproduce as reproduce
 from .plot import plot_calibration as plot_calibration
 from .plot import plot_energy as plot_energy
 from .plot import plot_linear as plot_linear
+from .reproduction import reproduce as reproduce
 from .simulation import energy as energy
 from .simulation.differentiation import Derivatives as Derivatives
 from .simulation.differentiation import derivatives as derivatives

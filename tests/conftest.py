@@ -10,13 +10,24 @@ import pytest
 import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
+FLAGS = "XLA_FLAGS"
+
+# Tests run most programs once or twice, so they wait for the compiler and not for what it has compiled. Without LLVM's
+# optimisations, and without parts that are compiled side by side, it takes less than half of the time. At this level LLVM would
+# choose instructions by a quick way, too (`fast-isel`), which makes wrong programs (`COMPILED_QUICKLY` in `compiling`): by the
+# thorough one the results are right. For a run as users compile, set `XLA_FLAGS`, which may be empty.
+COMPILED_FOR_TESTS = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_backend_extra_options=-fast-isel=false "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
 LONGEST = (
-    "maps cea gradients energy oracle several_contacts calibrate contact steppers tradeoff kernels kernel_functions creeping "
-    "returns_by_kernels several_sliding cycles calibration_goodness attractor properties branches simulate extending "
-    "verdicts standstill proofs_side_by_side basins several_maps design smallest_kick reproduce sampling notebooks"
+    "maps gradients oracle kernels several_contacts energy cea creeping steppers calibrate properties contact cycles "
+    "kernel_functions calibration_goodness branches tradeoff simulate extending attractor several_sliding verdicts "
+    "returns_by_kernels notebooks basins damaged_stores checkpoint smallest_kick kept_programs reproduce standstill design "
+    "several_maps proofs_side_by_side nearby_cycle sampling"
 )
 LONGEST = {f"test_{name}.py": place for place, name in enumerate(LONGEST.split())}
 
@@ -28,6 +39,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     # What JAX traces is kept, so that looking for rubbish among it at JAX's pace takes a tenth of the time and finds little.
     gc.set_threshold(200_000, 20, 20)
+    # Studies of minutes are worth optimising.
+    if "not slow" in config.option.markexpr:
+        os.environ.setdefault(FLAGS, COMPILED_FOR_TESTS)
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")

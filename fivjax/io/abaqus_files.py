@@ -28,10 +28,10 @@ def matrices(path: Path) -> dict[str, FileMatrix]:
     text = text_of(path)
     if re.search(r"^\s*\*USER ELEMENT", text, re.IGNORECASE | re.MULTILINE):
         return _substructure(path, text)
-    return {path.stem: _generated(path, text)}
+    return {path.stem: _matrix_input(path, text)}
 
 
-def _generated(path: Path, text: str) -> FileMatrix:
+def _matrix_input(path: Path, text: str) -> FileMatrix:
     place, lines = f"File `{path}`", text.splitlines()
     symmetric = None
     numbers, kept = [], []
@@ -67,7 +67,7 @@ def _generated(path: Path, text: str) -> FileMatrix:
             f"{place}, line {line}: rows and columns are numbered from 1, and internal ones from -1, but one is 0. "
             f"Write it again."
         )
-    rows, columns = (_labelled(part) for part in (labels[:, :count], labels[:, count:]))
+    rows, columns = (_with_directions(part) for part in (labels[:, :count], labels[:, count:]))
     numbers = np.array(numbers)
     if symmetric:
         kept, values = _one_of_each(place, rows, columns, values, numbers)
@@ -78,7 +78,7 @@ def _generated(path: Path, text: str) -> FileMatrix:
     return found._replace(labels=None, rows=tuple(label.node for label in found.labels or ()))
 
 
-def _labelled(labels: np.ndarray) -> np.ndarray:
+def _with_directions(labels: np.ndarray) -> np.ndarray:
     """Pairs of node and direction; what is only numbered has direction 0."""
     found = labels.astype(np.int64)
     return found if found.shape[1] == 2 else np.hstack([found, np.zeros_like(found)])
@@ -182,7 +182,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
     nodes: list[int] = []
     directions: dict[int, list[int]] = {}
     values: dict[str, list[float]] = {}
-    begun: dict[str, int] = {}
+    first_line: dict[str, int] = {}
     reading, listing, symmetric, count = "", False, True, 0
     for number, line in enumerate(text.splitlines(), 1):
         stripped, here = line.strip(), f"{place}, line {number}"
@@ -207,7 +207,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
                 reading = options.get("TYPE", "")
                 if reading in values or not reading:
                     raise ValueError(f"{here}: `*MATRIX` must say a `TYPE` of its own, but is {stripped!r}.")
-                values[reading], begun[reading] = [], number
+                values[reading], first_line[reading] = [], number
             else:
                 reading = ""  # load vectors and recovery matrices are not needed
         elif reading == "directions":
@@ -236,7 +236,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
         raise ValueError(f"{place} holds no `*MATRIX`. Write it with `STIFFNESS=YES, MASS=YES`.")
     return {
         name: FileMatrix(
-            _filled(f"{place}, line {begun[name]}: `{name}`", numbers, len(labels), symmetric),
+            _fill(f"{place}, line {first_line[name]}: `{name}`", numbers, len(labels), symmetric),
             tuple(labels),
             f"{place}, matrix `{name}`",
         )
@@ -251,7 +251,7 @@ def _integer(place: str, entry: str) -> int:
         raise ValueError(f"{place}: {entry!r} is no whole number. Write the file again, or mend the line.") from None
 
 
-def _filled(place: str, values: list[float], size: int, symmetric: bool) -> sparse.csr_array:
+def _fill(place: str, values: list[float], size: int, symmetric: bool) -> sparse.csr_array:
     wanted = size * (size + 1) // 2 if symmetric else size * size
     if len(values) != wanted:
         raise ValueError(

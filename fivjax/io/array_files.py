@@ -58,7 +58,7 @@ def _sparse(path: Path, parts: dict[str, np.ndarray]):
         if first.ndim != 2 or len(first) != 2:
             raise unreadable(path, known, f"the places of its entries have shape {first.shape}")
         first, last = first
-    return sparse_parts.listed(path, known, data, first, last, shape)
+    return sparse_parts.triplets(path, known, data, first, last, shape)
 
 
 def _matrices(path: Path, found: dict) -> dict[str, FileMatrix]:

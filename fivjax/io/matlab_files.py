@@ -74,7 +74,7 @@ def _variables(path: Path, content: bytes, order: str) -> dict:
         element = _element(path, whole, at, order)
         at = element.end
         if element.kind == PACKED_ELEMENT:
-            element = _unpacked(path, element.content, order)
+            element = _unpack(path, element.content, order)
         if element.kind != MATRIX:
             raise unreadable(path, KIND, f"an element of type {element.kind} is no variable")
         name, value = _variable(path, element.content, order)
@@ -85,7 +85,7 @@ def _variables(path: Path, content: bytes, order: str) -> dict:
     return found
 
 
-def _unpacked(path: Path, packed: memoryview, order: str) -> _Element:
+def _unpack(path: Path, packed: memoryview, order: str) -> _Element:
     most = max(SMALL, PACKED * len(packed))
     try:
         unpacking = zlib.decompressobj()
@@ -146,7 +146,7 @@ def _variable(path: Path, content: memoryview, order: str) -> tuple[str, object]
         return name, sparse_parts.compressed(path, KIND, "csc", values, numbers[0], numbers[1], where)
     # Whole numbers may be kept in a smaller type.
     wanted_type = np.dtype(classes[kind])
-    return name, _shaped(path, name, values if is_complex else values.astype(wanted_type, copy=False), shape)
+    return name, _reshape(path, name, values if is_complex else values.astype(wanted_type, copy=False), shape)
 
 
 def _numbers(path: Path, element: _Element, order: str) -> np.ndarray:
@@ -168,7 +168,7 @@ def _name(path: Path, element: _Element) -> str:
     return name.decode("ascii")
 
 
-def _shaped(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _reshape(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if math.prod(shape) != len(values):
         raise unreadable(path, KIND, f"variable `{name}` declares shape {shape}, but has {len(values)} numbers")
     return values.reshape(shape, order="F")
@@ -209,4 +209,4 @@ def _old_sparse(path: Path, name: str, table: np.ndarray):
         raise unreadable(path, KIND, f"the sparse variable `{name}` has shape {table.shape}")
     shape = sparse_parts.shape_of(path, KIND, table[-1, :2])
     values = table[:-1, 2] if table.shape[1] == 3 else table[:-1, 2] + 1j * table[:-1, 3]
-    return sparse_parts.listed(path, KIND, values, table[:-1, 0] - 1, table[:-1, 1] - 1, shape)
+    return sparse_parts.triplets(path, KIND, values, table[:-1, 0] - 1, table[:-1, 1] - 1, shape)

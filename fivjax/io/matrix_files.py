@@ -98,7 +98,7 @@ def _usable(path: Path, found: Mapping[str, FileMatrix | str]) -> FileMatrices:
         if reason:
             left_out[name] = reason
         elif isinstance(matrix, FileMatrix):
-            matrices[name] = _checked(matrix)
+            matrices[name] = _check(matrix)
     if not matrices:
         raise ValueError(next(iter(left_out.values()), f"File `{path}` holds no matrix. Write it again."))
     return FileMatrices(matrices, left_out)
@@ -117,7 +117,7 @@ def _reason(found: FileMatrix) -> str:
     return ""
 
 
-def _checked(found: FileMatrix) -> FileMatrix:
+def _check(found: FileMatrix) -> FileMatrix:
     """The matrix without stored zeros.
 
     **Raises:** `ValueError` unless it is finite.

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from .reading_limits import check_length, check_rows, unreadable
-from .sparse_parts import listed
+from .sparse_parts import triplets
 
 KIND = "Matrix Market"
 
@@ -94,7 +94,7 @@ def _array(path: Path, table: np.ndarray, sizes: list[int], field: str, symmetry
     # One triangle, column by column to the last row.
     whole = np.zeros((rows, rows), values.dtype)
     whole.T[np.triu_indices(rows, int(symmetry == "skew-symmetric"))] = values
-    return sparse.csr_array(whole + _mirrored(np.tril(whole, -1), symmetry).T)
+    return sparse.csr_array(whole + _mirror(np.tril(whole, -1), symmetry).T)
 
 
 def _coordinates(path: Path, table: np.ndarray, sizes: list[int], field: str, symmetry: str) -> sparse.csr_array:
@@ -109,7 +109,7 @@ def _coordinates(path: Path, table: np.ndarray, sizes: list[int], field: str, sy
     if table.shape[1] < 2:
         raise unreadable(path, KIND, "an entry must have a row and a column")
     i, j, values = table[:, 0] - 1, table[:, 1] - 1, _values(path, table[:, 2:], field)
-    given = listed(path, KIND, values, i, j, (rows, columns))
+    given = triplets(path, KIND, values, i, j, (rows, columns))
     if symmetry == "general":
         return given
     lower, upper = sparse.tril(given, -1, format="csr"), sparse.triu(given, 1, format="csr")
@@ -117,8 +117,8 @@ def _coordinates(path: Path, table: np.ndarray, sizes: list[int], field: str, sy
     if both.nnz:
         i, j = (int(index[0]) + 1 for index in both.nonzero())
         raise unreadable(path, KIND, f"it is {symmetry}, but gives row {i}, column {j} and its mirror image, too")
-    return sparse.csr_array(given + _mirrored(lower, symmetry).T + _mirrored(upper, symmetry).T)
+    return sparse.csr_array(given + _mirror(lower, symmetry).T + _mirror(upper, symmetry).T)
 
 
-def _mirrored(part, symmetry: str):
+def _mirror(part, symmetry: str):
     return {"symmetric": part, "skew-symmetric": -part, "hermitian": part.conj()}[symmetry]

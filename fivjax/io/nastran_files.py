@@ -95,23 +95,23 @@ def _column(here: str, line: int, fields: list[str]) -> list[tuple]:
 def _cards(place: str, text: str):
     """Each DMIG card with its first line and its fields, without the word DMIG and the marks of continuation."""
     card: list[str] = []
-    begun = 0
+    first_line = 0
     for number, raw in enumerate(text.splitlines(), 1):
         line = raw.split("$")[0].rstrip()
         if not line:
             continue
         if re.match(r"\s*DMIG[\s*,]", line, re.IGNORECASE):
             if card:
-                yield begun, card
-            begun, card = number, _fields(f"{place}, line {number}", line)
+                yield first_line, card
+            first_line, card = number, _fields(f"{place}, line {number}", line)
         elif card and line[0] in "*+, ":
             # A continuation line goes on where the line before ended.
             card += _fields(f"{place}, line {number}", line)
         elif card:
-            yield begun, card
+            yield first_line, card
             card = []
     if card:
-        yield begun, card
+        yield first_line, card
 
 
 def _fields(here: str, line: str) -> list[str]:
@@ -179,6 +179,8 @@ def output4_matrices(path: Path) -> dict:
         else:
             parts[about["name"]] = values
     return {
-        name: sparse_parts.listed(path, kind, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape)
+        name: sparse_parts.triplets(
+            path, kind, parts[f"{name}/data"], parts[f"{name}/row"], parts[f"{name}/col"], shape
+        )
         for name, shape in shapes.items()
     }

@@ -57,7 +57,7 @@ def load_archive(path: Path) -> dict[str, np.ndarray]:
                 name = member.filename.removesuffix(".npy")
                 if name in found:
                     raise unreadable(path, KIND, f"array `{name}` is there twice")
-                found[name] = _array(path, f"array `{name}`: ", _unpacked(path, archive, member))
+                found[name] = _array(path, f"array `{name}`: ", _unpack(path, archive, member))
     except damage as error:
         if isinstance(error, zipfile.BadZipFile) and path.read_bytes()[:1] == b"\x80":
             error = "it holds no arrays of numbers"
@@ -65,7 +65,7 @@ def load_archive(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _unpacked(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+def _unpack(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise unreadable(path, KIND, f"`{member.filename}` is packed in a way that NumPy does not use")
     with archive.open(member) as file:

@@ -44,16 +44,16 @@ def refuse_foreign(file) -> None:
         for name in group:
             full = f"{path}/{name}"
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                raise Refused(f"`{_shown(full)}` is a link to another place or another file, which is not followed")
+                raise Refused(f"`{_printable(full)}` is a link to another place or another file, which is not followed")
             item = group[name]
             info = h5py.h5o.get_info(item.id)
             # A group with two names could hold itself.
             if isinstance(item, h5py.Group):
                 if (info.fileno, info.addr) in seen:
-                    raise Refused(f"the group `{_shown(full)}` is there twice")
+                    raise Refused(f"the group `{_printable(full)}` is there twice")
                 groups.append((full, item))
             elif isinstance(item, h5py.Dataset):
-                _check_dataset(_shown(full), item)
+                _check_dataset(_printable(full), item)
             seen.add((info.fileno, info.addr))
             if len(seen) > OBJECTS or info.num_attrs > ATTRIBUTES:
                 raise Refused(f"it has more than {OBJECTS} parts, or {ATTRIBUTES} attributes")
@@ -85,7 +85,7 @@ def netcdf(path: str, send) -> None:
         file = h5netcdf.File(raw, "r", decode_vlen_strings=True)
         send({"attrs": _attributes(file.attrs)})
         for name, variable in file.variables.items():
-            about = {"name": _named(name), "dims": [_named(dim) for dim in variable.dimensions]}
+            about = {"name": _check_name(name), "dims": [_check_name(dim) for dim in variable.dimensions]}
             _send_array(send, {**about, "attrs": _attributes(variable.attrs)}, variable)
 
 
@@ -96,7 +96,7 @@ def matlab(path: str, send) -> None:
     with h5py.File(path, "r") as file:
         refuse_foreign(file)
         for name, item in file.items():
-            name = _named(name)
+            name = _check_name(name)
             if isinstance(item, h5py.Dataset) and _numeric(item):
                 _send_array(send, {"name": name}, item)
             elif isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
@@ -115,7 +115,7 @@ def output4(path: str, send) -> None:
 
     for name, matrix in op4.read(path, sparse=True, justmatrix=True).items():
         entries = sparse.coo_array(matrix)
-        name = _named(name)
+        name = _check_name(name)
         send({"name": name, "shape": [int(size) for size in entries.shape or ()]})
         for part, values in (("row", entries.row), ("col", entries.col), ("data", entries.data)):
             _send_array(send, {"name": f"{name}/{part}"}, values)
@@ -159,14 +159,14 @@ def _attributes(attrs) -> dict:
     for name in attrs:
         value = attrs[name]
         if isinstance(value, str | bytes):
-            found[_named(name)] = {"text": _text(value)} if isinstance(value, str) else {"bytes": value.hex()}
+            found[_check_name(name)] = {"text": _text(value)} if isinstance(value, str) else {"bytes": value.hex()}
         elif isinstance(value, list):
-            found[_named(name)] = {"texts": [_text(one) for one in value]}
+            found[_check_name(name)] = {"texts": [_text(one) for one in value]}
         elif isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufcSU":
             array = np.asarray(value)
-            found[_named(name)] = {"shape": array.shape, "dtype": array.dtype.str, "hex": array.tobytes().hex()}
+            found[_check_name(name)] = {"shape": array.shape, "dtype": array.dtype.str, "hex": array.tobytes().hex()}
         elif isinstance(value, np.ndarray) and value.dtype.kind == "O":
-            found[_named(name)] = {"texts": [_text(one) for one in value.ravel()]}
+            found[_check_name(name)] = {"texts": [_text(one) for one in value.ravel()]}
     return found
 
 
@@ -179,13 +179,13 @@ def _text(value) -> str:
     return value.decode("utf-8", "replace")
 
 
-def _named(name: str) -> str:
+def _check_name(name: str) -> str:
     if not name.isprintable():
-        raise Refused(f"the name `{_shown(name)}` is damaged")
+        raise Refused(f"the name `{_printable(name)}` is damaged")
     return name
 
 
-def _shown(name: str) -> str:
+def _printable(name: str) -> str:
     return "".join(character if character.isprintable() else "?" for character in name)[:80]
 
 

@@ -35,7 +35,7 @@ def compressed(path: Path, kind: str, by: str, data, indices, starts, shape: tup
     return maker((data, indices, starts), shape=shape)
 
 
-def listed(path: Path, kind: str, data, rows, columns, shape: tuple[int, int]):
+def triplets(path: Path, kind: str, data, rows, columns, shape: tuple[int, int]):
     """A matrix from its entries, each with a row and a column, counted from 0; entries at one place add up.
 
     **Raises:** `ValueError` for parts that do not fit together, and for indices outside the matrix.

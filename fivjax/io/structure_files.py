@@ -84,7 +84,7 @@ def read_structure(
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
     parts, remarks = _parts(Path(path), mass, damping, names)
-    order, numbers, aligned = _aligned(parts, _labels(labels))
+    order, numbers, aligned = _align(parts, _labels(labels))
     held = np.abs(aligned["stiffness"].diagonal()) >= HELD
     if np.any(held):
         aligned = {name: matrix[~held][:, ~held] for name, matrix in aligned.items()}
@@ -137,7 +137,7 @@ def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[st
         own = Path(file) if file is not None else path
         if own not in read:
             read[own] = read_matrices(own)
-        chosen = _chosen(role, own, read[own], names.get(role), alone=file is not None)
+        chosen = _choose(role, own, read[own], names.get(role), alone=file is not None)
         if chosen is not None:
             found[role] = chosen
     if "mass" not in found:
@@ -154,7 +154,7 @@ def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[st
     return found, remarks
 
 
-def _chosen(role: str, path: Path, held: FileMatrices, name: str | None, *, alone: bool) -> FileMatrix | None:
+def _choose(role: str, path: Path, held: FileMatrices, name: str | None, *, alone: bool) -> FileMatrix | None:
     if name is not None:
         if name in held.left_out:
             raise ValueError(held.left_out[name])
@@ -205,7 +205,7 @@ def _labels(labels) -> tuple[Label, ...] | None:
     return found
 
 
-def _aligned(
+def _align(
     parts: dict[str, FileMatrix], labels
 ) -> tuple[tuple[Label, ...] | None, list[int], dict[str, sparse.csr_array]]:
     """Labels, the numbers of nodes (or of rows, where there are no labels), and the matrices with their rows in one order.

@@ -86,7 +86,7 @@ def first_limit(loop: Loop) -> Limit:
         closed = state + jnp.outer(input_, row) * gain / (1 - gain * impulsive)
         return significant_growth(closed) > 0
 
-    def searching(carry):
+    def not_found(carry):
         i, found = carry
         return (i < lower.size) & ~found
 
@@ -94,7 +94,7 @@ def first_limit(loop: Loop) -> Limit:
         i, _ = carry
         return i + 1, ~empty[i] & unstable(between[i])
 
-    i, found = jax.lax.while_loop(searching, step, (jnp.zeros((), jnp.int32), jnp.array(False)))
+    i, found = jax.lax.while_loop(not_found, step, (jnp.zeros((), jnp.int32), jnp.array(False)))
     last = i - 1
     code = jnp.where(found, jnp.where(last == 0, ALWAYS, codes[last - 1]), NEVER)
     at = jnp.maximum(last - 1, 0)
@@ -150,7 +150,7 @@ def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[A
     n = matrix.shape[0]
     shifts = np.array([0.3719, 1.7133, 5.2917])
 
-    def seen_from(shift):
+    def zeros_about(shift):
         inverted = inverse(matrix - shift * np.eye(n))
         seen = row @ inverted
         through = seen @ column
@@ -158,7 +158,7 @@ def _zeros(matrix: Float[Array, "n n"], column: Float[Array, " n"], row: Float[A
         projected = inverted - jnp.outer(column, seen @ inverted) / through
         return projected, jnp.where(jnp.all(jnp.isfinite(projected)), quality, 0.0)
 
-    projected, quality = jax.vmap(seen_from)(shifts)
+    projected, quality = jax.vmap(zeros_about)(shifts)
     # The first of the best. For a loop that is zero or undamped none is usable, and the result is not finite.
     chosen = (quality > 0) & (quality == jnp.max(quality))
     chosen = chosen & (jnp.cumsum(chosen) == 1)

@@ -164,7 +164,7 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
     import xarray as xr
 
     name, quantity, target, larger_is_better = goal
-    bounds, low, width = _checked_bounds(structure, bounds, tied)
+    bounds, low, width = _check_bounds(structure, bounds, tied)
     names = list(bounds)
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
 
@@ -173,7 +173,7 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
         everything = {**structure.parameters, **chosen}
         return {**chosen, **{key: rule(everything) for key, rule in tied.items()}}
 
-    def judged(shares):
+    def loss_and_quantity(shares):
         reached = quantity(structure.replace(**values(shares)))
         return goal.loss(reached), reached
 
@@ -183,7 +183,7 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
     def search(shares):
         def step(carry, _):
             shares, memory = carry
-            (value, reached), gradient = jax.value_and_grad(judged, has_aux=True)(shares)
+            (value, reached), gradient = jax.value_and_grad(loss_and_quantity, has_aux=True)(shares)
             # Where there is no derivative, Adam's averages of the last ones continue the search.
             gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
             updates, memory = optimiser.update(gradient, memory)
@@ -217,7 +217,7 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
     return Design(structure.replace(**parameters), parameters, before, after, target, outcome, name, history)
 
 
-def _checked_bounds(structure: Structure, bounds, tied):
+def _check_bounds(structure: Structure, bounds, tied):
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     if not bounds:
         raise ValueError('Argument `bounds` must name at least one parameter, such as {"k1": (90e3, 110e3)}.')

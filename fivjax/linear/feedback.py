@@ -68,7 +68,7 @@ def friction_loop(structure: Structure, direction: Float[Array, ""]) -> tuple[Lo
     keep = sliding_coordinates(structure.size, structure.normal)
     free = (structure.mass, structure.damping, structure.stiffness)
     rows = [direction * matrix[structure.normal][keep] for matrix in free]
-    return _scaled(Loop(*matrices, _tangential(structure), *rows), time_scale(structure))
+    return _in_natural_units(Loop(*matrices, _tangential(structure), *rows), time_scale(structure))
 
 
 def slope_loop(
@@ -78,7 +78,7 @@ def slope_loop(
     matrices = sliding_matrices(structure, direction * mu)
     column = _tangential(structure)
     zero = jnp.zeros_like(column)
-    return _scaled(Loop(*matrices, column, zero, column, zero), time_scale(structure))
+    return _in_natural_units(Loop(*matrices, column, zero, column, zero), time_scale(structure))
 
 
 def _tangential(structure: Structure):
@@ -86,7 +86,7 @@ def _tangential(structure: Structure):
     return jnp.asarray(keep == structure.tangential, structure.mass.dtype)
 
 
-def _scaled(loop: Loop, scale) -> tuple[Loop, Float[Array, ""]]:
+def _in_natural_units(loop: Loop, scale) -> tuple[Loop, Float[Array, ""]]:
     # Unit masses and frequencies of order one, so that fixed tolerances make sense. L keeps its value.
     size = 1 / jnp.sqrt(jnp.abs(jnp.diagonal(loop.mass)))
     both = jnp.outer(size, size)

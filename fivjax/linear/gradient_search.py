@@ -137,7 +137,7 @@ def search_critical_friction(
             'Argument `route` must be "eigenvalues" for an undamped structure: all its motions are on the limit, so '
             "its Hurwitz determinants are zero at any friction."
         )
-    solution, bracket = _searched(structure, real(start), route, float(highest), direction, max_steps)
+    solution, bracket = _search(structure, real(start), route, float(highest), direction, max_steps)
     mu, steps = float(solution.value), int(solution.stats["num_steps"])
     if bracket.exhausted:
         outcome = StabilityOutcome.NEVER_UNSTABLE
@@ -153,7 +153,7 @@ def search_critical_friction(
 
 # Not `compiling.compiled`: at the root the sign is a matter of rounding, which decides between ten steps and fifty.
 @eqx.filter_jit
-def _searched(structure, start, route, highest, direction, max_steps):
+def _search(structure, start, route, highest, direction, max_steps):
     def instability(mu, structure):
         if route == "eigenvalues":
             return significant_growth(_in_natural_units(structure, mu, direction))

@@ -11,7 +11,7 @@ from ..model.scene import Scene
 from ..model.structure import Structure
 from .critical import stability_limit
 from .mode_coupling import coalescence
-from .mode_following import HALVINGS, LOOKS, Sampler, matched
+from .mode_following import HALVINGS, LOOKS, Sampler, match_modes
 from .several_contacts import free_coordinates, one_contact
 from .system import with_axes
 
@@ -58,7 +58,7 @@ def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | Non
             before, now = followed[-1], samples[k]
             at.looks = LOOKS
             if before is not None and now is not None:
-                now = now.taken(matched(at, values[k - 1], before, values[k], now, HALVINGS))
+                now = now.reorder(match_modes(at, values[k - 1], before, values[k], now, HALVINGS))
             followed.append(now)
             tick()
         dataset = _modes_dataset(scene, name, values, followed)

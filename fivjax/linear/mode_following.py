@@ -26,7 +26,7 @@ class Modes(eqx.Module):
     left: np.ndarray  # (m, 2m), projects a state onto the mode
     right: np.ndarray  # (m, 2m), the mode's state
 
-    def taken(self, order) -> "Modes":
+    def reorder(self, order) -> "Modes":
         return jax.tree.map(lambda array: array[order], self)
 
 
@@ -88,7 +88,7 @@ def _modes_of(matrix: np.ndarray) -> Modes:
     )
 
 
-def _assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _assign(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pairs with the least total cost."""
     # Imported here, because it takes long to load.
     from scipy.optimize import linear_sum_assignment
@@ -96,10 +96,10 @@ def _assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return linear_sum_assignment(cost)
 
 
-def matched(at: Sampler, x0: float, a: Modes, x1: float, b: Modes, halvings: int) -> np.ndarray:
+def match_modes(at: Sampler, x0: float, a: Modes, x1: float, b: Modes, halvings: int) -> np.ndarray:
     """For each mode of `a`, at x0, the index of the same mode in `b`, at x1."""
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
-    rows, order = _assigned(distance)
+    rows, order = _assign(distance)
     moved = distance[rows, order]
     others = np.where(np.arange(len(order))[None, :] == order[:, None], np.inf, distance)
     neighbours = np.minimum(others.min(axis=1, initial=np.inf), _gaps(a.eigenvalue))
@@ -107,10 +107,10 @@ def matched(at: Sampler, x0: float, a: Modes, x1: float, b: Modes, halvings: int
         return order
     middle, half = at.between(x0, x1) if halvings else (x0, None)
     if half is not None:
-        first = matched(at, x0, a, middle, half, halvings - 1)
-        second = matched(at, middle, half, x1, b, halvings - 1)
+        first = match_modes(at, x0, a, middle, half, halvings - 1)
+        second = match_modes(at, middle, half, x1, b, halvings - 1)
         return second[first]
-    return _met(a, b)
+    return _coalescences(a, b)
 
 
 def _gaps(eigenvalues: np.ndarray) -> np.ndarray:
@@ -118,17 +118,17 @@ def _gaps(eigenvalues: np.ndarray) -> np.ndarray:
     return np.where(np.eye(len(eigenvalues), dtype=bool), np.inf, between).min(axis=1, initial=np.inf)
 
 
-def _met(a: Modes, b: Modes) -> np.ndarray:
-    """The same as `matched` where two modes have met between `a` and `b`."""
+def _coalescences(a: Modes, b: Modes) -> np.ndarray:
+    """The same as `match_modes` where two modes have met between `a` and `b`."""
     # Modes that cross without coupling keep their shapes: each left eigenvector of `a` finds only one right one of `b`.
     share = np.abs(a.left @ b.right.T)
-    rows, order = _assigned(-share)
+    rows, order = _assign(-share)
     rest = np.where(np.arange(len(order))[None, :] == order[:, None], 0.0, share)
     if np.all(share[rows, order] > 0.9) and np.all(rest.max(axis=1, initial=0.0) < 0.5):
         return order
     # They met: matched by frequency on one side and by growth rate on the other; all other modes by distance.
     distance = np.abs(a.eigenvalue[:, None] - b.eigenvalue[None, :])
-    _, order = _assigned(distance)
+    _, order = _assign(distance)
     close = np.flatnonzero(_gaps(a.eigenvalue) <= 10 * distance.max(axis=1))
     if len(close) > 1:
         order[close[_ranks(a.eigenvalue[close])]] = order[close][_ranks(b.eigenvalue[order[close]])]

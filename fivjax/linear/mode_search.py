@@ -166,7 +166,7 @@ def _rounding(pencil: Pencil, values, shapes) -> np.ndarray:
     return 2 * ROUNDING * terms / np.maximum(slope + root, np.finfo(float).tiny)
 
 
-def _without_rounding(pencil: Pencil, values, shapes) -> np.ndarray:
+def _round_off(pencil: Pencil, values, shapes) -> np.ndarray:
     """The eigenvalues, those that cannot be told from zero or from real ones made exactly so.
 
     Of two equal real eigenvalues rounding makes a pair, one of which would be left out.
@@ -189,7 +189,7 @@ def _all(pencil: Pencil, band: float):
     finite = np.abs(bottom) > 1e-14 * np.abs(top)
     values, shapes = unit * top[finite] / bottom[finite], vectors[:n, finite]
     # LAPACK's routine for real matrices gives exactly real eigenvalues, and exact pairs.
-    values = _without_rounding(pencil, values, shapes)
+    values = _round_off(pencil, values, shapes)
     chosen = np.flatnonzero((values.imag >= 0) & (values.imag <= band))
     chosen = chosen[np.lexsort((values.real[chosen], values.imag[chosen]))]
     return values[chosen], shapes[:, chosen], np.inf
@@ -228,13 +228,13 @@ def _in_band(pencil: Pencil, band: float):
         inside = (values.imag >= max(low - margin, 0.0)) & (values.imag <= high + margin)
         found += [(value, shape, shifts) for value, shape in zip(values[inside], shapes[:, inside].T, strict=True)]
     found.sort(key=lambda mode: (mode[0].imag, mode[0].real))
-    single = [mode for k, mode in enumerate(found) if not _found_before(mode, found[:k])]
+    single = [mode for k, mode in enumerate(found) if not _is_duplicate(mode, found[:k])]
     single = [mode for mode in single if mode[0].imag <= band]
     shapes = np.stack([mode[1] for mode in single], axis=1) if single else np.zeros((pencil.size, 0), complex)
     return np.array([mode[0] for mode in single]), shapes, strip
 
 
-def _found_before(mode, others) -> bool:
+def _is_duplicate(mode, others) -> bool:
     """Whether a mode is one of those that another shift gave: with their eigenvalue, and a shape in the space of theirs."""
     value, shape, shift = mode
     alike = [other for other in others if other[2] != shift and abs(value - other[0]) <= 1e-6 * abs(value)]
@@ -253,13 +253,13 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
     factors = splu(pencil.at(shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1)
     relative, mass, damping = shift / unit, unit**2 * pencil.mass, unit * pencil.damping
 
-    def inverted(state):
+    def shift_inverse(state):
         # With y = λx/ω, σ = s/ω: (A - σB)⁻¹B of (a, b) solves y - σx = a and -Kx - (ωC + σω²M) y = ω²M b.
         a, b = state[:n], state[n:]
         x = factors.solve(-(mass @ (b + relative * a) + damping @ a))
         return np.concatenate([x, a + relative * x])
 
-    operator = LinearOperator((2 * n, 2 * n), matvec=inverted, dtype=complex)  # pyright: ignore[reportCallIssue]
+    operator = LinearOperator((2 * n, 2 * n), matvec=shift_inverse, dtype=complex)  # pyright: ignore[reportCallIssue]
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
     values, states = eigs(operator, k=min(count, 2 * n - 2), v0=start)  # pyright: ignore[reportAssignmentType]
     values = shift + unit / values
@@ -268,13 +268,13 @@ def near(pencil: Pencil, shift: complex, count: int) -> tuple[np.ndarray, np.nda
     near_real = 1e-4
     close = np.abs(values.imag) <= near_real * unit
     if np.any(close):
-        again, anew = _near_the_real_axis(inverted, shift, states[:, close])
-        again = _without_rounding(pencil, again, anew[:n])
+        again, anew = _near_the_real_axis(shift_inverse, shift, states[:, close])
+        again = _round_off(pencil, again, anew[:n])
         values, states = np.append(values[~close], again), np.hstack([states[:, ~close], anew])
     return values, states[:n]
 
 
-def _near_the_real_axis(inverted, shift: complex, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _near_the_real_axis(shift_inverse, shift: complex, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The eigenvalues of these states, exactly real or in exact pairs, and the states that go with them.
 
     Complex arithmetic puts a real eigenvalue on either side of the real axis. Real and imaginary parts of the states span a
@@ -284,7 +284,7 @@ def _near_the_real_axis(inverted, shift: complex, states: np.ndarray) -> tuple[n
     # Real and imaginary parts of states that depend on each other up to this share are one; the rest is rounding.
     dependent = 1e-9
     basis = columns[:, sizes > dependent * sizes[0]]
-    images = np.stack([inverted(column) for column in basis.T], axis=1)
+    images = np.stack([shift_inverse(column) for column in basis.T], axis=1)
     small = basis.T @ images  # ω(L - s)⁻¹ of the real matrix L that is sought
     found, shapes = np.linalg.eig((shift * np.eye(len(small)) + abs(shift) * np.linalg.inv(small)).real)
     # A direction of rounding alone is no state of the space.

@@ -73,17 +73,17 @@ def polynomial_roots(coefficients) -> Complex[Array, "n ..."]:
     # Simple roots need some fifteen iterations; at a double root each iteration at least triples the precision.
     iterations = 60
 
-    def unsettled(carry):
+    def not_converged(carry):
         iteration, _, change = carry
         return (iteration < iterations) & (jnp.max(change, initial=0.0) > 1e-26)
 
-    def improved(carry):
+    def iterate(carry):
         iteration, roots, _ = carry
         roots, change = _aberth(coefficients, roots)
         return iteration + 1, roots, change
 
     change = jnp.full_like(coefficients[-1], jnp.inf)
-    _, roots, change = jax.lax.while_loop(unsettled, improved, (0, start, change))
+    _, roots, change = jax.lax.while_loop(not_converged, iterate, (0, start, change))
     settled = finite & (change < 1e-8)
     return jnp.stack([jax.lax.complex(jnp.where(settled, x, jnp.nan), y) for x, y in roots])
 

@@ -90,11 +90,11 @@ def _margin(structure, mu, direction):
         coefficients = characteristic_polynomial(mass, damping, stiffness, scale)
         return jnp.min(jnp.stack(hurwitz_determinants(coefficients)))
 
-    def scaled(mass, damping, stiffness):
+    def in_natural_time(mass, damping, stiffness):
         return state_matrix(mass, damping / scale, stiffness / scale**2)
 
-    state = scaled(mass, damping, stiffness)
-    without = scaled(*sliding_matrices(structure, jnp.zeros_like(mu)))
+    state = in_natural_time(mass, damping, stiffness)
+    without = in_natural_time(*sliding_matrices(structure, jnp.zeros_like(mu)))
     return jnp.minimum(
         _relative_determinant(bialternate_sum(state), bialternate_sum(without)), _relative_determinant(state, without)
     )

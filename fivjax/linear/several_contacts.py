@@ -100,7 +100,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     place = jnp.argmax(unstable)
     found, always = jnp.any(unstable), unstable[0] | unstable[1] & _nearly_at_zero(structure, direction)
 
-    def halved(_, ends):
+    def bisect(_, ends):
         low, high = ends
         middle = 0.5 * (low + high)
         above = _growth(structure, middle, direction) > 0
@@ -109,7 +109,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     ends = (looks[jnp.maximum(place - 1, 0)], looks[place])
     # Halvings of the distance between two coefficients: to the last digit.
     halvings = 50
-    low, high = jax.lax.fori_loop(0, halvings, halved, ends)
+    low, high = jax.lax.fori_loop(0, halvings, bisect, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
     values = eigenvalues(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
     omega = jnp.abs(values[jnp.argmax(values.real)].imag)

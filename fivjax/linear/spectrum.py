@@ -42,13 +42,13 @@ def linearisation(system: Structure | Scene, mu=None, *, direction: int = 1) -> 
         >>> fj.cea.linearisation(structure, 0.2).shape
         (4, 4)
     """
-    return _matrix(_checked(system, mu, direction))
+    return _matrix(_check(system, mu, direction))
 
 
 _matrix = compiled(lambda scene: sliding_motion(scene)[0])
 
 
-def _checked(system, mu, direction) -> Scene:
+def _check(system, mu, direction) -> Scene:
     if mu is not None:
         arguments.real_number("mu", mu, minimum=0)
     scene = as_scene(system, mu, direction)
@@ -95,7 +95,7 @@ def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Co
         _check_frictions(mu)
         mu = real(mu)
         return _eigenvalues_over(system, mu.ravel(), direction).reshape(*mu.shape, -1)
-    return _eigenvalues(_checked(system, mu, direction))
+    return _eigenvalues(_check(system, mu, direction))
 
 
 def _check_frictions(mu) -> None:
@@ -134,4 +134,4 @@ def growth_rate(system: Structure | Scene, mu=None, *, direction: int = 1) -> Fl
         >>> bool(fj.cea.growth_rate(structure, 0.3) > 0)
         True
     """
-    return _growth_rate(_checked(system, mu, direction))
+    return _growth_rate(_check(system, mu, direction))

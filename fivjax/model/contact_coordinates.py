@@ -54,7 +54,7 @@ def in_contact_coordinates(structure: Structure) -> Structure:
     contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
     source = structure.source
     if not isinstance(source, FromParameters):
-        return Structure(*_turned(x, source), contacts=contacts, coordinates=names)
+        return Structure(*_transform(x, source), contacts=contacts, coordinates=names)
     return Structure.from_parameters(
         TurnedMatrices(source.matrices_of, tuple(map(tuple, x.tolist()))),
         source.parameters,
@@ -73,7 +73,7 @@ class TurnedMatrices:
     x: tuple[tuple[float, ...], ...]
 
     def __call__(self, **parameters) -> Matrices:
-        return _turned(np.array(self.x), self.matrices_of(**parameters))
+        return _transform(np.array(self.x), self.matrices_of(**parameters))
 
 
 @dataclass(frozen=True)
@@ -86,15 +86,15 @@ class TurnedStructure:
         return in_contact_coordinates(self.builder(**parameters))
 
 
-def _turned(x: np.ndarray, matrices: tuple) -> Matrices:
+def _transform(x: np.ndarray, matrices: tuple) -> Matrices:
     """Matrices and load in the coordinates z of q = X z."""
     mass, damping, stiffness, load = map(jnp.asarray, matrices)
 
-    def seen(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    def congruence(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         turned = jnp.asarray(x.T) @ matrix @ x
         return 0.5 * (turned + turned.T)
 
-    return Matrices(seen(mass), seen(damping), seen(stiffness), jnp.asarray(x.T) @ load)
+    return Matrices(congruence(mass), congruence(damping), congruence(stiffness), jnp.asarray(x.T) @ load)
 
 
 def to_contact_coordinates(structure: Structure, y: Float[Returned, "*k state"]) -> Float[Returned, "*k state"]:

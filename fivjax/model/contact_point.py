@@ -11,7 +11,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..foundation.precision import is_known
-from .matrix_checks import checked_index
+from .matrix_checks import check_index
 
 Direction = int | str | np.ndarray
 
@@ -59,7 +59,7 @@ class ContactPoint:
         return f"ContactPoint(tangential={text(self.tangential)}, normal={text(self.normal)})"
 
 
-def checked_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ...]:
+def resolve_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ...]:
     """The contacts with their directions as indices where these are coordinates, else as vectors."""
     n = len(names)
     if isinstance(contacts, ContactPoint):
@@ -72,7 +72,7 @@ def checked_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ..
     if not contacts:
         raise ValueError("Argument `contacts` must hold at least one contact, but is empty.")
 
-    def checked(name: str, value: Direction) -> int | np.ndarray:
+    def resolve(name: str, value: Direction) -> int | np.ndarray:
         if isinstance(value, str):
             if value not in names:
                 raise ValueError(
@@ -81,7 +81,7 @@ def checked_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ..
                 )
             return names.index(value)
         if not isinstance(value, np.ndarray):
-            return checked_index(name, value, n)
+            return check_index(name, value, n)
         if value.shape != (n,) or not np.all(np.isfinite(value)) or not np.any(value):
             raise ValueError(
                 f"Argument `{name}` must be a finite vector of shape ({n},) that is not zero, but is {value.tolist()}."
@@ -90,7 +90,7 @@ def checked_contacts(contacts, names: tuple[str, ...]) -> tuple[ContactPoint, ..
         return int(np.argmax(value)) if is_coordinate else value
 
     found = tuple(
-        ContactPoint(checked("tangential", contact.tangential), checked("normal", contact.normal))
+        ContactPoint(resolve("tangential", contact.tangential), resolve("normal", contact.normal))
         for contact in contacts
     )
     chosen = [direction for contact in found for direction in (contact.tangential, contact.normal)]

@@ -55,7 +55,7 @@ def code_of(scene) -> dict[str, str]:
 
 
 def _of_law(law: AbstractFriction, speed):
-    law = _made_again(law)
+    law = _rebuild(law)
     own_series = type(law).next_term is not AbstractFriction.next_term
     series = law.next_term([speed, speed, speed], [speed, speed]) if own_series else None
     # With the derivative: a law may define its own.
@@ -63,7 +63,7 @@ def _of_law(law: AbstractFriction, speed):
 
 
 def _of_load(load: AbstractLoad, t):
-    load = _made_again(load)
+    load = _rebuild(load)
     return load.force, load.final, load.jumps, load(t)
 
 
@@ -72,7 +72,7 @@ def _of_structure(structure: Structure, parameters: Mapping):
     return made, made.matrices, made.damping_parts
 
 
-def _made_again(part):
+def _rebuild(part):
     """A law or a load as `Scene.replace` makes it for other values."""
     return type(part)(**{name: value for name, value in vars(part).items() if value is not None})
 

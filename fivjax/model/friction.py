@@ -100,7 +100,7 @@ class AbstractFriction(eqx.Module):
         times = 10.0
         speeds = times * (fastest or 1.0) * shares
         static = self.static
-        mu, slope, bend, bounds, jumps = _sampled(self, jnp.asarray(speeds))
+        mu, slope, bend, bounds, jumps = _sample(self, jnp.asarray(speeds))
         if not all(map(is_known, (static, mu))):
             return
         static, mu, name = float(static), np.asarray(mu), type(self).__name__
@@ -138,7 +138,7 @@ def slope_of(law: AbstractFriction, slip_speed: Float[Array, "*contacts"]) -> Fl
 
 
 @jax.jit
-def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
+def _sample(law: AbstractFriction, speeds: Float[Array, " k"]):
     def slope(speed):
         return slope_of(law, speed)
 
@@ -154,7 +154,7 @@ def _sampled(law: AbstractFriction, speeds: Float[Array, " k"]):
 def _jump(law: AbstractFriction, low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, ""]:
     """By how much a law changes in the shortest interval between two speeds: always the half in which it changes more."""
 
-    def halved(_, ends):
+    def bisect(_, ends):
         (low, of_low), (high, of_high) = ends
         middle = 0.5 * (low + high)
         of_middle = law(middle)
@@ -164,7 +164,7 @@ def _jump(law: AbstractFriction, low: Float[Array, ""], high: Float[Array, ""]) 
 
     # Halvings of an interval until what is left of a change is a jump.
     halvings = 50
-    (_, of_low), (_, of_high) = jax.lax.fori_loop(0, halvings, halved, ((low, law(low)), (high, law(high))))
+    (_, of_low), (_, of_high) = jax.lax.fori_loop(0, halvings, bisect, ((low, law(low)), (high, law(high))))
     return jnp.abs(of_high - of_low)
 
 

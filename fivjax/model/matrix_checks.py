@@ -67,7 +67,7 @@ def check_shapes(n: int, **matrices) -> None:
             )
 
 
-def checked_index(name: str, index, n: int) -> int:
+def check_index(name: str, index, n: int) -> int:
     if isinstance(index, bool) or not isinstance(index, int | np.integer):
         raise TypeError(f"Argument `{name}` must be the index of a coordinate, but is {arguments.describe(index)}.")
     if not 0 <= index < n:
@@ -77,7 +77,7 @@ def checked_index(name: str, index, n: int) -> int:
     return int(index)
 
 
-def checked_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
+def check_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
     """The names of the coordinates, q0, q1, … unless given."""
     if names is None:
         return tuple(f"q{i}" for i in range(n))

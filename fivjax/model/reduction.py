@@ -135,7 +135,7 @@ def craig_bampton(
         columns[1][inner] = modes
     basis = np.hstack(columns)
     reduced, basis = _structure(structure, basis, outer, len(squares))
-    return _compared(structure, _damped(reduced, damping_ratio), basis, up_to)
+    return _compare(structure, _with_modal_damping(reduced, damping_ratio), basis, up_to)
 
 
 def _modes_up_to(stiffness, mass, frequency: float) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +154,7 @@ def _structure(full: SparseStructure, basis: np.ndarray, outer: np.ndarray, mode
     names += [f"mode {number + 1}" for number in range(modes)]
     names += ["load"] * (basis.shape[1] - len(names))
 
-    def seen_through(basis: np.ndarray, contacts: list[ContactPoint]) -> Structure:
+    def project(basis: np.ndarray, contacts: list[ContactPoint]) -> Structure:
         turned = [basis.T @ (matrix @ basis) for matrix in (full.mass, full.damping, full.stiffness)]
         mass, damping, stiffness = (0.5 * (matrix + matrix.T) for matrix in turned)
         load = basis.T @ full.load_direction
@@ -162,7 +162,7 @@ def _structure(full: SparseStructure, basis: np.ndarray, outer: np.ndarray, mode
 
     count = full.normal_directions.shape[1]
     tangential, normal = basis.T @ full.tangential_directions, basis.T @ full.normal_directions
-    raw = seen_through(basis, [ContactPoint(tangential[:, i], normal[:, i]) for i in range(count)])
+    raw = project(basis, [ContactPoint(tangential[:, i], normal[:, i]) for i in range(count)])
     # Contacts get coordinates of their own, because other functions need them there.
     turn, places = transformation(raw)
     basis = basis @ turn
@@ -170,10 +170,10 @@ def _structure(full: SparseStructure, basis: np.ndarray, outer: np.ndarray, mode
         suffix = f" {i}" if count > 1 else ""
         names[places[i]], names[places[count + i]] = f"tangential{suffix}", f"normal{suffix}"
     contacts = [ContactPoint(places[i], places[count + i]) for i in range(count)]
-    return seen_through(basis, contacts), basis
+    return project(basis, contacts), basis
 
 
-def _damped(structure: Structure, ratio: float) -> Structure:
+def _with_modal_damping(structure: Structure, ratio: float) -> Structure:
     if ratio == 0:
         return structure
     from scipy.linalg import eigh
@@ -192,7 +192,7 @@ def _damped(structure: Structure, ratio: float) -> Structure:
     )
 
 
-def _compared(full: SparseStructure, reduced: Structure, basis: np.ndarray, up_to: float) -> Reduction:
+def _compare(full: SparseStructure, reduced: Structure, basis: np.ndarray, up_to: float) -> Reduction:
     from scipy.linalg import eigh
 
     squares, _ = _modes_up_to(full.stiffness, full.mass, up_to)

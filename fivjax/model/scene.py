@@ -117,7 +117,7 @@ class Scene(eqx.Module):
                 f"{arguments.did_you_mean(unknown[0], self.parameters)}"
             )
 
-        def rebuilt(part):
+        def rebuild(part):
             if isinstance(part, FrictionPerContact):
                 return part.replace(**changes)
             own = {name: value for name, value in vars(part).items() if value is not None}
@@ -128,9 +128,9 @@ class Scene(eqx.Module):
         of_structure = {name: changes[name] for name in self.structure.parameters if name in changes}
         return Scene(
             structure=self.structure.replace(**of_structure) if of_structure else self.structure,
-            friction=rebuilt(self.friction),
+            friction=rebuild(self.friction),
             belt_speed=changes.get("belt_speed", self.belt_speed),
-            load=rebuilt(self.load),
+            load=rebuild(self.load),
             restitution=changes.get("restitution", self.restitution),
             impact_law=self.impact_law,
         )

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import in_double_precision, is_known, real
-from .contact_point import ContactPoint, checked_contacts, directions
-from .matrix_checks import check_matrix, check_shapes, checked_names
+from .contact_point import ContactPoint, directions, resolve_contacts
+from .matrix_checks import check_matrix, check_names, check_shapes
 from .printing import as_call
 
 
@@ -159,14 +159,14 @@ class Structure(eqx.Module):
             )
         if is_known(load_direction) and not np.all(np.isfinite(np.asarray(load_direction))):
             raise ValueError("Argument `load_direction` must be finite.")
-        self.coordinates = checked_names(coordinates, n)
+        self.coordinates = check_names(coordinates, n)
         if contacts is None:
             contacts = [ContactPoint(tangential, normal)]
         elif (tangential, normal) != (0, 2):
             raise ValueError("Give either `contacts`, or `tangential` and `normal` for a single contact, but not both.")
         self.places = tuple(
             (_place(contact.tangential), _place(contact.normal))
-            for contact in checked_contacts(contacts, self.coordinates)
+            for contact in resolve_contacts(contacts, self.coordinates)
         )
         self.source = given
 

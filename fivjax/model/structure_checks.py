@@ -102,20 +102,20 @@ class StructureChecks:
         found = []
         if self.internal:
             found.append(
-                f"{_of(len(self.internal), 'row')} of internal nodes, which have negative numbers ({_named(self.internal)}): "
+                f"{_of(len(self.internal), 'row')} of internal nodes, which have negative numbers ({_listing(self.internal)}): "
                 f"unknowns that elements or constraints have of their own."
             )
         if self.multipliers:
             found.append(
                 f"{_of(len(self.multipliers), 'Lagrange multiplier')} without mass and stiffness "
-                f"({_named(self.multipliers)}). Each holds a constraint, such as a tie or a contact, and makes one eigenvalue "
-                f"of the stiffness negative, which is no instability. `fj.craig_bampton` and `fj.cea.complex_modes` keep the "
-                f"constraints. For matrices without multipliers, export the model with penalty stiffness in their place, or a "
-                f"substructure that retains the contact nodes."
+                f"({_listing(self.multipliers)}). Each holds a constraint, such as a tie or a contact, and makes one "
+                f"eigenvalue of the stiffness negative, which is no instability. `fj.craig_bampton` and `fj.cea.complex_modes` "
+                f"keep the constraints. For matrices without multipliers, export the model with penalty stiffness in their "
+                f"place, or a substructure that retains the contact nodes."
             )
         if self.loose:
             found.append(
-                f"{_of(len(self.loose), 'row')} with neither mass nor stiffness ({_named(self.loose)}). Hold such degrees of "
+                f"{_of(len(self.loose), 'row')} with neither mass nor stiffness ({_listing(self.loose)}). Hold such degrees of "
                 f"freedom in the finite-element model, or leave them out."
             )
         return found
@@ -125,7 +125,7 @@ def _of(count: int, one: str, many: str = "") -> str:
     return f"{count} {one if count == 1 else many or one + 's'}"
 
 
-def _named(rows: tuple[str, ...]) -> str:
+def _listing(rows: tuple[str, ...]) -> str:
     more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
     return "; ".join(rows[:NAMED]) + more
 
@@ -158,7 +158,7 @@ def check_matrices(
         total = tuple(float(ones @ (mass @ ones)) for ones in along)
     own = np.arange(1, len(massless) + 1) if numbers is None else np.asarray(numbers)
 
-    def named(which) -> tuple[str, ...]:
+    def names_of(which) -> tuple[str, ...]:
         kinds = np.full(len(own), -1) if directions is None else np.asarray(directions)
         words = {-1: "row {}", 0: "point {}"}
         return tuple(
@@ -175,9 +175,9 @@ def check_matrices(
         total_mass=total,
         fixed=fixed,
         remarks=tuple(remarks),
-        multipliers=named(multipliers),
-        internal=named(own < 0),
-        loose=named(loose),
+        multipliers=names_of(multipliers),
+        internal=names_of(own < 0),
+        loose=names_of(loose),
     )
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from .. import plot
-from ..model.scene import sliding_equilibrium
-from ..plot import energy as plot_energy
+import fivjax as fj
+
 from . import pictures
 from . import scenes as paper
 from .findings import Made, given, number, statement
@@ -55,7 +54,7 @@ def figure_15(runs: Runs) -> Made:
     window = two_cycles(cycles, stick + 0.6 * (detach - stick), 3)
     contact = cycles["contact_work"].values
     shown = shown_cycles(cycles, window)
-    size = sliding_equilibrium(run.scene)[0] - cycles["turning_point"].values[between]
+    size = fj.sliding_equilibrium(run.scene)[0] - cycles["turning_point"].values[between]
     findings = (
         given(
             "Section 4.3",
@@ -131,7 +130,7 @@ def in_millijoules(energies: np.ndarray) -> str:
 
 def _growth(runs: Runs, name: str, window: Window, per_cycle: str) -> Figure:
     """The common parts of Figs. 15 and 16."""
-    picture = plot_energy.growth(runs.beginning(name), runs.cycles(name), window, per_cycle)
+    picture = fj.plot_energy.growth(runs.beginning(name), runs.cycles(name), window, per_cycle)
     whole, _, zoom = picture.axes[:3]
     return pictures.lettered(picture, [whole, zoom])
 
@@ -219,7 +218,7 @@ def figure_17(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 17. Phase planes of the limit cycles after a kick of p = 1.2 at three belt speeds."
-    return Made(caption, plot.phase_plane(shown, last=0.5), runs.data(*names.values()), findings)
+    return Made(caption, fj.plot.phase_plane(shown, last=0.5), runs.data(*names.values()), findings)
 
 
 def figure_18(runs: Runs) -> Made:
@@ -279,7 +278,7 @@ def figure_18(runs: Runs) -> Made:
         ),
     )
     shown = {"3 m/s": runs.beginning("p = 1.2"), "10 m/s": runs.beginning("10 m/s")}
-    picture = plot_energy.slip_reversal(shown, windows)
+    picture = fj.plot_energy.slip_reversal(shown, windows)
     pictures.lettered(picture, picture.axes[:3], ["", *shown])
     caption = (
         "Fig. 18. (a) Tangential velocity after p = 1.2 at 3 and 10 m/s; two cycles of the limit cycle at (b) 3 m/s and "

@@ -3,8 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from ..linear import cea
-from ..plot import energy as plot_energy
+import fivjax as fj
+
 from . import pictures
 from .findings import Made, statement
 from .measures import Window, growth_rate, two_cycles
@@ -17,7 +17,7 @@ def figure_11(runs: Runs) -> Made:
     start = runs.first(name)
     energy = np.asarray(energy_of(run).mechanical)
     thirds = [energy[(run.t >= t) & (run.t < t + 1)].mean() for t in (3.0, 4.0, 5.0)]
-    rate, linear = growth_rate(run, cycles, (0.3 * start, 0.95 * start)), float(cea.growth_rate(run.scene))
+    rate, linear = growth_rate(run, cycles, (0.3 * start, 0.95 * start)), float(fj.cea.growth_rate(run.scene))
     findings = (
         statement(
             "Fig. 11(a)",
@@ -36,7 +36,7 @@ def figure_11(runs: Runs) -> Made:
     )
     windows = [(max(0.0, start - 0.5), start + 0.15), (float(run.t[-1]) - 0.3, float(run.t[-1]))]
     caption = "Fig. 11. Mechanical energy during mode coupling (run of Fig. 4): (a) onset, (b) limit cycle."
-    picture = pictures.lettered(plot_energy.mechanical_energy(run, windows))
+    picture = pictures.lettered(fj.plot_energy.mechanical_energy(run, windows))
     return Made(caption, picture, runs.data(name), findings)
 
 
@@ -65,7 +65,7 @@ def figure_12(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 12. Mechanical energy after kicks of p = 1.2 and p = 1.19."
-    return Made(caption, plot_energy.mechanical_energy(shown), runs.data(*shown), findings)
+    return Made(caption, fj.plot_energy.mechanical_energy(shown), runs.data(*shown), findings)
 
 
 def figure_13(runs: Runs) -> Made:
@@ -103,7 +103,9 @@ def figure_13(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 13. Two cycles of growth, p = 1.2, μ = 0.227, 3 m/s: displacement; contact power, energy per cycle."
-    return Made(caption, plot_energy.contact_exchange(runs.beginning(name), cycles, window), runs.data(name), findings)
+    return Made(
+        caption, fj.plot_energy.contact_exchange(runs.beginning(name), cycles, window), runs.data(name), findings
+    )
 
 
 # The number of cycles with detachment that are compared, from the first on.
@@ -147,7 +149,7 @@ def figure_14(runs: Runs) -> Made:
             why=f"compared while both grow: in these cycles the run of p = 1.2 has swung to {reached:.0%} of its limit cycle",
         ),
     )
-    picture = plot_energy.detachments({n: runs(n) for n in names}, cycles, windows, (0.8, 1.8))
+    picture = fj.plot_energy.detachments({n: runs(n) for n in names}, cycles, windows, (0.8, 1.8))
     pictures.lettered(picture, picture.axes[1:])
     caption = (
         f"Fig. 14. Detachment after kicks (a) above and (b) below the critical one, in the {FIRST - 1}th and {FIRST}th cycle "

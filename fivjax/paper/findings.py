@@ -11,6 +11,8 @@ from collections.abc import Iterable
 import xarray as xr
 from matplotlib.figure import Figure
 
+import fivjax as fj
+
 
 class Kind(enum.StrEnum):
     """The kind of a finding."""
@@ -41,6 +43,7 @@ class Made:
     picture: Figure
     data: xr.Dataset
     findings: tuple[Finding, ...]
+    scene: fj.Scene | None = None  # what the data are of, where they do not tell themselves
 
 
 def number(where: str, what: str, printed: str, computed: float, unit: str = "", why: str = "") -> Finding:

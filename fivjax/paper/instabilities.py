@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..linear import cea
-from ..plot import energy as plot_energy
+import fivjax as fj
+
 from . import pictures, spectra
 from .findings import Made, number, statement
 from .measures import Window, frequency, growing_mode, growth_rate, peak, straightness, two_cycles
@@ -29,7 +29,7 @@ def _onset(runs: Runs, name: str, since: float, where: str):
     data = runs.data(name).merge(spectrum.rename(t="spectrum_t"), combine_attrs="override")
     picture = pictures.onset(run, spectrum, zoom)
     rate = growth_rate(run, cycles, early)
-    linear = float(cea.growth_rate(run.scene))
+    linear = float(fj.cea.growth_rate(run.scene))
     grows = statement(
         where,
         "first phase",
@@ -244,7 +244,7 @@ def figure_7(runs: Runs) -> Made:
             off[2] > 0 == off[0] and abs(gain[2]) < 0.1 * abs(gain[1]),
         ),
     )
-    picture = plot_energy.mechanical_power(runs("both"), list(windows.values()))
+    picture = fj.plot_energy.mechanical_power(runs("both"), list(windows.values()))
     pictures.lettered(picture, names=list(windows))
     caption = "Fig. 7. Mechanical power at the start (t1) and end (t2) of linear growth and on the limit cycle (t3) of Fig. 6."
     return Made(caption, picture, runs.data("both"), findings)

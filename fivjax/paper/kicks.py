@@ -3,9 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from .. import plot
-from ..kicks.critical import critical_perturbation
-from ..linear import cea
+import fivjax as fj
+
 from . import pictures
 from . import scenes as paper
 from .findings import Made, given, number, statement
@@ -15,7 +14,7 @@ from .runs import Runs, energy_of
 
 def critical(mu, belt_speed, p_range: Window, p_step: float) -> xr.Dataset:
     """Critical kicks for Fig. 10 and Table 2, over the same two axes, so that they share compiled programs."""
-    return critical_perturbation(
+    return fj.critical_perturbation(
         paper.scene(), mu=mu, belt_speed=belt_speed, p_range=p_range, p_step=p_step, tolerance=1e-5, progress=False
     )
 
@@ -37,7 +36,7 @@ def figure_8(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 8. The kick (Eq. 14) and the answer, p = 1.1, μ = 0.227, 3 m/s."
-    return Made(caption, plot.perturbation(run, zoom=0.4), runs.data("a kick", cycles=False), findings)
+    return Made(caption, fj.plot.perturbation(run, zoom=0.4), runs.data("a kick", cycles=False), findings)
 
 
 def figure_9(runs: Runs) -> Made:
@@ -63,12 +62,12 @@ def figure_9(runs: Runs) -> Made:
 
 
 def figure_10(runs: Runs) -> Made:
-    limit = float(cea.critical_friction(paper.scene().structure))
+    limit = float(fj.cea.critical_friction(paper.scene().structure))
     mu = np.append(np.linspace(0.1, 0.228, 17), 0.235)
     data = critical(mu, [3.0], (1.0, 3.0), 0.025).isel(belt_speed=0).assign_attrs(mu_crit=limit)
     p_crit = data["p_crit"].values
     stable = mu < limit
-    coupling = float(cea.coalescence(paper.scene().structure).mu)
+    coupling = float(fj.cea.coalescence(paper.scene().structure).mu)
     findings = (
         statement(
             "Fig. 10",
@@ -94,4 +93,4 @@ def figure_10(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 10. Critical perturbation over the friction coefficient, 3 m/s, 100 N."
-    return Made(caption, plot.critical(data), data, findings)
+    return Made(caption, fj.plot.critical(data), data, findings)

@@ -3,9 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from ..io.datasets import labelled
-from ..linear import cea
-from ..plot import linear as plot_linear
+import fivjax as fj
+
 from . import pictures
 from . import scenes as paper
 from .findings import Made, given, number, statement
@@ -22,7 +21,7 @@ def table_1(runs: Runs) -> Made:
     findings = tuple(given("Table 1", what, f"{value:g} {unit}") for what, value, unit in paper.TABLE_1.values())
     picture = pictures.table(["parameter", "symbol", "value", "unit"], rows)
     caption = "Table 1. Parameters of the lumped model: what everything else here starts from."
-    return Made(caption, picture, labelled(data, paper.scene()), findings)
+    return Made(caption, picture, data, findings, paper.scene())
 
 
 def figure_2(runs: Runs) -> Made:
@@ -46,11 +45,11 @@ def figure_2(runs: Runs) -> Made:
     caption = (
         "Fig. 2. Friction laws: constant (Section 3.1), and falling with slip speed (Eq. 1, Sections 3.2 and 3.3)."
     )
-    return Made(caption, pictures.friction_laws(data), labelled(data, paper.scene(paper.CONSTANT)), findings)
+    return Made(caption, pictures.friction_laws(data), data, findings, paper.scene(paper.CONSTANT))
 
 
 def figure_3(runs: Runs) -> Made:
-    data = cea.modes(paper.scene().structure, mu=np.linspace(0, 0.5, 501))
+    data = fj.cea.modes(paper.scene().structure, mu=np.linspace(0, 0.5, 501))
     mu_crit, mu_meet = float(data["mu_crit"]), float(data["mu_coalescence"])
     below = float(data["growth_rate"].sel(mu=slice(0, mu_crit)).max())
     spread = data["growth_rate"].sel(mu=0.5, method="nearest").values
@@ -81,4 +80,4 @@ def figure_3(runs: Runs) -> Made:
         ),
     )
     caption = "Fig. 3. (a) Natural frequencies and (b) real parts of the modes of steady sliding over friction."
-    return Made(caption, pictures.lettered(plot_linear.eigenvalues(data)), data, findings)
+    return Made(caption, pictures.lettered(fj.plot_linear.eigenvalues(data)), data, findings)

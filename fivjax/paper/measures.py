@@ -3,9 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from ..linear import cea
-from ..model.scene import Scene, sliding_equilibrium
-from ..simulation.trajectory import Trajectory
+import fivjax as fj
 
 Window = tuple[float, float]
 
@@ -17,22 +15,22 @@ def frequency(cycles: xr.Dataset, window: Window) -> float:
     return len(start) / float(end[-1] - start[0])
 
 
-def growth_rate(run: Trajectory, cycles: xr.Dataset, window: Window) -> float:
+def growth_rate(run: fj.Trajectory, cycles: xr.Dataset, window: Window) -> float:
     """Rate at which turning points move away from equilibrium in a window, in 1/s (a fitted exponential)."""
     inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
-    rest = sliding_equilibrium(run.scene)[run.scene.structure.tangential]
+    rest = fj.sliding_equilibrium(run.scene)[run.scene.structure.tangential]
     amplitude = rest - cycles["turning_point"].values[inside]
     return float(np.polyfit(cycles["cycle_start"].values[inside], np.log(amplitude), 1)[0])
 
 
-def growing_mode(scene: Scene) -> tuple[float, float]:
+def growing_mode(scene: fj.Scene) -> tuple[float, float]:
     """Frequency (Hz) of the mode that grows fastest in linear theory, and the phase between x2 and y1 in it (degrees)."""
-    values, vectors = np.linalg.eig(cea.linearisation(scene))
+    values, vectors = np.linalg.eig(fj.cea.linearisation(scene))
     k = int(np.argmax(values.real + 1e-9 * values.imag))
     return float(values[k].imag / (2 * np.pi)), float(np.degrees(np.angle(vectors[0, k] / vectors[1, k])))
 
 
-def straightness(run: Trajectory, cycles: xr.Dataset, window: Window) -> float:
+def straightness(run: fj.Trajectory, cycles: xr.Dataset, window: Window) -> float:
     """R² of a straight line through the amplitudes of the cycles in a window."""
     inside = (cycles["cycle_start"] >= window[0]) & (cycles["cycle_end"] <= window[1])
     t = cycles["cycle_start"].values[inside]
@@ -48,7 +46,7 @@ def two_cycles(cycles: xr.Dataset, t: float, count: int = 2) -> Window:
     return float(cycles["cycle_start"][k]), float(cycles["cycle_end"][k + count - 1])
 
 
-def peak(run: Trajectory, since: float, quantity: str = "acceleration") -> float:
+def peak(run: fj.Trajectory, since: float, quantity: str = "acceleration") -> float:
     """Largest tangential value of a quantity from an instant (s) on."""
     late = np.asarray(run.t) >= since
     return float(np.abs(getattr(run, quantity)[late, run.scene.structure.tangential]).max())

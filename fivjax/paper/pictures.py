@@ -1,7 +1,7 @@
 """Pictures in the layout of the paper's Figs. 2, 4–6 and 9 and its tables: matplotlib figures from computed results.
 
-Colours are similar to the paper's where everyone can distinguish them; in grey they differ in lightness, and lines also in
-style.
+Colours are those of Okabe and Ito that are similar to the paper's, which everyone can distinguish; in grey they differ in
+lightness, and lines also in style.
 """
 
 import textwrap
@@ -13,10 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
-from ..plot.contact_status import shade_status
-from ..plot.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, legend_above, new_figure
-from ..simulation.trajectory import Trajectory
+import fivjax as fj
 
+BLACK, BLUE, GREEN, ORANGE, VERMILION = "#000000", "#0072B2", "#009E73", "#E69F00", "#D55E00"
 Window = tuple[float, float]
 
 # The range of a spectrogram below its strongest line, in dB. The paper does not state its range; with this one its two
@@ -26,7 +25,7 @@ DEPTH = 40.0
 
 def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figure:
     """Friction coefficient over slip speed, one line for each `law` (Fig. 2)."""
-    figure = new_figure(figure, 5.6, 3.8)
+    figure = _new_figure(figure, 5.6, 3.8)
     axes = figure.add_subplot()
     styles = [(VERMILION, "-"), (BLUE, "--"), (BLACK, "-.")]
     for law, (colour, line) in zip(dataset["law"].values, styles, strict=False):
@@ -37,16 +36,16 @@ def friction_laws(dataset: xr.Dataset, *, figure: Figure | None = None) -> Figur
     return figure
 
 
-def onset(run: Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figure | None = None) -> Figure:
+def onset(run: fj.Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figure | None = None) -> Figure:
     """Accelerations along the belt and across it, a window of them, and the spectrogram (Figs. 4 and 5).
 
     `spectrum` is from `spectra.spectrogram`; across the belt is the paper's y1, coordinate 1.
     """
-    figure = new_figure(figure, 8.4, 6.0)
+    figure = _new_figure(figure, 8.4, 6.0)
     panels = figure.subplot_mosaic("aa;bc")
     accelerations(panels["a"], run, (float(run.t[0]), float(run.t[-1])))
     panels["a"].axvspan(*window, color="0.8", zorder=0)
-    _thick(legend_above(panels["a"], columns=2))
+    _thick(_legend_above(panels["a"], columns=2))
     accelerations(panels["b"], run, window)
     level = spectrum["level"]
     shown = level.sel(frequency=slice(0, 500))
@@ -59,13 +58,13 @@ def onset(run: Trajectory, spectrum: xr.Dataset, window: Window, *, figure: Figu
 
 
 def coexistence(
-    runs: Mapping[str, Trajectory], zoomed: Trajectory, zoom: Window, marks: Mapping[str, Window], *, figure=None
+    runs: Mapping[str, fj.Trajectory], zoomed: fj.Trajectory, zoom: Window, marks: Mapping[str, Window], *, figure=None
 ) -> Figure:
     """Tangential accelerations of several runs; below, a window of one of them with its normal acceleration (Fig. 6).
 
     `marks` are windows to point at by name, those of Fig. 7.
     """
-    figure = new_figure(figure, 8.4, 6.4)
+    figure = _new_figure(figure, 8.4, 6.4)
     panels = figure.subplot_mosaic("a;b", height_ratios=(3, 2))
     overlaid(runs, axes=panels["a"])
     for name, (start, end) in marks.items():
@@ -77,27 +76,27 @@ def coexistence(
     low, high = panels["a"].get_ylim()
     panels["a"].set_ylim(low, high + 0.12 * (high - low))
     accelerations(panels["b"], zoomed, zoom)
-    legend_above(panels["b"], columns=2)
+    _legend_above(panels["b"], columns=2)
     return lettered(figure, list(panels.values()))
 
 
 def overlaid(
-    runs: Mapping[str, Trajectory], *, axes: Axes | None = None, figure: Figure | None = None
+    runs: Mapping[str, fj.Trajectory], *, axes: Axes | None = None, figure: Figure | None = None
 ) -> Figure | None:
     """The tangential accelerations of several runs on one pair of axes, in the order given (Figs. 6(a) and 9)."""
     if axes is None:
-        figure = new_figure(figure, 8.4, 3.8)
+        figure = _new_figure(figure, 8.4, 3.8)
         axes = figure.add_subplot()
     # Of different lightness, so that they can be distinguished in grey.
     shades = [(BLUE, ORANGE), (ORANGE, GREEN, BLACK)][len(runs) > 2]
     for (name, run), colour in zip(runs.items(), shades, strict=False):
         axes.plot(run.t, run.acceleration[:, run.scene.structure.tangential], color=colour, lw=0.5, label=name)
     axes.set(xlabel="time (s)", ylabel="tangential\nacceleration (m/s²)", xlim=(0, max(r.t[-1] for r in runs.values())))
-    _thick(legend_above(axes, columns=len(runs)))
+    _thick(_legend_above(axes, columns=len(runs)))
     return figure
 
 
-def accelerations(axes: Axes, run: Trajectory, window: Window) -> None:
+def accelerations(axes: Axes, run: fj.Trajectory, window: Window) -> None:
     """Tangential and normal (y1) acceleration in a window, status shaded where the window is short enough to see it."""
     inside = (np.asarray(run.t) >= window[0]) & (np.asarray(run.t) <= window[1])
     t, values = np.asarray(run.t)[inside], np.asarray(run.acceleration)[inside]
@@ -110,13 +109,13 @@ def accelerations(axes: Axes, run: Trajectory, window: Window) -> None:
     for line, label, colour, style, width in sorted(lines, key=lambda item: -np.nanmax(np.abs(item[0]))):
         axes.plot(t, line, color=colour, ls=style, lw=width, label=label)
     if short:
-        shade_status(axes, Trajectory(**{**vars(run), "t": t, "status": run.status[inside], "energy": None}))
+        fj.plot.shade_status(axes, fj.Trajectory(**{**vars(run), "t": t, "status": run.status[inside], "energy": None}))
     axes.set(xlabel="time (s)", ylabel="acceleration (m/s²)", xlim=window)
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, figure: Figure | None = None) -> Figure:
     """A table of text (Tables 1 and 2)."""
-    figure = new_figure(figure, 1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1))
+    figure = _new_figure(figure, 1.8 * len(columns), 0.5 + 0.32 * (len(rows) + 1))
     axes = figure.add_subplot()
     axes.set_axis_off()
     drawn = axes.table(
@@ -147,6 +146,16 @@ def lettered(figure: Figure, panels: Sequence[Axes] | None = None, names: Sequen
     for letter, axes, name in zip("abcdefgh", panels, names or [""] * len(panels), strict=False):
         axes.set_title(f"({letter}) {name}".rstrip(), loc="left", fontsize="medium")
     return figure
+
+
+def _new_figure(figure: Figure | None, width: float, height: float) -> Figure:
+    """The figure to draw into: the one given, or a new one of this size in inches."""
+    return Figure(figsize=(width, height), layout="constrained") if figure is None else figure
+
+
+def _legend_above(axes: Axes, columns: int = 3) -> Legend:
+    """A legend above the right end of a panel, where it covers no curve."""
+    return axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, frameon=False)
 
 
 def _thick(legend: Legend) -> None:

@@ -1,12 +1,7 @@
-"""The paper in one call: its figures and tables as pictures and data, and a report on agreement."""
+"""All figures and tables of the paper by name, and the report on how far they agree with it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping
 
-from ..foundation.precision import in_double_precision
-from ..foundation.progress import following, stage, tick
-from ..io.datasets import check_writable, save, save_figure, save_text
-from . import pictures
 from .belt_speeds import figure_15, figure_16, figure_17, figure_18, table_2
 from .energy_flows import figure_11, figure_12, figure_13, figure_14
 from .findings import Kind, Made, summary
@@ -38,69 +33,6 @@ FIGURES: dict[str, Callable[[Runs], Made]] = {
 }
 
 
-class Reproduction(dict[str, Made]):
-    """The results, by name of figure or table."""
-
-    @property
-    def summary(self) -> str:
-        """A sentence that says how much of what was computed agrees with the paper."""
-        return summary(finding for made in self.values() for finding in made.findings)
-
-
-@in_double_precision
-def reproduce(
-    figure: str | int | Sequence[str | int] | None = None,
-    out: str | Path | None = None,
-    *,
-    progress: bool | None = None,
-) -> Reproduction:
-    """The paper's Figures 2 to 18 and Tables 1 and 2, from its own parameters.
-
-        fj.reproduce(3)["3"].picture
-        fj.reproduce(out="reproduction")
-
-    **Arguments:**
-
-    - `figure`: which to make: "2" to "18", "table1", "table2", or several of them; all unless given. Runs that several
-      figures of one call show are computed once.
-    - `out`: a folder to write into, made if it does not exist: `figNN.png` or `tableN.png`, the data as `.nc`, and
-      `reproduce.md`, which compares each number that the paper prints with the computed one. Unless given, nothing is written.
-    - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.
-
-    **Returns:** by name, objects with `picture` (a matplotlib figure), `data` (an xarray dataset), `caption` and `findings`;
-    `summary` says in a sentence how much agrees.
-
-    **Raises:** `ValueError` for a figure that the paper does not have, or a folder that cannot be written, before any work.
-
-    **Example:**
-
-        >>> made = fj.reproduce(3, progress=False)["3"]  # doctest: +SLOW
-        >>> print(made.findings[0].what)
-        μ_coupling
-    """
-    names = _names(figure)
-    report = "reproduce.md"
-    if out is not None:
-        out = Path(out)
-        if not out.exists() and out.parent.is_dir():
-            out.mkdir()
-        check_writable(out / report)
-    runs, made = Runs(), Reproduction()
-    with following("reproduce", shown=progress, total=len(names), unit=" figures"):
-        for name in names:
-            stage(_file_name(name))
-            one = FIGURES[name](runs)
-            pictures.captioned(one.picture, one.caption)
-            made[name] = one
-            if out is not None:
-                save_figure(one.picture, out / f"{_file_name(name)}.png")
-                save(one.data, out / f"{_file_name(name)}.nc")
-            tick()
-    if out is not None:
-        save_text(markdown(made), out / report)
-    return made
-
-
 def markdown(made: Mapping[str, Made]) -> str:
     """The printed and the computed values, as Markdown."""
     findings = [finding for one in made.values() for finding in one.findings]
@@ -126,7 +58,7 @@ def markdown(made: Mapping[str, Made]) -> str:
         ]
         lines += [""]
     for name, one in made.items():
-        file = _file_name(name)
+        file = file_name(name)
         lines += [f"## {one.caption}", "", f"![{_title(name)}]({file}.png)", "", f"Data: `{file}.nc`.", ""]
         lines += ["| where | what | the paper | computed | |", "|---|---|---|---|---|"]
         for f in one.findings:
@@ -138,7 +70,11 @@ def markdown(made: Mapping[str, Made]) -> str:
     return "\n".join(lines)
 
 
-def _names(figure) -> list[str]:
+def names_of(figure) -> list[str]:
+    """The names of the figures that a user asks for, by name or number or several of them; all for none.
+
+    **Raises:** `ValueError` for a figure that the paper does not have.
+    """
     if figure is None:
         return list(FIGURES)
     several = figure if isinstance(figure, list | tuple) else [figure]
@@ -152,7 +88,8 @@ def _names(figure) -> list[str]:
     return names
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
+    """The name of a figure's files, without suffix."""
     return f"fig{int(name):02d}" if name.isdigit() else name
 
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from ..simulation.energy import Energy
-from ..simulation.energy_cycles import energy_per_cycle
-from ..simulation.trajectory import Trajectory
+import fivjax as fj
+
 from .scenes import CASES
 
 
@@ -17,17 +16,17 @@ class Runs:
     """The paper's transients, each computed only once."""
 
     @functools.cache  # noqa: B019 (lives as long as one reproduction)
-    def __call__(self, name: str) -> Trajectory:
+    def __call__(self, name: str) -> fj.Trajectory:
         return CASES[name].run()
 
     @functools.cache  # noqa: B019
-    def beginning(self, name: str, t1: float = 4.0) -> Trajectory:
+    def beginning(self, name: str, t1: float = 4.0) -> fj.Trajectory:
         """The first part of a run, with as many rows: for windows that show details shorter than a row of the whole run."""
         return dataclasses.replace(CASES[name], t1=t1).run()
 
     @functools.cache  # noqa: B019
     def cycles(self, name: str) -> xr.Dataset:
-        return energy_per_cycle(self(name))
+        return fj.energy_per_cycle(self(name))
 
     def first(self, name: str, status: int | None = None) -> float:
         """The time (s) at which a run first sticks (0) or detaches (2), or, without `status`, of its first contact event;
@@ -55,7 +54,7 @@ class Runs:
         return _cases(dict(zip(names, parts, strict=True)))
 
 
-def energy_of(run: Trajectory) -> Energy:
+def energy_of(run: fj.Trajectory) -> fj.energy.Energy:
     """The ledger, which every case has."""
     assert run.energy is not None
     return run.energy

@@ -8,11 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from ..model.belt import belt_oscillator
-from ..model.friction import AbstractFriction, Coulomb, ExponentialDecay
-from ..model.load import Pulse
-from ..model.scene import Scene, sliding_equilibrium
-from ..simulation.trajectory import Trajectory, simulate
+import fivjax as fj
 
 # Table 1, as printed: value and unit.
 TABLE_1 = {
@@ -30,9 +26,9 @@ TABLE_1 = {
 TABLE_2 = {0.5: "1.06", 1.0: "1.11", 1.5: "1.17", 3.0: "1.20", 5.0: "1.20", 10.0: "1.20", 100.0: "1.20"}
 
 # Fig. 2 and Sections 3.1 to 3.3: constant; falling; falling, and above the critical friction.
-CONSTANT = Coulomb(0.5)
-FALLING = ExponentialDecay(0.2, 0.1, 0.5)
-BOTH = ExponentialDecay(0.6, 0.5, 0.5)
+CONSTANT = fj.Coulomb(0.5)
+FALLING = fj.ExponentialDecay(0.2, 0.1, 0.5)
+BOTH = fj.ExponentialDecay(0.6, 0.5, 0.5)
 
 # Section 4 from 4.1 on, unless the case says otherwise.
 MU = 0.227
@@ -47,7 +43,7 @@ class Case:
     vibration grows.
     """
 
-    friction: AbstractFriction
+    friction: fj.AbstractFriction
     belt_speed: float
     p: float = 1.0
     start: float = 0.0
@@ -56,15 +52,15 @@ class Case:
     # All cases have the same number of rows, so that those with the same friction law share compiled programs.
     rows: int = 60_000
 
-    def scene(self) -> Scene:
+    def scene(self) -> fj.Scene:
         """The scene with the parameters of Table 1."""
         return scene(self.friction, self.belt_speed, self.p, self.start)
 
-    def run(self) -> Trajectory:
+    def run(self) -> fj.Trajectory:
         """The trajectory with its energy ledger."""
         what = self.scene()
-        q = (1 + self.nudge) * sliding_equilibrium(what)
-        return simulate(what, self.t1, self.t1 / self.rows, y0=(q, np.zeros_like(q)), energy=True)
+        q = (1 + self.nudge) * fj.sliding_equilibrium(what)
+        return fj.simulate(what, self.t1, self.t1 / self.rows, y0=(q, np.zeros_like(q)), energy=True)
 
 
 NUDGE = 1e-4
@@ -75,19 +71,19 @@ CASES = {
     "mode coupling": Case(CONSTANT, 0.5, nudge=NUDGE, t1=6.0),
     "both": Case(BOTH, 0.5, nudge=NUDGE, t1=6.0),
     # A kick whose vibration dies out (Fig. 8); the paper does not state its size.
-    "a kick": Case(Coulomb(MU), 3.0, p=1.1, start=0.5),
-    "p = 1.2": Case(Coulomb(MU), 3.0, p=1.2),
-    "p = 1.19": Case(Coulomb(MU), 3.0, p=1.19),
-    "1 m/s": Case(Coulomb(MU), 1.0, p=1.16),
-    "1.5 m/s": Case(Coulomb(MU), 1.5, p=1.16),
-    "5 m/s": Case(Coulomb(MU), 5.0, p=1.2),
-    "10 m/s": Case(Coulomb(MU), 10.0, p=1.2),
-    "100 m/s": Case(Coulomb(MU), 100.0, p=1.2),
+    "a kick": Case(fj.Coulomb(MU), 3.0, p=1.1, start=0.5),
+    "p = 1.2": Case(fj.Coulomb(MU), 3.0, p=1.2),
+    "p = 1.19": Case(fj.Coulomb(MU), 3.0, p=1.19),
+    "1 m/s": Case(fj.Coulomb(MU), 1.0, p=1.16),
+    "1.5 m/s": Case(fj.Coulomb(MU), 1.5, p=1.16),
+    "5 m/s": Case(fj.Coulomb(MU), 5.0, p=1.2),
+    "10 m/s": Case(fj.Coulomb(MU), 10.0, p=1.2),
+    "100 m/s": Case(fj.Coulomb(MU), 100.0, p=1.2),
 }
 
 
-def scene(friction: AbstractFriction | None = None, belt_speed=3.0, p=1.2, start=0.0) -> Scene:
+def scene(friction: fj.AbstractFriction | None = None, belt_speed=3.0, p=1.2, start=0.0) -> fj.Scene:
     """The paper's scene: Table 1, and unless given μ = 0.227, 3 m/s and a kick of 1.2 for 0.1 s (Section 4)."""
     values = {name: value for name, (_, value, _) in TABLE_1.items()}
-    load = Pulse(values.pop("force"), p, duration=0.1, start=start)
-    return Scene(belt_oscillator(**values), Coulomb(MU) if friction is None else friction, belt_speed, load)
+    load = fj.Pulse(values.pop("force"), p, duration=0.1, start=start)
+    return fj.Scene(fj.belt_oscillator(**values), fj.Coulomb(MU) if friction is None else friction, belt_speed, load)

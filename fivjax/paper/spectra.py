@@ -3,13 +3,11 @@
 import numpy as np
 import xarray as xr
 
-from ..foundation import arguments
-from ..io.datasets import labelled
-from ..simulation.trajectory import Trajectory
+import fivjax as fj
 
 
 def spectrogram(
-    run: Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, window: float = 0.2
+    run: fj.Trajectory, quantity: str = "acceleration", coordinate: int | None = None, *, window: float = 0.2
 ) -> xr.Dataset:
     """The spectrum of one coordinate over time, as in Figs. 4(c) and 5(c).
 
@@ -22,9 +20,6 @@ def spectrogram(
 
     **Raises:** `ValueError` for a window that does not fit into the run, or rows that are not evenly spaced.
     """
-    arguments.instance("run", run, Trajectory, "a trajectory, such as `simulate` returns")
-    arguments.one_of("quantity", quantity, ("displacement", "velocity", "acceleration"))
-    arguments.real_number("window", window, above=0)
     rate = _sampling_rate(run)
     samples = round(window * rate)
     if not 8 <= samples <= len(run.t):
@@ -43,11 +38,13 @@ def spectrogram(
     strongest = np.max(power)
     # The floor is far below the range that is drawn, and keeps levels finite.
     level = 10 * np.log10(np.maximum(power / (strongest if strongest > 0 else 1.0), 1e-20))
-    dataset = xr.Dataset(
+    return xr.Dataset(
         {"level": (("frequency", "t"), level, {"long_name": f"power of {quantity}", "units": "dB"})},
-        {"frequency": ("frequency", frequency, {"long_name": "frequency", "units": "Hz"}), "t": float(run.t[0]) + t},
+        {
+            "frequency": ("frequency", frequency, {"long_name": "frequency", "units": "Hz"}),
+            "t": ("t", float(run.t[0]) + t, {"long_name": "time", "units": "s"}),
+        },
     )
-    return labelled(dataset, run.scene, quantity=quantity, coordinate=coordinate, window=window)
 
 
 def component(t: np.ndarray, signal: np.ndarray, frequency: float) -> complex:
@@ -58,26 +55,26 @@ def component(t: np.ndarray, signal: np.ndarray, frequency: float) -> complex:
     return complex(2 * np.sum(weights * (signal - np.mean(signal)) * np.exp(-2j * np.pi * frequency * t)))
 
 
-def harmonics(run: Trajectory, window: tuple[float, float], frequency: float, count: int = 4) -> np.ndarray:
+def harmonics(run: fj.Trajectory, window: tuple[float, float], frequency: float, count: int = 4) -> np.ndarray:
     """Levels of the tangential acceleration at 2, 3, … `count` times a frequency (Hz), relative to that frequency's, in dB."""
     inside, signal = _within(run, window, run.scene.structure.tangential)
     found = [abs(component(inside, signal, k * frequency)) for k in range(1, count + 1)]
     return 20 * np.log10(np.array(found[1:]) / found[0])
 
 
-def phase_shift(run: Trajectory, window: tuple[float, float], frequency: float, coordinate: int) -> float:
+def phase_shift(run: fj.Trajectory, window: tuple[float, float], frequency: float, coordinate: int) -> float:
     """The phase lag of a coordinate's acceleration behind the tangential one at a frequency (Hz), in degrees, -180 to 180."""
     t, tangential = _within(run, window, run.scene.structure.tangential)
     _, other = _within(run, window, coordinate)
     return float(np.degrees(np.angle(component(t, tangential, frequency) / component(t, other, frequency))))
 
 
-def _within(run: Trajectory, window: tuple[float, float], coordinate: int) -> tuple[np.ndarray, np.ndarray]:
+def _within(run: fj.Trajectory, window: tuple[float, float], coordinate: int) -> tuple[np.ndarray, np.ndarray]:
     inside = (np.asarray(run.t) >= window[0]) & (np.asarray(run.t) <= window[1])
     return np.asarray(run.t)[inside], np.asarray(run.acceleration)[inside, coordinate]
 
 
-def _sampling_rate(run: Trajectory) -> float:
+def _sampling_rate(run: fj.Trajectory) -> float:
     steps = np.diff(run.t)
     # The last row is the end of the run, which need not be a multiple of the step.
     if np.ptp(steps[:-1]) > 1e-6 * steps[0]:

@@ -14,6 +14,9 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[2] / "fivjax"
 # The public names (`fivjax/__init__.pyi`): above every room but the command line, which is written with them.
 DOOR = "fivjax"
+# Written with the public names, so above them, lowest first. Where the door offers a name from here, it imports it when somebody
+# uses the name: after all that stands below.
+ABOVE_THE_DOOR = ("paper", "reproduction", "cli")
 
 
 def modules(package: Path = PACKAGE) -> dict[str, Path]:
@@ -54,7 +57,8 @@ def imported(name: str, path: Path, known: Mapping[str, Path]) -> set[str]:
             if not (node.args and isinstance(node.args[0], ast.Constant)):
                 raise ValueError(f"Module {name}, line {node.lineno}: what is imported by name must be written out.")
             add(str(node.args[0].value))
-    return {module for module in found if module in known and module != name}
+    offered = {module for module in found if name == DOOR and room(module) in ABOVE_THE_DOOR}
+    return {module for module in found - offered if module in known and module != name}
 
 
 def imports(package: Path = PACKAGE) -> dict[str, set[str]]:

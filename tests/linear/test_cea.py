@@ -10,7 +10,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import fivjax as fj
 from fivjax import contact
-from fivjax.foundation.compiling import less_thought
+from fivjax.foundation.compiling import COMPILED_QUICKLY
 from fivjax.foundation.linear_solve import solve
 from fivjax.linear import cea, linearisation, polynomials, routh_hurwitz
 from fivjax.linear.linearisation import linear_sliding
@@ -480,17 +480,18 @@ def test_margin_is_the_product_of_sums_of_eigenvalues():
         assert np.min(np.abs(sums - value)) < 1e-9
 
 
-def test_a_slope_is_right_with_the_options_that_compile_quickly():
-    """With level 0 of LLVM's optimisations in place of 1, XLA makes of this slope a zero."""
+@pytest.mark.parametrize("options", [{}, COMPILED_QUICKLY], ids=["those of the tests", "those of users"])
+def test_a_slope_is_right_with_the_options_that_compile_quickly(options):
+    """With level 0 of LLVM's optimisations and its quick choice of instructions XLA makes of this slope a zero."""
 
     def instability(mu):
         return -cea.margin(belt(), mu)
 
     with jax.enable_x64(True):
         mu = jnp.asarray(0.99)
-        value, slope = jax.jit(
-            lambda mu: jax.jvp(instability, (mu,), (jnp.ones_like(mu),)), compiler_options=less_thought()
-        )(mu)
+        value, slope = jax.jit(lambda mu: jax.jvp(instability, (mu,), (jnp.ones_like(mu),)), compiler_options=options)(
+            mu
+        )
     assert value == pytest.approx(instability(0.99), rel=1e-12)
     assert slope == pytest.approx(reference.difference(instability, 0.99, 1e-5), rel=1e-6)
 

@@ -5,6 +5,7 @@ import builtins
 import dis
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +26,9 @@ FLOORS = (
     ("cycles",),
     ("branches", "maps"),
     ("kicks", "plot"),
-    ("design", "paper", "notebook"),
+    ("design", "notebook"),
+    (import_floors.DOOR,),
+    *((room,) for room in import_floors.ABOVE_THE_DOOR),
 )
 LONGEST, MEDIAN = 400, 150
 # Modules that are too long and are being divided; the list may only shrink.
@@ -44,7 +47,6 @@ def graph():
 def test_no_import_runs_upwards(graph):
     """A room that imports a higher one, or one beside it, also inside a function, could not be used or read without it."""
     floor = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-    floor.update({import_floors.DOOR: len(FLOORS), "cli": len(FLOORS) + 1})
     for module, targets in graph.items():
         here = import_floors.room(module)
         assert here in floor, f"room `{here}` has no floor"
@@ -58,7 +60,8 @@ def test_no_imports_run_in_a_ring(graph):
     rooms = import_floors.between_rooms(graph)
     assert import_floors.cycle(rooms) is None
     assert import_floors.cycle(graph) is None
-    of_rooms = {room: targets for room, targets in rooms.items() if room not in (import_floors.DOOR, "cli")}
+    above = (import_floors.DOOR, *import_floors.ABOVE_THE_DOOR)
+    of_rooms = {room: targets for room, targets in rooms.items() if room not in above}
     assert len(import_floors.floors(of_rooms)) <= 10
 
 
@@ -111,8 +114,49 @@ def test_public_names_are_what_the_stub_says():
     assert set(dir(fj)) == names
     assert not [name for name in names if name.startswith("_")]
     assert fj.__version__[0].isdigit()
-    for room in (room for rooms in FLOORS for room in rooms if (Path(fj.__file__).parent / room).is_dir()):
+    for room in {import_floors.room(name) for name in import_floors.modules()} - {import_floors.DOOR}:
         importlib.import_module(f"fivjax.{room}")
+
+
+def offered(place: str, text: str) -> set[str]:
+    """What a module or a stub offers: what is defined in it, or imported as `x as x`."""
+    nodes = ast.parse(text, place).body
+    imported = (alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names)
+    defined = {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    return defined | {alias.name for alias in imported if alias.asname == alias.name}
+
+
+def not_public(name: str, path: Path, public: set[str]) -> set[str]:
+    """What a module of the paper uses of the package besides public names: imports, and attributes of `fj` and of its modules."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute) and re.fullmatch(r"fj(\.\w+)+", ast.unparse(node)):
+            _, first, *inner = ast.unparse(node).split(".")
+            value = getattr(fj, first, None) if first in public else None
+            if first not in public or (inner and inspect.ismodule(value) and inner[0] not in offered_by(value)):
+                found.add(ast.unparse(node))
+    own = import_floors.imported(name, path, import_floors.modules())
+    return found | {one for one in own if import_floors.room(one) not in ("paper", import_floors.DOOR)}
+
+
+def offered_by(module) -> set[str]:
+    return offered(module.__name__, inspect.getsource(module))
+
+
+def test_the_paper_is_written_with_public_names(tmp_path):
+    """The figures of the paper are what a user could write; what they need and is not public would be missing to users."""
+    public = offered("the stub", Path(fj.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    assert public == set(dir(fj))
+    own = {name: path for name, path in import_floors.modules().items() if import_floors.room(name) == "paper"}
+    assert len(own) > 10
+    for name, path in own.items():
+        assert not not_public(name, path, public), name
+    # What the check is there to see.
+    for number, text in enumerate(
+        ("from ..io import datasets", "from fivjax.plot import style", "fj.plot.style.BLUE", "fj._show")
+    ):
+        (tmp_path / f"{number}.py").write_text(f"import fivjax as fj\n{text}\n")
+        assert not_public("fivjax.paper.made_up", tmp_path / f"{number}.py", public), text
 
 
 STARTS = {
@@ -147,6 +191,12 @@ def test_what_a_start_loads(loaded, step):
     """Seconds of imports that a session may never need are left until they are used."""
     assert "fivjax" in loaded[step]
     assert not loaded[step] & HEAVY
+    # What is written with the public names comes after them.
+    assert not {
+        name
+        for name in loaded[step]
+        if name.startswith("fivjax.") and import_floors.room(name) in import_floors.ABOVE_THE_DOOR
+    }
 
 
 @pytest.mark.parametrize("room", COMPUTING)
