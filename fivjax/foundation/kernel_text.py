@@ -33,6 +33,11 @@ class Form(NamedTuple):
         told = tuple(leaf if array is None else array for leaf, array in zip(leaves, arrays, strict=True))
         return cls(structure, told), [leaf for leaf, array in zip(leaves, arrays, strict=True) if array is not None]
 
+    @property
+    def kept(self) -> "Form":
+        """The first that was the same, so that a kernel is looked up without comparing all that a form says."""
+        return _FORMS.setdefault(self, self)
+
     def args(self, arrays: Sequence) -> Any:
         """The arguments with these arrays."""
         remaining = iter(arrays)
@@ -43,6 +48,9 @@ class Form(NamedTuple):
     def arrays(self) -> list["Array"]:
         """Those of the arguments, in order."""
         return [leaf for leaf in self.leaves if isinstance(leaf, Array)]
+
+
+_FORMS: dict[Form, Form] = {}
 
 
 class Array(NamedTuple):
