@@ -141,7 +141,7 @@ def bulk() -> None:
         "on the cycle": ((0.22, 0.2275), (1.0, 1.5), (1.25, 1.6)),
         "quiet": ((0.05, 0.15), (2.9, 3.0), (1.1, 1.3)),
     }
-    how = motion.How(fj.EventExact(), False)
+    how = motion.MotionAsked(fj.EventExact(), False)
     for kind, make in kinds.items():
         for what, ends in ranges.items():
             rng, rows, form = np.random.default_rng(3), [], None

@@ -98,7 +98,7 @@ def first_tangential(structure: Structure) -> int:
     return int(np.ravel(contact_coordinates(structure)[0])[0])
 
 
-class How(eqx.Module):
+class PeriodAsked(eqx.Module):
     """How a period is followed and what of it is kept, fixed when it is traced."""
 
     method: AbstractStepper = eqx.field(static=True)
@@ -116,7 +116,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     n, tangential = scene.structure.size, first_tangential(scene.structure)
     longest = int(LONGEST * LOOKS) + 1
     instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 1) / LOOKS) / frequency
-    _, (states, contacts) = _settling((scene, How(method)), instants, by_kernel=has_kernel(scene, method))
+    _, (states, contacts) = _settling((scene, PeriodAsked(method)), instants, by_kernel=has_kernel(scene, method))
     speed = states[:, n + tangential]
     rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
     begin = jnp.argmax(rises) + 1
@@ -151,8 +151,8 @@ _settling = KernelFunction(_settle)
 
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
-    args, nothing = (scene, cycle, How(for_derivatives(method), count)), np.zeros(1)
-    (after, lines, impulses), _ = _period(args, nothing, by_kernel=has_kernel(scene, method))
+    args = scene, cycle, PeriodAsked(for_derivatives(method), count)
+    (after, lines, impulses), _ = _period(args, by_kernel=has_kernel(scene, method))
     lines, impulses = ((2 / cycle.period) * (part[:, 0] - 1j * part[:, 1]) for part in (lines, impulses))
     return after._replace(lines=lines, impulses=impulses)
 
@@ -199,7 +199,7 @@ def waveform(
     """Channels of a cycle at instants between 0 and its period (s), in any order. Differentiable in forward mode."""
     fixed = jax.lax.stop_gradient(instants)
     order = jnp.argsort(fixed)
-    args = scene, cycle, How(for_derivatives(method), channels=channels)
+    args = scene, cycle, PeriodAsked(for_derivatives(method), channels=channels)
     _, rows = _along_period(args, fixed[order], by_kernel=has_kernel(scene, method))
     values, slopes = (jnp.zeros_like(part).at[order].set(part) for part in rows)
     # The rows are those of fixed instants.

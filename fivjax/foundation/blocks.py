@@ -31,8 +31,8 @@ def workers() -> int:
 
 
 def in_threads(run: Callable, parts: Iterable, pool: Executor, threads: int) -> None:
-    """`run(part)` for all parts, in so many threads: this one begins at once, and others of the pool take what is left when they
-    have woken.
+    """`run(part)` for all parts, in so many threads: this one begins at once, and others of the pool take what is left once
+    they have woken.
     """
     left = iter(list(parts))
 

@@ -16,7 +16,7 @@ from ..foundation.precision import known_to_numpy
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding
-from ..section.crossings import How, Kick, Point, to_crossing
+from ..section.crossings import ByMethod, Kick, Point, to_crossing
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
@@ -69,13 +69,13 @@ def _followed(
     if not by_kernel:
         # XLA compiles a program for each number of rows.
         wanted = MOST_CROSSINGS
-    args = How(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
+    args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
     along = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), _count(directions))), args)
     moving = still[0], along, still[2], still[3]
     if of_start is not None:
         moving = eqx.tree_at(lambda args: args[2].y, moving, of_start.T)
-    (end, rows), (_, slopes) = _motion_after_kick.derived(args, np.arange(1.0, wanted + 1), moving, by_kernel=by_kernel)
+    (end, rows), (_, slopes) = _motion_after_kick.derived(args, moving, np.arange(1.0, wanted + 1), by_kernel=by_kernel)
     at, contact = rows.point, rows.point.contact
     return Crossings(
         at.y, np.moveaxis(slopes.point.y, -1, 0), contact.status, contact.direction, rows.events, int(end.crossed)

@@ -11,7 +11,7 @@ from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
-from .crossings import Arrival, How, Point, motion_to_section
+from .crossings import Arrival, ByMethod, Point, motion_to_section
 
 # Returns in all that are shared out among threads.
 LEAST_IN_THREADS = 64
@@ -61,7 +61,7 @@ class SectionKernels:
             contact = Contact(np.asarray(status, np.int32)[0], np.asarray(direction, float)[0])
             whose = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.whose)
             last = np.int32(1), np.float64(np.inf), np.bool_(False)
-            self.form = Form.of((How(EventExact()), whose, Point(np.asarray(y)[0], contact), *last))[0].kept
+            self.form = Form.of((ByMethod(EventExact()), whose, Point(np.asarray(y)[0], contact), *last))[0].kept
         # In the order of that tree.
         own = np.empty((len(y), 3))
         own[:, 0], own[:, 1], own[:, 2] = crossings, np.inf, peaks
