@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Mechanics, Status, same_mode
-from ..foundation.polynomial import value_and_slope
+from ..foundation.polynomial import value_and_rate
 from ..io.recordings import Channel
 from ..steppers.base import AbstractStepper, rates
 from ..steppers.core import Segment
@@ -23,7 +23,7 @@ def channels_inside(
     By the series of `EventExact`, which its advance has computed already; else by a cubic between the ends of the step.
     """
     terms, unit = channel_series(method, mechanics, segment, channels)
-    value, _ = value_and_slope(terms, (times / unit)[:, None])
+    value, _ = value_and_rate(terms, unit, times[:, None])
     return value
 
 

@@ -26,7 +26,7 @@ from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..contact.coordinates import at_places
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
-from ..foundation.polynomial import value_and_slope
+from ..foundation.polynomial import value_and_rate
 from ..io.recordings import Channel
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
@@ -234,9 +234,8 @@ def _channels_along(args, instants: Float[Array, " q"]):
             return (period - now.left <= instant) & (now.left > 0) & (now.taken < MOST_ADVANCES)
 
         now = jax.lax.while_loop(going, step, now)
-        value, slope = value_and_slope(now.terms, (instant - now.t) / now.unit)
-        value = jnp.where(now.taken < MOST_ADVANCES, value, jnp.nan)
-        return now, (value, slope / now.unit)
+        value, rate = value_and_rate(now.terms, now.unit, instant - now.t)
+        return now, (jnp.where(now.taken < MOST_ADVANCES, value, jnp.nan), rate)
 
     zero, none = jnp.zeros_like(period), jnp.zeros((terms_of(how.method), len(how.channels)))
     begin = _Step(zero, none, zero + 1, cycle.y, cycle.contact, period, jnp.zeros((), jnp.int32))

@@ -76,9 +76,8 @@ def section_kernels(scene: Scene, mechanics, longest_return, pool: Executor | No
 
 def _on_section(end: Arrival):
     """State, status and direction on the section; the state is NaN where the section was not reached."""
-    point = end.at.point
-    y = np.where(end.arrived[:, None], point.y, np.nan)
-    return y, point.contact.status.astype(np.int32), point.contact.direction
+    point, contact = end.at.point, end.at.point.contact
+    return np.where(end.arrived[:, None], point.y, np.nan), contact.status.astype(np.int32), contact.direction
 
 
 def numbers_in_rows(tree) -> Float[np.ndarray, "g k"]:

@@ -16,7 +16,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
-from ..foundation.polynomial import value_and_slope
+from ..foundation.polynomial import value_and_rate
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
 from ..steppers.core import Segment, next_part
@@ -204,7 +204,7 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
 
 def _at(mechanics: Mechanics, method: EventExact, accounts_of, now: Step, instant) -> tuple[State, Ledger | None]:
     """The state and the ledger within a step."""
-    y, _ = value_and_slope(now.series, (instant - now.t) / now.unit)
+    y, _ = value_and_rate(now.series, now.unit, instant - now.t)
     y = physics.on_constraint(mechanics, now.contact, y)
     if accounts_of is None:
         return y, None
