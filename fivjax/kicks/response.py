@@ -6,12 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
-from ..branches.multiple_shooting import parameter_direction
 from ..contact import Contact, Status
 from ..foundation.kernel_functions import KernelFunction
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import known_to_numpy
 from ..model.load import Pulse
 from ..model.scene import Scene
@@ -37,8 +37,16 @@ class Crossings(NamedTuple):
 
 def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
     """The scene's derivatives by several of its parameters, stacked along a first axis."""
-    each = [parameter_direction(scene, name) for name in names]
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
+    return _directions_of(scene, names, np.array([float(scene.parameters[name]) for name in names]))
+
+
+@by_numpy
+def _directions_of(scene: Scene, names: tuple[str, ...], values: Float[Array, " k"]) -> Scene:
+    def moved(values) -> Scene:
+        return scene.replace(**dict(zip(names, values, strict=True)))
+
+    # All in one, because each is traced.
+    return jax.vmap(lambda along: jax.jvp(moved, (values,), (along,))[1])(jnp.eye(len(names)))
 
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
