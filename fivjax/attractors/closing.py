@@ -131,7 +131,7 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
 def _newton_steps(maps: ReturnMaps, jacobian, gap) -> Float[np.ndarray, "m 2n"]:
     """NaN where there is none."""
     matrices = np.eye(gap.shape[1]) - jacobian
-    if len(maps.structure.places) > 1:
+    if len(maps.structure.contacts) > 1:
         # Uncoupled oscillators may be shifted against each other in time, so the step is not unique: the shortest is taken.
         steps = [np.linalg.lstsq(*one, rcond=1e-9)[0] for one in zip(matrices, gap, strict=True)]
         return np.array(steps).reshape(gap.shape)
