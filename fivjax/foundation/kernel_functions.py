@@ -79,20 +79,9 @@ class KernelFunction:
 
     def derived_by(self, args: tuple, leaf: np.ndarray, directions, instants=NO_ROWS, *, by_kernel: bool = True):
         """The same, along directions of one of the arguments' arrays, which is this very `leaf`."""
-        refuse_if_forked()
-        form, arrays = Form.of(args)
-        wide = tuple(array is leaf for array in arrays)
-        if by_kernel:
-            given, along = _rows(arrays, []), directions.reshape(leaf.size, -1)
-            found, slopes = self.derived_of_many(form, given, np.asarray(instants), wide, along)
-            return jax.tree.map(lambda leaf: leaf[0], found), jax.tree.map(lambda leaf: leaf[0], slopes)
-        total = directions.shape[-1]
-        dots = [
-            directions if moves else np.zeros((*array.shape, total))
-            for array, moves in zip(form.arrays, wide, strict=True)
-        ]
-        found, slopes = self._derived_by_xla(form, *_typed(form, arrays, []), dots, instants)
-        return jax.tree.map(known_to_numpy, found), jax.tree.map(known_to_numpy, slopes)
+        count = directions.shape[-1]
+        still = jax.tree.map(lambda own: directions if own is leaf else np.zeros((*np.shape(own), count)), args)
+        return self.derived(args, still, instants, by_kernel=by_kernel)
 
     def of_many(
         self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants=NO_ROWS, pool: Executor | None = None
