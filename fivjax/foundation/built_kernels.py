@@ -206,10 +206,9 @@ wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else
     space = {"wp": wp, "body": body}
     exec(compile(code, place, "exec"), space)
     module = wp.get_module(f"fivjax.kernel_{name}")
-    # Tangents side by side are vectors as they are written: more thought takes a fifth longer and makes them no faster.
-    thought = "-O1" if width > 1 else "-O3"
-    # What is compared with itself is compared to see whether it is a number.
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} {thought} -ffp-contract=fast -Wno-tautological-compare"
+    # What is compared with itself is compared to see whether it is a number. The same for all: Warp's headers are compiled anew
+    # for other flags.
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast -Wno-tautological-compare"
     module.options.update(max_unroll=1, cpu_compiler_flags=flags, enable_backward=False)
     kernel = wp.kernel(space["followed"], enable_backward=False, module=module)
     load(module, ["cpu"])
