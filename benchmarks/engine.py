@@ -145,7 +145,7 @@ def bulk() -> None:
         "on limit cycles": ((0.22, 0.2275), (1.0, 1.5), (1.25, 1.6)),
         "without events": ((0.05, 0.15), (2.9, 3.0), (1.1, 1.3)),
     }
-    how = motion.How(fj.EventExact(), False)
+    how = motion.MotionAsked(fj.EventExact(), False)
     print(
         f"| cycles of vibration per CPU second, 512 trajectories in one call (`engine bulk`) | {' | '.join(ranges)} |"
     )

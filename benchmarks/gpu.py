@@ -49,7 +49,7 @@ def motions(points: int) -> dict[str, np.ndarray]:
     for _ in range(256):
         mu, v, p = rng.uniform((0.15, 1.0, 1.1), (0.2275, 3.0, 1.6))
         scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu), v, fj.Pulse(100.0, p))
-        form, arrays = Form.of((scene, None, np.asarray(4000, np.int32), motion.How(fj.EventExact(), False)))
+        form, arrays = Form.of((scene, None, np.asarray(4000, np.int32), motion.MotionAsked(fj.EventExact(), False)))
         rows.append(np.concatenate([np.ravel(array).astype(float) for array in arrays]))
     given, seconds, last = np.tile(rows, (points**2 // 256, 1)), [], None
     for _ in range(3):

@@ -27,7 +27,7 @@ from ..foundation.kernel_functions import KernelFunction
 from ..foundation.numpy_evaluation import by_numpy
 from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import How
+from ..section.crossings import ByMethod
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
@@ -120,12 +120,12 @@ def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, follow
     own = _filled((np.asarray(y, float), np.asarray(h, float), ends), by_kernel)
     size = own[0].shape[1]
     # Directions of the derivatives: those of the state, the duration, the parameter.
-    args = How(stepper), scene
+    args = ByMethod(stepper), scene
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), size + 2)), (*args, *_first(own)))
     of_parameter = jax.tree.map(lambda leaf: np.asarray(leaf, float)[..., None] * np.eye(size + 2)[-1], direction)
     units = np.eye(size + 2)
     directions = still[0], of_parameter, units[:size], units[size], still[4]
-    found = _image.derived(args, np.zeros(1), directions, own=own, by_kernel=by_kernel)
+    found = _image.derived(args, directions, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
     parts = y, guard, to[..., :size], to[..., size], to[..., size + 1]
     return Images(*(part[:count] for part in (*parts, of_guard[:, :size], of_guard[:, size], of_guard[:, size + 1])))
@@ -189,7 +189,7 @@ def inside(scene: Scene, stepper: EventExact, phases: Phases) -> Inside:
     """Guards and states along all phases, including both ends of each."""
     by_kernel, (status, direction, _) = has_kernel(scene, stepper), _typed(phases.modes)
     own = _filled((phases.y, phases.h, status, direction), by_kernel)
-    _, rows = _looks((How(stepper), scene), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
+    _, rows = _looks((ByMethod(stepper), scene), np.linspace(0.0, 1.0, LOOKS + 1), own=own, by_kernel=by_kernel)
     return Inside(*(part[: len(phases.modes)] for part in rows))
 
 

@@ -1,10 +1,10 @@
 """Displacements, velocities and accelerations of channels at any instants inside one segment of a motion."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Mechanics, Status, same_mode
+from ..foundation.polynomial import value_and_rate
 from ..io.recordings import Channel
 from ..steppers.base import AbstractStepper, rates
 from ..steppers.core import Segment
@@ -23,13 +23,8 @@ def channels_inside(
     By the series of `EventExact`, which its advance has computed already; else by a cubic between the ends of the step.
     """
     terms, unit = channel_series(method, mechanics, segment, channels)
-    times = times / unit
-
-    def horner(total, term):
-        return total * times[:, None] + term, None
-
-    begin = jnp.broadcast_to(terms[-1], (times.shape[0], len(channels)))
-    return jax.lax.scan(horner, begin, terms[-2::-1])[0]
+    value, _ = value_and_rate(terms, unit, times[:, None])
+    return value
 
 
 def channel_series(

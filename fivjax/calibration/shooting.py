@@ -26,7 +26,7 @@ from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..contact.coordinates import at_places
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
-from ..foundation.polynomial import value_and_slope
+from ..foundation.polynomial import value_and_rate
 from ..io.recordings import Channel
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
@@ -98,7 +98,7 @@ def first_tangential(structure: Structure) -> int:
     return int(np.ravel(contact_coordinates(structure)[0])[0])
 
 
-class How(eqx.Module):
+class PeriodAsked(eqx.Module):
     """How a period is followed and what of it is kept, fixed when it is traced."""
 
     method: AbstractStepper = eqx.field(static=True)
@@ -116,7 +116,7 @@ def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) 
     n, tangential = scene.structure.size, first_tangential(scene.structure)
     longest = int(LONGEST * LOOKS) + 1
     instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 1) / LOOKS) / frequency
-    _, (states, contacts) = _settling((scene, How(method)), instants, by_kernel=has_kernel(scene, method))
+    _, (states, contacts) = _settling((scene, PeriodAsked(method)), instants, by_kernel=has_kernel(scene, method))
     speed = states[:, n + tangential]
     rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
     begin = jnp.argmax(rises) + 1
@@ -151,8 +151,8 @@ _settling = KernelFunction(_settle)
 
 def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
-    args, nothing = (scene, cycle, How(for_derivatives(method), count)), np.zeros(1)
-    (after, lines, impulses), _ = _period(args, nothing, by_kernel=has_kernel(scene, method))
+    args = scene, cycle, PeriodAsked(for_derivatives(method), count)
+    (after, lines, impulses), _ = _period(args, by_kernel=has_kernel(scene, method))
     lines, impulses = ((2 / cycle.period) * (part[:, 0] - 1j * part[:, 1]) for part in (lines, impulses))
     return after._replace(lines=lines, impulses=impulses)
 
@@ -199,7 +199,7 @@ def waveform(
     """Channels of a cycle at instants between 0 and its period (s), in any order. Differentiable in forward mode."""
     fixed = jax.lax.stop_gradient(instants)
     order = jnp.argsort(fixed)
-    args = scene, cycle, How(for_derivatives(method), channels=channels)
+    args = scene, cycle, PeriodAsked(for_derivatives(method), channels=channels)
     _, rows = _along_period(args, fixed[order], by_kernel=has_kernel(scene, method))
     values, slopes = (jnp.zeros_like(part).at[order].set(part) for part in rows)
     # The rows are those of fixed instants.
@@ -234,9 +234,8 @@ def _channels_along(args, instants: Float[Array, " q"]):
             return (period - now.left <= instant) & (now.left > 0) & (now.taken < MOST_ADVANCES)
 
         now = jax.lax.while_loop(going, step, now)
-        value, slope = value_and_slope(now.terms, (instant - now.t) / now.unit)
-        value = jnp.where(now.taken < MOST_ADVANCES, value, jnp.nan)
-        return now, (value, slope / now.unit)
+        value, rate = value_and_rate(now.terms, now.unit, instant - now.t)
+        return now, (jnp.where(now.taken < MOST_ADVANCES, value, jnp.nan), rate)
 
     zero, none = jnp.zeros_like(period), jnp.zeros((terms_of(how.method), len(how.channels)))
     begin = _Step(zero, none, zero + 1, cycle.y, cycle.contact, period, jnp.zeros((), jnp.int32))

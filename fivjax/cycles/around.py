@@ -1,5 +1,6 @@
 """One period of a cycle: its segments, its sequence of contact modes, its peak speed, harmonics and monodromy matrix."""
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -7,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
+from numpy.polynomial.legendre import leggauss
+from numpy.polynomial.polynomial import polyval
 
 from ..contact import Contact, State, Status
 from ..foundation.carried import depending_on
@@ -15,7 +18,7 @@ from ..foundation.precision import known_to_numpy
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS, How, Point, motion_to_section
+from ..section.crossings import MOST_SEGMENTS, ByMethod, Point, motion_to_section
 from ..section.peak_speed import higher_peak
 from ..section.return_maps import known_for_section
 from ..steppers.event_exact import EventExact
@@ -90,7 +93,7 @@ _period = KernelFunction(_around)
 
 def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float) -> Seen:
     """Segments, peak tangential speed and harmonics of one period from a point on it."""
-    args = How(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
+    args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
     most = LEAST_SEGMENTS
     while True:
         end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, stepper))
@@ -101,20 +104,24 @@ def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float) 
     return Seen(found, float(end.peak), harmonics(found, period))
 
 
+_gauss_points = functools.cache(leggauss)
+
+
 def harmonics(segments: Round, period: float) -> Complex[np.ndarray, "count n"]:
     r"""Fourier coefficients of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, over exactly one period; m/s.
 
     With this many Gauss points, a product of two series is integrated with an error far below that of the series itself.
     """
     order, n = segments.series.shape[1] - 1, segments.series.shape[2] // 2
-    points, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
+    points, weights = _gauss_points(order // 2 + 2)
     times = 0.5 * (points + 1.0) * segments.h[:, None]
-    x, velocities = (times / segments.unit[:, None])[..., None], np.zeros((*times.shape, n))
-    for k in reversed(range(order + 1)):
-        velocities = velocities * x + segments.series[:, None, k, n:]
-    turns = 2j * math.pi * np.arange(1, HARMONICS + 1)[:, None, None] * ((segments.t[:, None] + times) / period)
+    powers = np.vander((times / segments.unit[:, None]).ravel(), order + 1, increasing=True)
+    velocities = powers.reshape(*times.shape, order + 1) @ segments.series[..., n:]
+    once = np.exp(-2j * math.pi / period * (segments.t[:, None] + times)).ravel()
+    # All orders are powers of the first.
+    waves = np.multiply.accumulate(np.broadcast_to(once, (HARMONICS, len(once))))
     weighted = (0.5 * segments.h[:, None] * weights)[..., None] * velocities
-    return (2 / period) * np.einsum("hsq,sqn->hn", np.exp(-turns), weighted)
+    return (2 / period) * waves @ weighted.reshape(len(once), n)
 
 
 def word(segments: Round) -> tuple[Phase, ...]:
@@ -149,24 +156,21 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
     stuck = segments.contact.status == Status.STICK
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
-    start = Point(segments.y[longest], jax.tree.map(lambda leaf: leaf[longest], segments.contact))
-    middle, _ = _flow_with_jacobian(scene, stepper, start, 0.5 * float(segments.h[longest]))
-    _, matrix = _flow_with_jacobian(scene, stepper, middle, period)
+    middle = polyval(0.5 * segments.h[longest] / segments.unit[longest], segments.series[longest])
+    start = Point(middle, jax.tree.map(lambda leaf: leaf[longest], segments.contact))
+    matrix = _monodromy(scene, stepper, start, period)
     free = free_coordinates(scene, segments.contact.status[longest])
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
 
 
-def _flow_with_jacobian(
-    scene: Scene, stepper: EventExact, start: Point, time: float
-) -> tuple[Point, Float[np.ndarray, "state state"]]:
-    """The state after a given time (s), and its derivative by the start."""
-    start = jax.tree.map(known_to_numpy, start)
+def _monodromy(scene: Scene, stepper: EventExact, start: Point, period: float) -> Float[np.ndarray, "state state"]:
+    """The derivative of the state a period (s) later by that at the start."""
     whose, last = known_for_section(scene), np.array([float(NEVER)])
-    args = How(stepper), whose, start, NEVER, float(time), np.False_
+    args = ByMethod(stepper), whose, start, NEVER, period, np.False_
     by_kernel = has_kernel(scene, stepper)
-    (end, _), (slopes, _) = motion_to_section.derived_by(args, last, start.y, np.eye(len(start.y)), by_kernel=by_kernel)
-    return end.at.point, slopes.at.point.y
+    _, (slopes, _) = motion_to_section.derived_by(args, start.y, np.eye(len(start.y)), last, by_kernel=by_kernel)
+    return slopes.at.point.y
 
 
 def free_coordinates(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:

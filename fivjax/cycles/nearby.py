@@ -24,7 +24,7 @@ from ..foundation.precision import in_double_precision, known_to_numpy, refusing
 from ..model.printing import as_call
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
-from ..section.crossings import How, Point, motion_to_section
+from ..section.crossings import ByMethod, Point, motion_to_section
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from .cycle import LimitCycle, point_of, under_final_load
@@ -207,7 +207,7 @@ def _image(scene: Scene, contact: Contact, crossings):
     """The return map with period and peak, as a function of the state on the section; its further result is the contact mode
     there, and whether the section was reached.
     """
-    how, numbers = How(EventExact()), jnp.asarray(crossings, jnp.float64)[None]
+    how, numbers = ByMethod(EventExact()), jnp.asarray(crossings, jnp.float64)[None]
 
     def image(y):
         (at, _, arrived, peak), _ = motion_to_section(

@@ -5,7 +5,8 @@ threads, one per core or device.
 """
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -27,6 +28,24 @@ def workers() -> int:
     if jax.default_backend() != "cpu":
         return len(jax.local_devices())
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def in_threads(run: Callable, parts: Iterable, pool: Executor, threads: int) -> None:
+    """`run(part)` for all parts, in so many threads: this one begins at once, and others of the pool take what is left once
+    they have woken.
+    """
+    left = iter(list(parts))
+
+    def work() -> None:
+        for part in left:
+            run(part)
+
+    others = [pool.submit(work) for _ in range(threads - 1)]
+    work()
+    for other in others:
+        # One that has not begun by now has nothing to do.
+        if not other.cancel():
+            other.result()
 
 
 def in_blocks(

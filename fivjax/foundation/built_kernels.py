@@ -3,6 +3,8 @@
 They are kept for later processes.
 """
 
+import copy
+import ctypes
 import functools
 import hashlib
 import linecache
@@ -12,7 +14,7 @@ from itertools import pairwise
 import jax
 import numpy as np
 
-from .blocks import workers
+from .blocks import in_threads, workers
 from .kept_programs import kept_value
 from .kernel_text import Form, text, written
 from .warp_library import ONE_AT_A_TIME, folder_of_texts, gpus_for, load, warp
@@ -28,6 +30,9 @@ LEAST_IN_THREADS = 32
 # The arrays of every kernel, with their axes: over trajectories, then as said.
 GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
+# What a kernel is told beside where they are: the length of a row of numbers, from one row of instants to the next, and theirs.
+SIZES = ("numbers", "step", "count")
+_NO_DOTS = np.zeros((1, 1, 1))
 
 
 def width_for(directions: int, numbers: int) -> int:
@@ -59,9 +64,13 @@ class Kernel:
         """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
         # Tangents that do not depend on what is perturbed are not written: they are zero.
         found = tuple(np.zeros(shape) for shape in self.shapes(given.shape[:-1], instants.shape[-1]))
-        width = max(self.width, 1)
-        dots = np.zeros((1, 1, width)) if dots is None else np.ascontiguousarray(dots)
-        self.launch([np.ascontiguousarray(given), dots, np.ascontiguousarray(instants)], list(found), pool)
+        dots = _NO_DOTS if dots is None else np.ascontiguousarray(dots)
+        arrays = [np.ascontiguousarray(given), dots, np.ascontiguousarray(instants), *found]
+        # Several tangents side by side are a type of the compiler for CPUs.
+        if self.width <= 1 and (devices := gpus_for(len(given))):
+            self._launch_on_gpus(devices, arrays[: len(GIVEN)], found)
+        else:
+            self.launch_on_cpu(*_places([(array.ctypes.data, array.shape) for array in arrays]), len(given), pool)
         return found
 
     def shapes(self, batch: tuple[int, ...], count: int) -> tuple[tuple[int, ...], ...]:
@@ -71,34 +80,38 @@ class Kernel:
         of_rows = count * row_dots if self.width else 1
         return (*batch, ends), (*batch, count * rows), (*batch, end_dots, width), (*batch, of_rows, width)
 
-    def launch(self, given: list, found: list, pool: Executor | None = None) -> None:
-        """Run the kernel for all rows of these arrays, and fill those that are `found`."""
-        wp = warp()
-        # Several tangents side by side are a type of the compiler for CPUs.
-        if self.width <= 1 and (devices := gpus_for(len(found[0]))):
-            self._launch_on_gpus(devices, given, found)
-            return
-        self.launch_on_cpu(
-            [wp.array(part, dtype=wp.float64, device="cpu", copy=False) for part in (*given, *found)], pool
-        )
+    def launch_on_arrays(self, arrays: list) -> None:
+        """Run the kernel for all rows of these arrays of Warp's on the CPU."""
+        self.launch_on_cpu(*_places([(array.ptr or 0, array.shape) for array in arrays]), arrays[len(GIVEN)].shape[0])
 
-    def launch_on_cpu(self, arrays: list, pool: Executor | None = None) -> None:
-        """The same for arrays of Warp's, in as many threads as there are cores."""
-        wp, kernel, lanes = warp(), self.kernel, arrays[len(GIVEN)].shape[0]
+    def launch_on_cpu(
+        self, addresses: list[int], sizes: tuple[int, int, int], lanes: int, pool: Executor | None = None
+    ) -> None:
+        """The same for arrays at these addresses, in as many threads as there are cores."""
+        recorded, addressed = self._recorded, list(map(ctypes.c_uint64, addresses))
+        sized = list(map(ctypes.c_int32, sizes))
 
         def run(part: tuple[int, int]) -> None:
-            wp.launch(kernel, dim=part[1] - part[0], inputs=[*arrays, part[0]], device="cpu", block_dim=1)
+            launch = copy.copy(recorded)
+            launch.params = [None, *addressed, *sized, ctypes.c_int32(part[0])]
+            launch.set_dim(part[1] - part[0])
+            launch.launch()
 
-        if pool is None:
-            pool = _threads() if lanes >= LEAST_IN_THREADS else None
+        if pool is None and lanes >= LEAST_IN_THREADS:
+            pool = _threads()
         if pool is None or lanes == 1:
             run((0, lanes))
             return
         parts = min(lanes, AT_A_TIME * workers())
-        for _ in pool.map(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist())):
-            pass
+        in_threads(run, pairwise(np.linspace(0, lanes, parts + 1).astype(int).tolist()), pool, min(parts, workers()))
 
-    def _launch_on_gpus(self, devices: list[str], given: list, found: list) -> None:
+    @functools.cached_property
+    def _recorded(self):
+        """A launch that Warp has prepared: it takes a tenth of the time of one from the start."""
+        nothing = [0] * (len(GIVEN) + len(FOUND) + len(SIZES) + 1)
+        return warp().launch(self.kernel, dim=1, inputs=nothing, device="cpu", block_dim=1, record_cmd=True)
+
+    def _launch_on_gpus(self, devices: list[str], given: list, found: tuple) -> None:
         wp = warp()
         load(self.kernel.module, devices)
         ends = np.linspace(0, len(found[0]), len(devices) + 1).astype(int).tolist()
@@ -107,10 +120,11 @@ class Kernel:
             # What is the same for all trajectories has one row.
             own = [whole if len(whole) == 1 else whole[part] for whole in (*given, *found)]
             arrays = [wp.array(rows, dtype=wp.float64, device=device) for rows in own]
-            wp.launch(self.kernel, dim=part.stop - part.start, inputs=[*arrays, 0], device=device)
-            launched.append((part, arrays[len(given) :]))
+            addresses, sizes = _places([(array.ptr or 0, array.shape) for array in arrays])
+            wp.launch(self.kernel, dim=part.stop - part.start, inputs=[*addresses, *sizes, 0], device=device)
+            launched.append((part, arrays))
         for part, arrays in launched:
-            for whole, array in zip(found, arrays, strict=True):
+            for whole, array in zip(found, arrays[len(given) :], strict=True):
                 whole[part] = array.numpy()
 
     def slopes(self, end_dots, row_dots, count: int):
@@ -137,6 +151,12 @@ class Kernel:
         return tuple(map(jax.tree.unflatten, self.text.structures, parts))
 
 
+def _places(arrays: list[tuple[int, tuple[int, ...]]]) -> tuple[list[int], tuple[int, int, int]]:
+    """What a kernel is told of arrays with these addresses and shapes: where they are, and `SIZES`."""
+    (_, (_, numbers)), _, (_, (rows, count)) = arrays[: len(GIVEN)]
+    return [address for address, _ in arrays], (numbers, 0 if rows == 1 else count, count)
+
+
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers(), "fivjax kernels")
@@ -147,7 +167,7 @@ _KERNELS: dict = {}
 
 def kernel_of(function, form: Form, wide: tuple[bool, ...] = (), width: int = 0) -> Kernel:
     """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`."""
-    key = function, form, wide, width
+    key = function, form.kept, wide, width
     if key not in _KERNELS:
         with ONE_AT_A_TIME:
             if key not in _KERNELS:
@@ -163,30 +183,31 @@ def _compiled(source: str, widths: tuple[int, ...], directions: int, width: int)
     wide = f"double wide __attribute__((ext_vector_type({width}), aligned(8)))" if width > 1 else "double wide"
     body = f"""
 typedef {wide};
-const long long lane_ = lane, count = instants_.shape[1];
-const double* given = given_.data + lane_ * given_.shape[1];
-const wide* dots = (const wide*)dots_.data;
-const double* instants = instants_.data + (instants_.shape[0] == 1 ? 0 : lane_) * count;
-double* ends = ends_.data + lane_ * {ends};
-double* rows = rows_.data + lane_ * count * {rows};
-wide* end_dots = (wide*)end_dots_.data + lane_ * {end_dots};
-wide* row_dots = (wide*)row_dots_.data + lane_ * {f"count * {row_dots}" if width else 1};
+const long long lane_ = lane, count = count_;
+const double* given = (const double*)given_ + lane_ * numbers_;
+const wide* dots = (const wide*)dots_;
+const double* instants = (const double*)instants_ + lane_ * step_;
+double* ends = (double*)ends_ + lane_ * {ends};
+double* rows = (double*)rows_ + lane_ * count * {rows};
+wide* end_dots = (wide*)end_dots_ + lane_ * {end_dots};
+wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else 1};
 {source}
 """
-    arrays = {**GIVEN, **FOUND}
-    signature = ", ".join(f"{own}_: A{axes}" for own, axes in arrays.items())
-    names = ", ".join(f"{own}_" for own in arrays)
+    names = [f"{own}_" for own in (*GIVEN, *FOUND, *SIZES)]
+    types = ["wp.uint64"] * len(GIVEN | FOUND) + ["int"] * len(SIZES)
+    signature = ", ".join(f"{own}: {kind}" for own, kind in zip(names, types, strict=True))
     code = (
         f"@wp.func_native(body)\ndef run(lane: int, {signature}): ...\n\n"
-        f"def followed({signature}, first: int):\n    run(first + wp.tid(), {names})\n"
+        f"def followed({signature}, first: int):\n    run(first + wp.tid(), {', '.join(names)})\n"
     )
     # Warp reads a kernel's source by `inspect`, which looks here.
     place = f"<fivjax kernel {name}>"
     linecache.cache[place] = (len(code), None, code.splitlines(keepends=True), place)
-    space = {"wp": wp, "body": body, **{f"A{axes}": wp.array(dtype=wp.float64, ndim=axes) for axes in (2, 3, 4)}}
+    space = {"wp": wp, "body": body}
     exec(compile(code, place, "exec"), space)
     module = wp.get_module(f"fivjax.kernel_{name}")
-    # What is compared with itself is compared to see whether it is a number.
+    # What is compared with itself is compared to see whether it is a number. The same for all: Warp's headers are compiled anew
+    # for other flags.
     flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast -Wno-tautological-compare"
     module.options.update(max_unroll=1, cpu_compiler_flags=flags, enable_backward=False)
     kernel = wp.kernel(space["followed"], enable_backward=False, module=module)

@@ -20,6 +20,9 @@ from .kernel_primitive import is_real, values
 from .kernel_text import Form
 from .precision import is_known, known_to_numpy
 
+# The instants of a function without rows.
+NO_ROWS = np.zeros(1)
+
 
 class KernelFunction:
     """A JAX function `function(args, instants)` of a tree of arrays and other values, and of instants (shape `(k,)`).
@@ -33,7 +36,7 @@ class KernelFunction:
         self.function = function
         self.differentiated = function if differentiated is None else differentiated
 
-    def __call__(self, args: tuple, instants, *, own: tuple = (), by_kernel: bool = True):
+    def __call__(self, args: tuple, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):
         """The results: arrays of NumPy where all values are known, else traced ones; by XLA unless `by_kernel`.
 
         `own` are further arguments, whose arrays have a leading axis over several trajectories with known values; then so have
@@ -53,7 +56,7 @@ class KernelFunction:
             return found if own else jax.tree.map(lambda leaf: leaf[0], found)
         return kernel_of(self, form).results(*values(self, form, tuple(common), instants))
 
-    def derived(self, args: tuple, instants, directions, *, own: tuple = (), by_kernel: bool = True):
+    def derived(self, args: tuple, directions, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):
         """The results for known values, as a call gives them, and the derivatives of real ones along directions.
 
         `directions` is a tree like the arguments of one trajectory, with one more, last axis over the directions; what is zero
@@ -74,24 +77,15 @@ class KernelFunction:
             return found, slopes
         return jax.tree.map(lambda leaf: leaf[0], found), jax.tree.map(lambda leaf: leaf[0], slopes)
 
-    def derived_by(self, args: tuple, instants, leaf: np.ndarray, directions, *, by_kernel: bool = True):
+    def derived_by(self, args: tuple, leaf: np.ndarray, directions, instants=NO_ROWS, *, by_kernel: bool = True):
         """The same, along directions of one of the arguments' arrays, which is this very `leaf`."""
-        refuse_if_forked()
-        form, arrays = Form.of(args)
-        wide = tuple(array is leaf for array in arrays)
-        if by_kernel:
-            given, along = _rows(arrays, []), directions.reshape(leaf.size, -1)
-            found, slopes = self.derived_of_many(form, given, np.asarray(instants), wide, along)
-            return jax.tree.map(lambda leaf: leaf[0], found), jax.tree.map(lambda leaf: leaf[0], slopes)
-        total = directions.shape[-1]
-        dots = [
-            directions if moves else np.zeros((*array.shape, total))
-            for array, moves in zip(form.arrays, wide, strict=True)
-        ]
-        found, slopes = self._derived_by_xla(form, *_typed(form, arrays, []), dots, instants)
-        return jax.tree.map(known_to_numpy, found), jax.tree.map(known_to_numpy, slopes)
+        count = directions.shape[-1]
+        still = jax.tree.map(lambda own: directions if own is leaf else np.zeros((*np.shape(own), count)), args)
+        return self.derived(args, still, instants, by_kernel=by_kernel)
 
-    def of_many(self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants, pool: Executor | None = None):
+    def of_many(
+        self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants=NO_ROWS, pool: Executor | None = None
+    ):
         """The results for many trajectories, of which each has a row: all arrays of its arguments, one after the other. The
         instants are one row, or one for each trajectory.
         """
@@ -108,11 +102,13 @@ class KernelFunction:
         width = width_for(total, given.shape[1])
         kernel = kernel_of(self, form, wide, width)
         for start in range(0, total, width):
-            part = directions[:, start : start + width]
-            part = np.pad(part, ((0, 0), (0, width - part.shape[1])))
-            parts.append(kernel.launched(given, instants, part[None], pool))
-        ends, rows = parts[0][:2]
-        end_dots, row_dots = (np.concatenate([part[k] for part in parts], axis=-1)[..., :total] for k in (2, 3))
+            part = np.zeros((1, len(directions), width))
+            part[0, :, : total - start] = directions[:, start : start + width]
+            parts.append(kernel.launched(given, instants, part, pool))
+        ends, rows, *dots = parts[0]
+        if len(parts) > 1:
+            dots = [np.concatenate([part[k] for part in parts], axis=-1) for k in (2, 3)]
+        end_dots, row_dots = (part[..., :total] for part in dots)
         return kernel.results(ends, rows), kernel.slopes(end_dots, row_dots, instants.shape[-1])
 
     # Without kernels.

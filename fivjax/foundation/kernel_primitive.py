@@ -4,6 +4,7 @@ Under `jit` it calls the kernel, under `vmap` it is one call for more trajectori
 tangents beside values takes its place.
 """
 
+import ctypes
 import functools
 import math
 from collections.abc import Sequence
@@ -211,8 +212,8 @@ def _callable(kernel: _Hashed):
 
     def launch(given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_):
         for part in (rows_, end_dots_, row_dots_):
-            part.zero_()
-        own.launch_on_cpu([given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_])
+            ctypes.memset(part.ptr, 0, part.capacity)
+        own.launch_on_arrays([given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_])
 
     launch.__annotations__ = {
         f"{name}_": wp.array(dtype=wp.float64, ndim=axes) for name, axes in {**GIVEN, **FOUND}.items()

@@ -33,6 +33,11 @@ class Form(NamedTuple):
         told = tuple(leaf if array is None else array for leaf, array in zip(leaves, arrays, strict=True))
         return cls(structure, told), [leaf for leaf, array in zip(leaves, arrays, strict=True) if array is not None]
 
+    @property
+    def kept(self) -> "Form":
+        """The first that was the same, so that a kernel is looked up without comparing all that a form says."""
+        return _FORMS.setdefault(self, self)
+
     def args(self, arrays: Sequence) -> Any:
         """The arguments with these arrays."""
         remaining = iter(arrays)
@@ -43,6 +48,9 @@ class Form(NamedTuple):
     def arrays(self) -> list["Array"]:
         """Those of the arguments, in order."""
         return [leaf for leaf in self.leaves if isinstance(leaf, Array)]
+
+
+_FORMS: dict[Form, Form] = {}
 
 
 class Array(NamedTuple):
@@ -76,18 +84,19 @@ def _name_of(own: np.dtype) -> str:
     return "float64" if np.issubdtype(own, np.floating) else own.name
 
 
-class Place(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Place:
     """Where an array is in a row of numbers."""
 
     start: int
     shape: tuple[int, ...]
     dtype: str
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         return count_of(self.shape)
 
-    @property
+    @functools.cached_property
     def is_real(self) -> bool:
         return np.issubdtype(np.dtype(self.dtype), np.floating)
 
@@ -165,7 +174,7 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
         with jax.ensure_compile_time_eval():
             source = of_kernel.source(traced.consts)
     places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
-    return structures[-1], source, *(tuple(map(tuple, those)) for those in places)
+    return structures[-1], source, *map(tuple, places)
 
 
 def text(plain: tuple) -> Text:
@@ -179,13 +188,14 @@ def text(plain: tuple) -> Text:
     )
 
 
-def _places(avals, leading: int = 0) -> tuple[Place, ...]:
+def _places(avals, leading: int = 0) -> list[tuple[int, tuple[int, ...], str]]:
+    """The parts of places in a row."""
     found, start = [], 0
     for aval in avals:
         shape = tuple(aval.shape)[leading:]
-        found.append(Place(start, shape, np.dtype(aval.dtype).name))
+        found.append((start, shape, np.dtype(aval.dtype).name))
         start += count_of(shape)
-    return tuple(found)
+    return found
 
 
 class _WriterOfKernel:

@@ -24,8 +24,8 @@ def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, " n *k"]) -> Inex
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
-        lambda _, b: _eliminated(matrix, b),
-        lambda _, b: _eliminated(matrix.T, b),
+        lambda _, b: _in_columns(matrix, b),
+        lambda _, b: _in_columns(matrix.T, b),
     )
 
 
@@ -52,42 +52,53 @@ def determinant(matrix: Inexact[Array, "n n"]) -> Inexact[Array, ""]:
     return _repeated(n, further, (jnp.ones((), matrix.dtype), matrix))[0]
 
 
-def _eliminated(matrix, right):
+def eliminated(matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"], xp=jnp):
+    """`solve` without its derivative; by NumPy, if that is `xp`."""
     n = matrix.shape[0]
     index = np.arange(n)
 
     # Apart from each other, because in a kernel the right side may be tangents, and the matrix none.
     def further(k, sides):
         matrix, right = sides
-        pivot, swapped, place = _pivoted(matrix, k)
-        own, right = _with_row_at(right, k, place)
+        pivot, swapped, place = _pivoted(matrix, k, xp)
+        own, right = _with_row_at(right, k, place, xp)
         at_k, factors, divisor = (index == k)[:, None], swapped[:, k, None], pivot[k]
         pivot, own = pivot / divisor, own / divisor
-        return jnp.where(at_k, pivot, swapped - factors * pivot), jnp.where(at_k, own, right - factors * own)
+        return xp.where(at_k, pivot, swapped - factors * pivot), xp.where(at_k, own, right - factors * own)
 
-    return _repeated(n, further, (matrix, right.reshape(n, -1)))[1].reshape(right.shape)
+    return _repeated(n, further, (matrix, right), xp)[1]
 
 
-def _pivoted(table, k):
+@jax.jit
+def fivjax_elimination(matrix, right):
+    # A call of its own, which is traced once: that takes longer than most of what is around it.
+    return eliminated(matrix, right)
+
+
+def _in_columns(matrix, right):
+    return fivjax_elimination(matrix, right.reshape(right.shape[0], -1)).reshape(right.shape)
+
+
+def _pivoted(table, k, xp=jnp):
     """The pivot's row in column k, the table with row k in its place, and that place. (Row k itself is left where it was, too:
     nobody reads it there.)
     """
     index = np.arange(table.shape[0])
-    size = jnp.where(index >= k, jnp.abs(table[:, k]), -1.0)
+    size = xp.where(index >= k, xp.abs(table[:, k]), -1.0)
     # By sums and comparisons, because indices that differ within a batch would be gathered system by system.
-    place = jnp.min(jnp.where(size == jnp.max(size), index, table.shape[0]))
-    return *_with_row_at(table, k, place), place
+    place = xp.min(xp.where(size == xp.max(size), index, table.shape[0]))
+    return *_with_row_at(table, k, place, xp), place
 
 
-def _with_row_at(table, k, place):
+def _with_row_at(table, k, place, xp):
     """The row at a place, and the table with row k there."""
     chosen = (np.arange(table.shape[0]) == place)[:, None]
-    return jnp.sum(jnp.where(chosen, table, 0.0), axis=0), jnp.where(chosen, table[k], table)
+    return xp.sum(xp.where(chosen, table, 0.0), axis=0), xp.where(chosen, table[k], table)
 
 
-def _repeated(count: int, further, value):
+def _repeated(count: int, further, value, xp=jnp):
     """`further(k, value)` for each k below a count: written out for a few, else in a loop."""
-    if count > LARGEST:
+    if count > LARGEST and xp is jnp:
         return jax.lax.fori_loop(0, count, further, value)
     for k in range(count):
         value = further(k, value)

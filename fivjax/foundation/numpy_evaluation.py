@@ -15,6 +15,7 @@ from jax.extend.core import Jaxpr, Literal
 from .compiling import compiled, transformed
 from .jaxprs import of_scan, solution, within
 from .kernel_text import Form
+from .linear_solve import eliminated, fivjax_elimination
 from .numpy_primitives import function_of
 
 # Calls after which it is compiled, and results that are kept in case they are asked for again.
@@ -81,41 +82,84 @@ class _Step(NamedTuple):
     writes: list[int]
     types: list[np.dtype]  # of results
 
+    def taken(self, values: list) -> None:
+        """Write the results among the values."""
+        found = self.function([values[k] for k in self.reads])
+        for own, result, kind in zip(self.writes, found, self.types, strict=True):
+            values[own] = result if getattr(result, "dtype", None) == kind else np.asarray(result, kind)
+
 
 class _Plan:
-    """A traced function whose equations are looked up once, and not in each call: that takes longer than computing them."""
+    """A traced function whose equations are looked up once, and not in each call: that takes longer than computing them. What
+    follows from constants alone is computed once, too, and what is called is part of the plan.
+    """
 
     def __init__(self, jaxpr: Jaxpr):
-        self.values: list = []  # literals, at their places
-        places: dict = {}
+        self.values: list = []  # constants, at their places
+        self.steps: list[_Step] = []
+        self.made: dict = {}  # places of what is the same wherever it stands
+        self.given = [self._new() for _ in (*jaxpr.constvars, *jaxpr.invars)]
+        self.ends = self._ends_of(jaxpr, self.given)
+        # Backwards, to leave out what nobody reads.
+        read, steps = set(self.ends), []
+        for step in reversed(self.steps):
+            if not read.isdisjoint(step.writes):
+                steps.append(step)
+                read.update(step.reads)
+        self.steps = steps[::-1]
+        self.made.clear()
 
-        def new(variable) -> int:
-            places[variable] = len(self.values)
-            self.values.append(None)
-            return places[variable]
+    def _new(self, value=None) -> int:
+        self.values.append(value)
+        return len(self.values) - 1
+
+    def _ends_of(self, jaxpr: Jaxpr, given: list[int]) -> list[int]:
+        """Places of what a traced function returns, from those of its constants and arguments."""
+        places = dict(zip((*jaxpr.constvars, *jaxpr.invars), given, strict=True))
 
         def place(atom) -> int:
             if not isinstance(atom, Literal):
                 return places[atom]
-            self.values.append(np.asarray(atom.val, atom.aval.dtype))
-            return len(self.values) - 1
+            value = np.asarray(atom.val, atom.aval.dtype)
+            return self._once((value.dtype, value.shape, value.tobytes()), self._new, value)
 
-        self.given = [new(variable) for variable in (*jaxpr.constvars, *jaxpr.invars)]
-        self.steps = []
         for equation in jaxpr.eqns:
-            reads = list(map(place, equation.invars))
-            writes = list(map(new, equation.outvars))
-            types = [np.dtype(variable.aval.dtype) for variable in equation.outvars]
-            self.steps.append(_Step(_function_of(equation), reads, writes, types))
-        self.ends = list(map(place, jaxpr.outvars))
+            reads, called, name = list(map(place, equation.invars)), within(equation.params), equation.primitive.name
+            if name == "custom_linear_solve":
+                called, reads = solution(equation.params, reads)
+            if called is not None and name not in LOOPS and not _is_elimination(equation):
+                consts = [self._new(np.asarray(const)) for const in called.consts]
+                places.update(zip(equation.outvars, self._ends_of(called.jaxpr, [*consts, *reads]), strict=True))
+                continue
+            same = equation.primitive, tuple(equation.params.items()), tuple(reads)
+            writes = self._once(same, self._computed, equation, reads)
+            places.update(zip(equation.outvars, writes, strict=True))
+        return list(map(place, jaxpr.outvars))
+
+    def _computed(self, equation, reads: list[int]) -> list[int]:
+        """Places of an equation's results: they are computed now from what is constant, else by a step."""
+        writes = [self._new() for _ in equation.outvars]
+        types = [np.dtype(variable.aval.dtype) for variable in equation.outvars]
+        step = _Step(_function_of(equation), reads, writes, types)
+        if all(self.values[own] is not None for own in reads):
+            step.taken(self.values)
+        else:
+            self.steps.append(step)
+        return writes
+
+    def _once(self, same, make: Callable, *of):
+        """What is made for this, or was when the same was met before."""
+        try:
+            return self.made[same] if same in self.made else self.made.setdefault(same, make(*of))
+        except TypeError:  # some parameters of primitives cannot be compared
+            return make(*of)
 
     def __call__(self, given) -> list:
         values = self.values.copy()
         for own, value in zip(self.given, given, strict=True):
             values[own] = value
-        for function, reads, writes, types in self.steps:
-            for own, result, kind in zip(writes, function([values[k] for k in reads]), types, strict=True):
-                values[own] = result if getattr(result, "dtype", None) == kind else np.asarray(result, kind)
+        for step in self.steps:
+            step.taken(values)
         return [values[own] for own in self.ends]
 
 
@@ -126,14 +170,17 @@ def _run(jaxpr: Jaxpr, consts, given) -> list:
     return _plan_of(jaxpr)([*map(np.asarray, consts), *given])
 
 
+def _is_elimination(equation) -> bool:
+    """Whether a linear system is solved here, and not a batch of some."""
+    own = equation.params.get("name") == fivjax_elimination.__name__
+    return own and all(variable.aval.ndim == 2 for variable in equation.invars)
+
+
 def _function_of(equation) -> Callable:
-    params, name = equation.params, equation.primitive.name
-    if name in LOOPS:
-        return functools.partial(LOOPS[name], params)
-    called = within(params)
-    if called is not None:
-        return functools.partial(_run, called.jaxpr, called.consts)
-    return function_of(equation)
+    if _is_elimination(equation):
+        return lambda sides: (eliminated(*sides, xp=np),)
+    name = equation.primitive.name
+    return functools.partial(LOOPS[name], equation.params) if name in LOOPS else function_of(equation)
 
 
 def _while(params, operands: list) -> list:
@@ -166,9 +213,4 @@ def _cond(params, operands: list) -> list:
     return _run(branch.jaxpr, branch.consts, rest)
 
 
-def _solved(params, operands: list) -> list:
-    solve, given = solution(params, operands)
-    return _run(solve.jaxpr, solve.consts, given)
-
-
-LOOPS: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _solved}
+LOOPS: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond}

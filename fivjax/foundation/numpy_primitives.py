@@ -1,5 +1,6 @@
 """JAX's primitives by NumPy, for values that are known; and which places of arrays the indexing ones read and write."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -144,8 +145,13 @@ def _window(shape, start, sizes, mode) -> tuple[slice, ...] | None:
 
 
 def _gathered(array, places, params):
-    found = gathered_places(array.shape, places, params)
+    found = _gathered_before(array.shape, places.dtype, places.shape, places.tobytes(), tuple(params.items()))
     return None if found is None else array.ravel()[found]
+
+
+@functools.lru_cache
+def _gathered_before(shape, kind, of_places, places: bytes, params):
+    return gathered_places(shape, np.frombuffer(places, kind).reshape(of_places), dict(params))
 
 
 def _scattered(array, places, update, params, added: bool):

@@ -20,6 +20,12 @@ def value_slope_and_bend(c: Sequence[Array] | Array, x: Array) -> tuple[Array, A
     return value, slope, bend
 
 
+def value_and_rate(c: Sequence[Array] | Array, unit: Array, time: Array) -> tuple[Array, Array]:
+    """A series at a time that its coefficients measure in a unit (s), and its derivative by time."""
+    value, slope = value_and_slope(c, time / unit)
+    return value, slope / unit
+
+
 def in_shares(c: Array, unit: Array) -> Array:
     """The coefficients of the same polynomial where its argument is measured in another unit."""
 

@@ -143,7 +143,10 @@ def critical_perturbation(
     scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")
     seen = first_crossings(scan, verdicts)
-    fine, contradicted = _narrowed(run, method, columns, *_to_narrow(scan, verdicts, seen), tolerance)
+    brackets, at_ends = _to_narrow(scan, verdicts, seen)
+    # Newton's method mostly finds the kick from what one round leaves.
+    few = derivatives and not isinstance(method, WhereSwitched)
+    fine, contradicted = _narrowed(run, method, columns, brackets, at_ends, tolerance, 1 if few else None)
     stepping = np.zeros(math.prod(shape))
     if isinstance(method, WhereSwitched):
         # Errors are first order in the step, so halving it changes the result by as much as the remaining error.
@@ -155,7 +158,16 @@ def critical_perturbation(
     answers = {}
     if derivatives:
         stage("Newton's method and derivatives")
-        fine, answers = with_derivatives(scene, functools.partial(_verdicts, run, method), columns, fine)
+
+        def narrowed(rows: np.ndarray, found: FirstCrossing) -> FirstCrossing:
+            chosen = {name: column[rows] for name, column in columns.items()}
+            ends = np.tile([Verdict.SLIDING, Verdict.LIMIT_CYCLE], (len(rows), 1))
+            finer, again = _narrowed(run, method, chosen, found.brackets[rows], ends, tolerance)
+            contradicted[rows] |= again
+            return finer
+
+        verdicts_of = functools.partial(_verdicts, run, method)
+        fine, answers = with_derivatives(scene, verdicts_of, columns, fine, narrowed if few else None)
     # If the lower end of the range already squeals, there is no kick that slides.
     width = np.where(np.isnan(fine.low), 0.0, fine.high - fine.low)
     dataset = xr.Dataset(
@@ -228,9 +240,16 @@ def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> np.n
 
 
 def _narrowed(
-    run, method, columns: dict[str, np.ndarray], brackets: np.ndarray, at_ends: np.ndarray, tolerance: float
+    run,
+    method,
+    columns: dict[str, np.ndarray],
+    brackets: np.ndarray,
+    at_ends: np.ndarray,
+    tolerance: float,
+    rounds: int | None = None,
 ) -> tuple[FirstCrossing, np.ndarray]:
-    """The crossings inside brackets, narrowed to the tolerance or to where undecided trajectories stop the narrowing.
+    """The crossings inside brackets, narrowed to the tolerance, or to where undecided trajectories stop the narrowing; in so
+    many `rounds` at most.
 
     The first ends of each bracket are run again, so that both ends of the returned crossing are verdicts of trajectories from
     the narrowing. Second result: which rows have a verdict that contradicts `at_ends` (rows, 2). Of two different verdicts on
@@ -242,7 +261,7 @@ def _narrowed(
     brackets = brackets.copy()
     open_ = np.flatnonzero(np.isfinite(brackets).all(axis=1))
     round_ = 0
-    while len(open_):
+    while len(open_) and round_ != rounds:
         round_ += 1
         shares = np.linspace(0, 1, POINTS_PER_ROUND + 2)
         p = brackets[open_, :1] + shares * np.diff(brackets[open_])

@@ -1,12 +1,17 @@
 """Critical kicks to rounding, with kind and derivatives, and with trajectories on both sides that prove them."""
 
+from collections.abc import Callable
+
 import numpy as np
+from jaxtyping import Int
 
 from ..maps.crossing import FirstCrossing
 from ..model.scene import Scene
 from ..verdicts.verdict import Verdict
 from .stable_manifold import Critical, critical_kick
 from .touching import GrazingKick, grazing_kick
+
+Narrowed = Callable[[Int[np.ndarray, " r"], FirstCrossing], FirstCrossing]
 
 KINDS = ("none", "manifold", "grazing")
 # Relative distance of the two proving trajectories from a critical kick.
@@ -26,11 +31,12 @@ def differentiable(scene: Scene) -> tuple[str, ...]:
 
 
 def with_derivatives(
-    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: FirstCrossing
+    scene: Scene, verdicts, columns: dict[str, np.ndarray], found: FirstCrossing, narrowed: Narrowed | None
 ) -> tuple[FirstCrossing, dict[str, np.ndarray]]:
     """The crossings, by Newton's method where it finds them; and kind, derivatives and reasons for each row.
 
-    `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p.
+    `verdicts(columns, kicks, label)` gives the verdicts of rows at their own values of p; `narrowed(rows, found)` the crossings
+    of those rows in narrower brackets, for where Newton's method does not find them from these.
     """
     names, rows = differentiable(scene), len(found.middle)
     kind, why = np.full(rows, KINDS[0], dtype="<U8"), np.full(rows, NO_CHANGE, dtype=object)
@@ -39,12 +45,22 @@ def with_derivatives(
     left = np.flatnonzero(np.isfinite(found.low) & np.isfinite(found.high))
     why[left] = NO_SADDLE
     # A motion that passes no saddle, or one that is not on the boundary, may just touch another contact mode.
-    for name, method in ((KINDS[1], critical_kick), (KINDS[2], grazing_kick)):
+    attempts = [(KINDS[1], critical_kick), (KINDS[2], grazing_kick)]
+    if narrowed is not None:
+        attempts.insert(0, attempts[0])
+    for attempt, (name, method) in enumerate(attempts):
+        if attempt == 1 and narrowed is not None and len(left):
+            finer = narrowed(left, found)
+            middle[left], low[left], high[left] = finer.middle, finer.low, finer.high
+            left = left[np.isfinite(finer.low) & np.isfinite(finer.high)]
+            why[left] = NO_SADDLE
         critical: dict[int, Critical | GrazingKick] = {}
         for row in left:
             here = scene.replace(**{key: float(column[row]) for key, column in columns.items()})
-            answer = method(here, (found.low[row], found.high[row]), names)
-            if answer is not None:
+            answer = method(here, (low[row], high[row]), names)
+            # In a wide bracket another crossing may be near, which is not the first.
+            narrow = narrowed is None or attempt > 0
+            if answer is not None and (narrow or low[row] <= answer.p <= high[row]):
                 critical[row] = answer
         known = np.array(list(critical), int)
         if not len(known):

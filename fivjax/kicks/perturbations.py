@@ -19,7 +19,7 @@ from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import sliding_states
 from ..section.about_sliding import mechanics_about_sliding
-from ..section.crossings import MOST_SEGMENTS, How
+from ..section.crossings import MOST_SEGMENTS, ByMethod
 from ..steppers.core import follow
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
@@ -152,7 +152,7 @@ class Histories:
         self.sliding = stable_sliding(scene)
         stepper = EventExact()
         self.by_kernel = has_kernel(scene, stepper)
-        self.given = How(for_derivatives(stepper)), scene, np.asarray(float(time))
+        self.given = ByMethod(for_derivatives(stepper)), scene, np.asarray(float(time))
 
     def norm(self, u: Vectors) -> Float[np.ndarray, " k"]:
         return np.max(np.abs(u), axis=-1)
@@ -165,12 +165,12 @@ class Histories:
         for start in range(0, len(u), size):
             # Padded with copies, so that XLA compiles one size.
             rows = np.minimum(np.arange(start, start + size), len(u) - 1)
-            found.append(_after_history(self.given, np.zeros(1), own=(u[rows],), by_kernel=self.by_kernel)[0])
+            found.append(_after_history(self.given, own=(u[rows],), by_kernel=self.by_kernel)[0])
         return np.concatenate(found)[: len(u)]
 
     def pulled_back(self, u: Float[np.ndarray, " m"], gradient: Float[np.ndarray, " state"]) -> Float[np.ndarray, " m"]:
         args = *self.given, u
-        _, (slopes, _) = _after_history.derived_by(args, np.zeros(1), u, np.eye(len(u)), by_kernel=self.by_kernel)
+        _, (slopes, _) = _after_history.derived_by(args, u, np.eye(len(u)), by_kernel=self.by_kernel)
         return gradient @ slopes
 
     def certificate(self) -> Certificate:

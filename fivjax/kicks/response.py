@@ -6,17 +6,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
-from ..branches.multiple_shooting import parameter_direction
 from ..contact import Contact, Status
 from ..foundation.kernel_functions import KernelFunction
+from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import known_to_numpy
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding
-from ..section.crossings import How, Kick, Point, to_crossing
+from ..section.crossings import ByMethod, Kick, Point, to_crossing
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
 
@@ -37,8 +37,16 @@ class Crossings(NamedTuple):
 
 def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
     """The scene's derivatives by several of its parameters, stacked along a first axis."""
-    each = [parameter_direction(scene, name) for name in names]
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *each)
+    return _directions_of(scene, names, np.array([float(scene.parameters[name]) for name in names]))
+
+
+@by_numpy
+def _directions_of(scene: Scene, names: tuple[str, ...], values: Float[Array, " k"]) -> Scene:
+    def moved(values) -> Scene:
+        return scene.replace(**dict(zip(names, values, strict=True)))
+
+    # All in one, because each is traced.
+    return jax.vmap(lambda along: jax.jvp(moved, (values,), (along,))[1])(jnp.eye(len(names)))
 
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
@@ -69,13 +77,13 @@ def _followed(
     if not by_kernel:
         # XLA compiles a program for each number of rows.
         wanted = MOST_CROSSINGS
-    args = How(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
+    args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, start), np.int32(crossings)
     along = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf, float), 0, -1), directions)
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), _count(directions))), args)
     moving = still[0], along, still[2], still[3]
     if of_start is not None:
         moving = eqx.tree_at(lambda args: args[2].y, moving, of_start.T)
-    (end, rows), (_, slopes) = _motion_after_kick.derived(args, np.arange(1.0, wanted + 1), moving, by_kernel=by_kernel)
+    (end, rows), (_, slopes) = _motion_after_kick.derived(args, moving, np.arange(1.0, wanted + 1), by_kernel=by_kernel)
     at, contact = rows.point, rows.point.contact
     return Crossings(
         at.y, np.moveaxis(slopes.point.y, -1, 0), contact.status, contact.direction, rows.events, int(end.crossed)

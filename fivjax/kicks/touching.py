@@ -25,7 +25,7 @@ from ..foundation.precision import in_double_precision
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
-from ..section.crossings import MOST_SEGMENTS, How
+from ..section.crossings import MOST_SEGMENTS, ByMethod
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
@@ -70,7 +70,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
     directions = directions_of(scene, ("p", *names))
 
     def events(p: float) -> _Events:
-        found, _ = _to_events((How(stepper), scene.replace(p=p)), np.zeros(1), by_kernel=has_kernel(scene, stepper))
+        found, _ = _to_events((ByMethod(stepper), scene.replace(p=p)), by_kernel=has_kernel(scene, stepper))
         return found
 
     below, above, found = events(low), events(high), None
@@ -190,7 +190,7 @@ def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, ev
     """A guard at a time after `events` events, its time derivative, and the derivatives of both along directions of the
     parameters.
     """
-    args = How(for_derivatives(stepper)), scene, np.asarray(time), np.int32(events), np.int32(guard)
+    args = ByMethod(for_derivatives(stepper)), scene, np.asarray(time), np.int32(events), np.int32(guard)
     count = len(jax.tree.leaves(directions)[0])
     # By time, then along the directions.
     along = jax.tree.map(
@@ -199,7 +199,7 @@ def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, ev
     still = jax.tree.map(lambda leaf: np.zeros((*np.shape(leaf), 1 + count)), args)
     moving = still[0], along, np.eye(1, 1 + count)[0], *still[3:]
     by_kernel = has_kernel(scene, stepper)
-    (value, _), (slopes, _) = _to_guard.derived(args, np.zeros(1), moving, by_kernel=by_kernel)
+    (value, _), (slopes, _) = _to_guard.derived(args, moving, by_kernel=by_kernel)
     return float(value), float(slopes[0]), slopes[1:]
 
 

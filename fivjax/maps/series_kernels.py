@@ -71,7 +71,7 @@ class SeriesKernels:
             count = len(group[rows])
             given = [np.broadcast_to(of_all, (count, len(of_all))), self.table[group[rows]], own[rows]]
             ends, _ = _follow.of_many(
-                form, np.concatenate([*given, np.full((count, 1), float(steps))], axis=1), np.zeros(1), self.pool
+                form, np.concatenate([*given, np.full((count, 1), float(steps))], axis=1), pool=self.pool
             )
             own[rows, begin:size] = np.concatenate([part.reshape(count, -1) for part in ends], axis=1)
 

@@ -11,8 +11,10 @@ from ..foundation.kernel_text import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
-from .crossings import Arrival, How, Point, motion_to_section
+from .crossings import Arrival, ByMethod, Point, motion_to_section
 
+# Returns in all that are shared out among threads.
+LEAST_IN_THREADS = 64
 # Rows of numbers for a kernel are put together for so many bytes at a time.
 AT_A_TIME = 2**26
 
@@ -23,6 +25,8 @@ class SectionKernels:
     def __init__(self, whose, pool: Executor | None):
         self.whose, self.pool = whose, pool
         self.table = numbers_in_rows(whose)
+        # The state comes after what is the group's.
+        self.state = len(jax.tree.leaves(whose))
         self.form: Form | None = None
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
@@ -32,10 +36,10 @@ class SectionKernels:
         form, given = self._rows(group, y, status, direction, crossings, peaks)
         numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
         parts = [
-            motion_to_section.of_many(form, given[rows], numbers[rows], self.pool)
+            motion_to_section.of_many(form, given[rows], numbers[rows], self._pool_for(numbers[rows, -1]))
             for rows in in_parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
         ]
-        end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts)
+        end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]
         (y, status, direction), (at, _, arrived, peak) = _on_section(end), end
         peak = np.where(arrived, peak, np.nan)
         return y, status, direction, at.events.astype(np.int32), at.time, path.point.y, peak
@@ -43,22 +47,26 @@ class SectionKernels:
     def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
         form, given = self._rows(group, y, status, direction, crossings, False)
-        # The state comes after what is the group's.
-        state = len(jax.tree.leaves(self.whose))
-        wide = tuple(place == state for place in range(len(form.arrays)))
+        wide = tuple(place == self.state for place in range(len(form.arrays)))
         last = np.broadcast_to(np.asarray(crossings, float), len(y))[:, None]
-        found = motion_to_section.derived_of_many(form, given, last, wide, np.eye(y.shape[1]), self.pool)
+        found = motion_to_section.derived_of_many(form, given, last, wide, np.eye(y.shape[1]), self._pool_for(last))
         (end, _), (slopes, _) = found
         return (*_on_section(end), end.at.time), slopes.at.point.y
 
+    def _pool_for(self, crossings) -> Executor | None:
+        return self.pool if np.sum(crossings) >= LEAST_IN_THREADS else None
+
     def _rows(self, group, y, status, direction, crossings, peaks: bool):
-        crossings = np.broadcast_to(np.asarray(crossings, np.int32), len(y))
-        contact = Contact(np.asarray(status, np.int32), np.asarray(direction, float))
-        rows = Point(np.asarray(y), contact), crossings, np.full(len(y), np.inf), np.full(len(y), peaks)
         if self.form is None:
-            first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (self.whose, *rows))
-            self.form, _ = Form.of((How(EventExact()), *first))
-        return self.form, np.concatenate([self.table[group], numbers_in_rows(rows)], axis=1)
+            contact = Contact(np.asarray(status, np.int32)[0], np.asarray(direction, float)[0])
+            whose = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.whose)
+            last = np.int32(1), np.float64(np.inf), np.bool_(False)
+            self.form = Form.of((ByMethod(EventExact()), whose, Point(np.asarray(y)[0], contact), *last))[0].kept
+        # In the order of that tree.
+        own = np.empty((len(y), 3))
+        own[:, 0], own[:, 1], own[:, 2] = crossings, np.inf, peaks
+        contact = (np.reshape(part, (len(y), -1)) for part in (status, direction))
+        return self.form, np.concatenate([self.table[group], y, *contact, own], axis=1)
 
 
 def section_kernels(scene: Scene, mechanics, longest_return, pool: Executor | None) -> SectionKernels | None:
@@ -68,9 +76,8 @@ def section_kernels(scene: Scene, mechanics, longest_return, pool: Executor | No
 
 def _on_section(end: Arrival):
     """State, status and direction on the section; the state is NaN where the section was not reached."""
-    point = end.at.point
-    y = np.where(end.arrived[:, None], point.y, np.nan)
-    return y, point.contact.status.astype(np.int32), point.contact.direction
+    point, contact = end.at.point, end.at.point.contact
+    return np.where(end.arrived[:, None], point.y, np.nan), contact.status.astype(np.int32), contact.direction
 
 
 def numbers_in_rows(tree) -> Float[np.ndarray, "g k"]:

@@ -33,7 +33,7 @@ class Point(eqx.Module):
     contact: Contact
 
 
-class How(eqx.Module):
+class ByMethod(eqx.Module):
     """How a motion is followed, fixed when it is traced."""
 
     method: EventExact = eqx.field(static=True)

@@ -16,7 +16,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
-from ..foundation.polynomial import value_and_slope
+from ..foundation.polynomial import value_and_rate
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
 from ..steppers.core import Segment, next_part
@@ -27,7 +27,7 @@ from .energy import EnergyData, Ledger
 from .rows import grown, settled
 
 
-class How(eqx.Module):
+class MotionAsked(eqx.Module):
     """How a motion is followed, fixed when it is traced."""
 
     method: EventExact = eqx.field(static=True)
@@ -58,7 +58,7 @@ def _motion(args, instants: Float[Array, " T"]) -> tuple[Int[Array, ""], dict]:
     """How a motion ended (an `Ending`), and its rows.
 
     `args`: the scene, the state at the first instant (None for the sliding equilibrium, whose derivatives then need no
-    directions of their own), the most steps between two rows, and a `How`.
+    directions of their own), the most steps between two rows, and a `MotionAsked`.
     """
     return _followed(args, instants, args[3].method)
 
@@ -76,7 +76,7 @@ def rows_by_kernel(
     """What a `Trajectory` has at its saved instants, by name; and how the motion ended (an `Ending`). It starts at the sliding
     equilibrium unless `y0` is given.
     """
-    ending, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), How(method, energy)), saved)
+    ending, rows = _by_kernel((scene, y0, np.asarray(most, np.int32), MotionAsked(method, energy)), saved)
     rows["status"] = rows["status"].astype(np.int8)
     return ending, {"t": saved, **rows}
 
@@ -204,7 +204,7 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
 
 def _at(mechanics: Mechanics, method: EventExact, accounts_of, now: Step, instant) -> tuple[State, Ledger | None]:
     """The state and the ledger within a step."""
-    y, _ = value_and_slope(now.series, (instant - now.t) / now.unit)
+    y, _ = value_and_rate(now.series, now.unit, instant - now.t)
     y = physics.on_constraint(mechanics, now.contact, y)
     if accounts_of is None:
         return y, None

@@ -28,7 +28,7 @@ def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
     return (
         jax.default_backend() == "cpu"
         and scene.structure.size <= LARGEST
-        and len(scene.structure.contacts) <= MOST_CONTACTS
+        and len(scene.structure.places) <= MOST_CONTACTS
         and _laws_can_be_written(scene)
     )
 

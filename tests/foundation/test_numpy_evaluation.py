@@ -1,0 +1,61 @@
+"""Functions of known values by NumPy: the same as by XLA, bit for bit where linear systems are solved."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fivjax.foundation.blocks import in_threads
+from fivjax.foundation.linear_solve import solve
+from fivjax.foundation.numpy_evaluation import by_numpy
+
+RANDOM = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_linear_systems_are_solved_as_by_elimination(size):
+    """Small ones are written out, larger ones eliminated in a loop; one right side, or several."""
+    with jax.enable_x64(True):
+        matrix = RANDOM.normal(size=(size, size))
+        for right in (RANDOM.normal(size=size), RANDOM.normal(size=(size, 2))):
+            found = by_numpy(solve)(matrix, right)
+            assert np.allclose(found, np.linalg.solve(matrix, right), rtol=1e-10)
+            assert np.allclose(matrix @ found, right, rtol=1e-9)
+
+
+def test_as_many_systems_as_unknowns_are_not_taken_for_one():
+    with jax.enable_x64(True):
+        matrix, right = RANDOM.normal(size=(3, 3)), RANDOM.normal(size=(3, 3))
+        found = by_numpy(jax.vmap(solve, in_axes=(None, 0)))(matrix, right)
+        assert np.allclose(found, np.linalg.solve(matrix, right.T).T, rtol=1e-10)
+
+
+def test_a_singular_system_has_no_finite_solution():
+    with jax.enable_x64(True):
+        assert not np.all(np.isfinite(by_numpy(solve)(np.ones((2, 2)), np.array([1.0, 2.0]))))
+
+
+def test_what_is_known_is_not_changed_by_later_calls():
+    """Parts that depend on nothing are computed once, and each call has its own copy."""
+
+    def function(x):
+        table = jnp.arange(3.0) @ jnp.ones((3, 3))
+        return table, table + x, jnp.where(x > 0, table, -table)
+
+    with jax.enable_x64(True):
+        own = by_numpy(function)
+        own(np.float64(1.0))[0][:] = 7.0
+        table, moved, chosen = own(np.float64(-2.0))
+    assert table.tolist() == [3.0, 3.0, 3.0] and moved.tolist() == [1.0, 1.0, 1.0] and chosen.tolist() == [-3.0] * 3
+
+
+def test_parts_are_run_once_each_also_where_no_other_thread_is_free():
+    done, busy = [], threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(busy.wait)
+        in_threads(done.append, range(5), pool, 2)
+        busy.set()
+    assert sorted(done) == list(range(5))
