@@ -116,7 +116,7 @@ def derivatives(
         )
     if isinstance(wrt, str):
         raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
-    names = tuple(wrt)
+    names = arguments.listed_names("wrt", wrt, "mu")
     arguments.names_of_parameters("wrt", names, scene.parameters)
     arguments.one_of("mode", mode, ("forward", "reverse"))
     arguments.real_number("margin", margin, minimum=0)
