@@ -130,8 +130,11 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
 
 def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     """The names in a list; one name may stand for itself."""
-    names = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, Iterable) else (None,)
-    if isinstance(value, Mapping) or not all(isinstance(one, str) for one in names):
+    if isinstance(value, str):
+        return (value,)
+    listed = isinstance(value, Iterable) and not isinstance(value, Mapping)
+    names = tuple(value) if listed else ()
+    if not listed or not all(isinstance(one, str) for one in names):
         raise TypeError(f'Argument `{name}` must be a list of names, such as ["{example}"], but is {describe(value)}.')
     return names
 
