@@ -26,7 +26,7 @@ class NodeContact:
     - `against`: the other node, where the contact is between two nodes of the structure; displacements are then those of
       `node` less those of `against`. Unless given, the node touches the belt.
 
-    **Raises:** `TypeError` for a node that is no number, `ValueError` for a direction that is none.
+    **Raises:** `TypeError` for a node that is no whole number; `read_structure` refuses what is no direction.
 
     **Example:**
 
@@ -43,8 +43,6 @@ class NodeContact:
             whole = isinstance(node, int | np.integer) and not isinstance(node, bool)
             if not whole and not (name == "against" and node is None):
                 raise TypeError(f"Argument `{name}` must be the number of a node, but is {arguments.describe(node)}.")
-        for direction in (self.tangential, self.normal):
-            _components(direction)
 
 
 def read_contacts(path: str | Path) -> list[NodeContact]:

@@ -402,6 +402,17 @@ def test_what_are_no_starts(paper_scene, given):
         fj.limit_cycles(paper_scene, starts=["a"])
 
 
+@pytest.mark.parametrize("given", [None, 1.0, "a", [1, 2]])
+def test_what_no_structure_is_made_of(given):
+    """Refused before JAX is given a function that is none."""
+    with refused(TypeError, "`matrices_of`", "a function"):
+        fj.Structure.from_parameters(given, {"k": 1.0})
+    with refused(TypeError, "`parameters`", "a dictionary"):
+        fj.Structure.from_parameters(lambda k: None, given)
+    with refused(ValueError, "`parameters`", "at least one"):
+        fj.Structure.from_parameters(lambda: None, {})
+
+
 @pytest.mark.parametrize("given", [None, 1.0, [1, 2], {}])
 def test_what_is_no_path(given):
     for call in (
@@ -419,8 +430,9 @@ def test_what_is_no_path(given):
 def test_what_is_no_node(given):
     with refused(TypeError, "`node`", "number of a node"):
         fj.NodeContact(given, "x", "y")
-    with refused(ValueError, "direction", "'w'"):
-        fj.NodeContact(1, "x", "w")
+    if given is not None:
+        with refused(TypeError, "`against`", "number of a node"):
+            fj.NodeContact(1, "x", "y", given)
 
 
 # --------------------------------------------------------------------------------------------- files
