@@ -122,7 +122,7 @@ def _following(
         rebounds = touched & inelastic & (status != Status.DETACH)
         landed = Contact(status.astype(contact.status.dtype), following.direction)
         by = jnp.where(rebounds, after_brief_flight(mechanics, landed, load, y_next), 0.0)
-        y_next = also_moved(y_next, by, gap_rate(mechanics, impact(mechanics, y_stopped)))
+        y_next = also_moved(y_next, by, -mechanics.restitution * gap_rate(mechanics, y_stopped))
     following = Contact(status.astype(contact.status.dtype), following.direction)
     return following, on_constraint(mechanics, following, y_next)
 
