@@ -32,10 +32,10 @@ class FreeParameters(eqx.Module):
     def __init__(self, scene: Scene, free: Iterable[str], bounds: Mapping[str, tuple[float, float]] | None = None):
         if isinstance(free, str):
             raise TypeError(f'Argument `free` must be a list of names, such as ["{free}"], but is {free!r} (str).')
-        names = tuple(free)
+        names = arguments.listed_names("free", free, "mu")
         if not names:
             raise ValueError("Argument `free` must name at least one parameter, but is empty.")
-        bounds = {} if bounds is None else dict(bounds)
+        bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"mu": (0.1, 0.5)')
         known = scene.parameters
         for name in (*names, *bounds):
             if name not in known:

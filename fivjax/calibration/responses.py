@@ -12,6 +12,7 @@ from ..io.recordings import Channel
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import free_in_sliding
+from ..simulation.jump_instants import begun_at, load_before, moment
 from ..simulation.rows import begun
 from ..steppers.base import AbstractStepper
 from ..steppers.core import Segment, follow
@@ -50,13 +51,13 @@ def through_events(
     # Stretches end at the blocks' edges and at the load's jumps; one outside has no effect, not even on a derivative.
     inside = (scene.load.jumps >= start) & (scene.load.jumps <= edges[-1])
     ends = jnp.where(inside, scene.load.jumps, jax.lax.stop_gradient(jnp.clip(scene.load.jumps, start, edges[-1])))
-    ends = jnp.maximum(jnp.sort(jnp.concatenate([edges, ends])), start)
-    begins = jnp.concatenate([start[None], ends[:-1]])
-    block = jnp.searchsorted(edges, 0.5 * (begins + ends), side="right") - 1
+    ends = jnp.sort(jnp.concatenate([edges, ends]))
+    # Not `maximum`, which halves the derivative of one exactly at the start.
+    ends = jnp.where(ends < start, start, ends)
+    nothing_yet = jnp.zeros(len(channels)), jnp.zeros((2, 3), bool)
 
-    def to_next(carry, stretch):
-        y, contact = carry
-        t, end, block = stretch
+    def adding(t, block):
+        """Adds a segment of the stretch that begins at `t` (s), in this block."""
         samples = edges[block] + width * (jnp.arange(points) + 0.5) / points
         # Rounding must not put a sample at the start before it.
         samples = jnp.where(jnp.abs(samples - start) < 1e-6 * width, start, samples) - t
@@ -75,13 +76,28 @@ def through_events(
             sides = jnp.array([place < 0.5, True, place >= 0.5])
             return sums + gained, near | (jnp.stack(jumps(segment))[:, None] & sides)
 
-        load, begun_with = scene.load(0.5 * (t + end)), (jnp.zeros(len(channels)), jnp.zeros((2, 3), bool))
-        after = follow(method, mechanics, contact, load, y, end - t, total=begun_with, observe=add, kind="lax")
-        y = jnp.where(after.enough, after.y, jnp.nan)
-        return (y, after.contact), after.total
+        return add
 
-    contact, _ = begun(scene, y0, jnp.stack([start, ends[0]]), None)
-    _, (sums, near) = jax.lax.scan(to_next, (y0, contact), (begins, ends, block))
+    def to_next(carry, stretch):
+        y, contact = carry
+        t, end, block = stretch
+        load, add = scene.load(0.5 * (t + end)), adding(t, block)
+        after = follow(method, mechanics, contact, load, y, end - t, total=nothing_yet, observe=add, kind="lax")
+        y = jnp.where(after.enough, after.y, jnp.nan)
+
+        def at_once():
+            still = moment(mechanics, contact, load_before(scene, end), after.y, end - t)
+            return still.after.y, add(nothing_yet, still)
+
+        y, total = jax.lax.cond(end > t, lambda: (y, after.total), at_once)
+        return (y, after.contact), total
+
+    contact, _ = begun(scene, y0, jnp.stack([start, edges[-1]]), None)
+    block = jnp.searchsorted(edges, 0.5 * (jnp.append(start, ends[:-1]) + ends), side="right") - 1
+    first = begun_at(scene, mechanics, contact, y0, start, nothing_yet, adding(start, block[0]))
+    stretches = jnp.append(first.t, ends[:-1]), ends, block
+    _, (sums, near) = jax.lax.scan(to_next, (first.y, contact), stretches)
+    sums = sums.at[0].add(first.total[0])
     within = (block >= 0) & (block < blocks)
     place = jnp.where(within, block, blocks)
     means = jnp.zeros((blocks + 1, len(channels))).at[place].add(sums)[:blocks]

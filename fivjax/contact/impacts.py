@@ -1,9 +1,21 @@
 """Velocities after the gap has closed."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from .forces import State, degrees_of_freedom, gap, gap_rate, relative_velocity, with_contact_coordinates
+from .coordinates import spread
+from .forces import (
+    State,
+    contact_forces,
+    degrees_of_freedom,
+    gap,
+    gap_rate,
+    relative_velocity,
+    with_contact_coordinates,
+)
 from .mechanics import Mechanics
+from .mode import Contact, Status
 from .several_contacts import impulses_of_impact
 
 
@@ -50,7 +62,7 @@ def impact(mechanics: Mechanics, y: State) -> State:
 def _one(mechanics: Mechanics, y: State):
     """The state after the impulse on one contact, and whether it ends slip."""
     n = degrees_of_freedom(y)
-    g_tt, g_tn, g_nn = mechanics.compliance
+    _, _, g_nn = mechanics.compliance
     slip = relative_velocity(mechanics, y)
     jump = -(1.0 + mechanics.restitution) * gap_rate(mechanics, y)
     ends_slip = False
@@ -58,9 +70,7 @@ def _one(mechanics: Mechanics, y: State):
         tangential_impulse, normal_impulse = jnp.zeros_like(jump), jump / g_nn
     else:
         mu = mechanics.friction(jnp.abs(slip))
-        determinant = g_tt * g_nn - g_tn**2
-        ending = (-g_nn * slip - g_tn * jump) / determinant
-        ending_normal = (g_tn * slip + g_tt * jump) / determinant
+        ending, ending_normal = _ending_slip(mechanics, slip, jump)
         direction = jnp.sign(ending)
         dragging_normal = jump / mechanics.normal_compliance(direction, mu)
         ends_slip = jnp.abs(ending) <= mu * ending_normal
@@ -68,3 +78,58 @@ def _one(mechanics: Mechanics, y: State):
         normal_impulse = jnp.where(ends_slip, ending_normal, dragging_normal)
     kick = mechanics.from_tangential * tangential_impulse + mechanics.from_normal * normal_impulse
     return y.at[n:].add(kick), ends_slip
+
+
+def _ending_slip(mechanics: Mechanics, slip, jump):
+    """The tangential and the normal impulse that end the slip (m/s) and change the gap's rate by `jump` (m/s)."""
+    g_tt, g_tn, g_nn = mechanics.compliance
+    determinant = g_tt * g_nn - g_tn**2
+    return (-g_nn * slip - g_tn * jump) / determinant, (g_tn * slip + g_tt * jump) / determinant
+
+
+def after_brief_flight(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
+    """How velocities differ, per m/s of a rebound that ends at once, from those of one contact that stays on the belt.
+
+    That is the derivative of what follows a landing by the restitution, where that is zero: a rebound of speed v flies for
+    2 v / a under the acceleration a towards the belt. Meanwhile the forces of the mode `contact` are missing; then a second
+    impact ends it. Where the impulses of both impacts lie on the same edge of the friction cone as these forces do, or both
+    end the slip, they make up for exactly what is missing.
+    """
+    g_tt, g_tn, g_nn = mechanics.compliance
+    tangential_force, normal_force = contact_forces(mechanics, contact, load, y)
+    pressing = g_tn * tangential_force + g_nn * normal_force
+    flight = 2.0 / jnp.where(pressing > 0, pressing, 1.0)  # s, per m/s
+    if mechanics.impact_law == "reset":
+        tangential = normal = jnp.zeros_like(flight)
+    elif mechanics.impact_law == "frictionless":
+        tangential, normal = jnp.zeros_like(flight), 1.0 / g_nn
+    else:
+        slip = relative_velocity(mechanics, y)
+        mu = mechanics.friction(jnp.abs(slip))
+        # After an impact that ended the slip, it is what the flight leaves.
+        left = -(g_tt * tangential_force + g_tn * normal_force) * flight
+        ending, ending_normal = _ending_slip(mechanics, left, jnp.ones_like(left))
+        ends_slip = (slip == 0) & (jnp.abs(ending) <= mu * ending_normal)
+        dragging = 1.0 / mechanics.normal_compliance(contact.direction, mu)
+        tangential = jnp.where(ends_slip, ending, contact.direction * mu * dragging)
+        normal = jnp.where(ends_slip, ending_normal, dragging)
+    tangential, normal = tangential - tangential_force * flight, normal - normal_force * flight
+    # A contact that sticks is held: whatever the impulses in between, they add up to none.
+    held, held_normal = _ending_slip(mechanics, jnp.zeros_like(flight), -jnp.ones_like(flight))
+    sticks = contact.status == Status.STICK
+    tangential, normal = jnp.where(sticks, held, tangential), jnp.where(sticks, held_normal, normal)
+    return spread(mechanics.from_tangential, tangential) + spread(mechanics.from_normal, normal)
+
+
+@jax.custom_jvp
+def also_moved(y: State, by: Float[Array, " n"], amount: Float[Array, ""]) -> State:
+    """The state, whose velocities' derivatives are those of `y` and, `by` so much, that of `amount`."""
+    del by, amount
+    return y
+
+
+@also_moved.defjvp
+def _(primals, tangents):
+    y, by, amount = primals
+    n = degrees_of_freedom(y)
+    return also_moved(y, by, amount), tangents[0].at[n:].add(by * tangents[2])

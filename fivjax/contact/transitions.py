@@ -1,5 +1,6 @@
 """What follows when a contact mode ends: the next mode, chosen from the forces, and the state on its constraint."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -18,7 +19,7 @@ from .forces import (
     with_contact_coordinates,
 )
 from .guard import cone_margins
-from .impacts import impact
+from .impacts import after_brief_flight, also_moved, impact
 from .mechanics import Mechanics
 from .mode import Contact, Status
 from .mode_forces import ModeForces, sticking_forces
@@ -100,11 +101,15 @@ def _following(
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck():
-        return _resting(mechanics, contact, load, impact(mechanics, y_stopped), touched, resolution)
+        return _resting(mechanics, contact, load, impact(impacting, y_stopped), touched, resolution)
 
+    impacting, inelastic = mechanics, mechanics.restitution == 0
     # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
     # ended goes on. So it is excluded.
     if mechanics.several:
+        # Without restitution, what a small rebound changes is made up for by its end (`after_brief_flight`).
+        fixed = jnp.where(inelastic, jax.lax.stop_gradient(mechanics.restitution), mechanics.restitution)
+        impacting = eqx.tree_at(lambda m: m.restitution, mechanics, fixed)
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
         own = ended[..., 0] | ended[..., 1]
         over = (own & (contact.status == Status.STICK)) | lifted
@@ -114,6 +119,10 @@ def _following(
         y_next = jnp.where(touched, struck(), y_stopped)
         following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
         status = jnp.where(lifted, Status.DETACH, following.status)
+        rebounds = touched & inelastic & (status != Status.DETACH)
+        landed = Contact(status.astype(contact.status.dtype), following.direction)
+        by = jnp.where(rebounds, after_brief_flight(mechanics, landed, load, y_next), 0.0)
+        y_next = also_moved(y_next, by, -mechanics.restitution * gap_rate(mechanics, y_stopped))
     following = Contact(status.astype(contact.status.dtype), following.direction)
     return following, on_constraint(mechanics, following, y_next)
 

@@ -70,7 +70,7 @@ def cycle_derivatives(
         raise ValueError(
             "Argument `cycle` must be periodic, but is a torus, which has no single period to differentiate."
         )
-    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
+    names = arguments.listed_names("wrt", wrt, "mu")
     arguments.names_of_parameters("wrt", names, cycle.scene.parameters)
     arguments.truth("multipliers", multipliers)
     own = cycle_in_contact_coordinates(cycle)

@@ -41,7 +41,8 @@ def in_own_coordinates(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         for name in {"start", "cycle"} & set(names) & given.keys():
             given[name] = _inside(scene, given[name])
-        if "starts" in names and "starts" in given:
+        # Anything else is refused by the function.
+        if "starts" in names and isinstance(given.get("starts"), tuple | list | np.ndarray):
             given["starts"] = [_inside(scene, start) for start in given["starts"]]
         given["scene"] = in_double_precision(scene_in_contact_coordinates)(scene)
         return _outside(scene, call(**given))

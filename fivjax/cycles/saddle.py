@@ -60,6 +60,7 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
     """
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
+    arguments.instance("cycle", cycle, LimitCycle | None, "a limit cycle, such as `fivjax.limit_cycle(scene)`, or None")
     refuse_painleve(scene)
     sliding_equilibrium(under_final_load(scene))
     _refuse_unstable_sliding(under_final_load(scene))

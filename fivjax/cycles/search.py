@@ -1,7 +1,7 @@
 """Limit cycles: motions are released, their attractors are found as those of a map are, and described."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -127,7 +127,12 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         'periodic'
     """
     _check(scene)
-    return _met(scene, [*starts, *_kicked(scene)]).cycles
+    if isinstance(starts, str | Mapping) or not isinstance(starts, Iterable):
+        raise TypeError(
+            f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
+        )
+    given = [_state_of(scene, start, f"starts[{number}]") for number, start in enumerate(starts)]
+    return _met(scene, [*given, *_kicked(scene)]).cycles
 
 
 def _kicked(scene: Scene) -> list[Trajectory]:
@@ -238,13 +243,13 @@ def _released(
     return np.concatenate([np.asarray(_released_states(scene, np.asarray(loads))), moved, *np.array(given)[:, None]])
 
 
-def _state_of(scene: Scene, start) -> np.ndarray:
+def _state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
     if isinstance(start, Trajectory):
         return np.concatenate([np.asarray(start.displacement)[-1], np.asarray(start.velocity)[-1]])
-    state = arguments.numeric_array("start", start).astype(float)
+    state = arguments.numeric_array(name, start).astype(float)
     if state.shape != (2 * scene.structure.size,):
         raise ValueError(
-            f"Argument `start` must hold {scene.structure.size} displacements and as many velocities, but has shape "
+            f"Argument `{name}` must hold {scene.structure.size} displacements and as many velocities, but has shape "
             f"{state.shape}."
         )
     return state

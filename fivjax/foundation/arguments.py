@@ -5,7 +5,8 @@ are bad ends in a named status instead.
 """
 
 import difflib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -127,6 +128,31 @@ def one_of(name: str, value, choices: Iterable[str]) -> None:
         )
 
 
+def listed_names(name: str, value, example: str) -> tuple[str, ...]:
+    """The names in a list; one name may stand for itself."""
+    if isinstance(value, str):
+        return (value,)
+    listed = isinstance(value, Iterable) and not isinstance(value, Mapping)
+    names = tuple(value) if listed else ()
+    if not listed or not all(isinstance(one, str) for one in names):
+        raise TypeError(f'Argument `{name}` must be a list of names, such as ["{example}"], but is {describe(value)}.')
+    return names
+
+
+def bounds_by_name(name: str, value, example: str) -> dict:
+    """Bounds as a dictionary, whose values are still to be checked."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"Argument `{name}` must be a dictionary, such as {{{example}}}, but is {describe(value)}.")
+    return dict(value)
+
+
+def path(name: str, value) -> Path:
+    """A path, from a string or a path."""
+    if not isinstance(value, str | Path):
+        raise TypeError(f"Argument `{name}` must be a path, as a string or a `pathlib.Path`, but is {describe(value)}.")
+    return Path(value)
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """ " Did you mean `k1`?", for a name that is none of those known but close to one; else nothing."""
     near = difflib.get_close_matches(name, known, n=1)
@@ -138,7 +164,7 @@ def names_of_parameters(name: str, names: Collection[str], known: Iterable[str])
     known = sorted(known)
     unknown = next((one for one in names if one not in known), None)
     if unknown is not None or not names:
-        near = "" if unknown is None else did_you_mean(unknown, known)
+        near = "" if unknown is None else did_you_mean(str(unknown), known)
         raise ValueError(
             f"Argument `{name}` must name parameters of the scene, but has {'none' if unknown is None else unknown!r}; they "
             f"are: {', '.join(known)}.{near}"

@@ -108,7 +108,7 @@ def open(path: str | Path) -> "xr.Dataset":
     """
     import xarray as xr
 
-    path = Path(path)
+    path = arguments.path("path", path)
     if not path.is_file():
         raise ValueError(f"File `{path}` does not exist.")
     accessor.register()

@@ -5,6 +5,7 @@ import stat
 from io import BytesIO
 from pathlib import Path
 
+from ..foundation import arguments
 from ..foundation.whole_files import try_to_write, write_whole
 
 
@@ -13,7 +14,7 @@ def check_writable(path: str | Path) -> Path:
 
     **Raises:** `ValueError` with the reason.
     """
-    path = Path(path)
+    path = arguments.path("path", path)
     try:
         _check(path, _place(path))
     except OSError as error:

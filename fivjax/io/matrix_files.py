@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from ..foundation import arguments
 from . import abaqus_files, array_files, harwell_boeing_files, nastran_files
 from .file_matrix import FileMatrix
 
@@ -54,7 +55,7 @@ def read_matrices(path: str | Path) -> FileMatrices:
         >>> sorted(fj.read_matrices("model.npz"))
         ['K', 'M']
     """
-    path = Path(path)
+    path = arguments.path("path", path)
     if not path.is_file():
         raise ValueError(f"File `{path}` does not exist.")
     if path.stat().st_size == 0:

@@ -26,6 +26,8 @@ class NodeContact:
     - `against`: the other node, where the contact is between two nodes of the structure; displacements are then those of
       `node` less those of `against`. Unless given, the node touches the belt.
 
+    **Raises:** `TypeError` for a node that is no whole number; `read_structure` refuses what is no direction.
+
     **Example:**
 
         >>> contact = fj.NodeContact(17, tangential="x", normal="-z")
@@ -35,6 +37,12 @@ class NodeContact:
     tangential: str | int | Sequence[float]
     normal: str | int | Sequence[float]
     against: int | None = None
+
+    def __post_init__(self):
+        for name, node in (("node", self.node), ("against", self.against)):
+            whole = isinstance(node, int | np.integer) and not isinstance(node, bool)
+            if not whole and not (name == "against" and node is None):
+                raise TypeError(f"Argument `{name}` must be the number of a node, but is {arguments.describe(node)}.")
 
 
 def read_contacts(path: str | Path) -> list[NodeContact]:

@@ -69,7 +69,7 @@ def read_recording(
         >>> [(channel.quantity, channel.coordinate) for channel in data.channels]
         [('acceleration', 0), ('acceleration', 1)]
     """
-    path = Path(path)
+    path = arguments.path("path", path)
     readers = {".csv": _csv, ".txt": _csv, ".npy": _numpy, ".npz": _numpy, ".wav": _wav, ".mat": _matlab}
     if path.suffix.lower() not in readers:
         raise ValueError(

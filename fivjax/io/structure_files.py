@@ -83,7 +83,7 @@ def read_structure(
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
-    parts, remarks = _parts(Path(path), mass, damping, names)
+    parts, remarks = _parts(arguments.path("path", path), mass, damping, names)
     order, numbers, aligned = _align(parts, _labels(labels))
     held = np.abs(aligned["stiffness"].diagonal()) >= HELD
     if np.any(held):
@@ -134,7 +134,7 @@ def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[st
     read: dict[Path, FileMatrices] = {}
     found = {}
     for role, file in files.items():
-        own = Path(file) if file is not None else path
+        own = arguments.path(role, file) if file is not None else path
         if own not in read:
             read[own] = read_matrices(own)
         chosen = _choose(role, own, read[own], names.get(role), alone=file is not None)

@@ -143,21 +143,24 @@ def smallest_kick(
     refuse_several_contacts(scene.structure, "`smallest_kick`")
     if not scene.friction.constant:
         raise ValueError("Argument `scene` must have constant friction: the bound is that of a linear sliding motion.")
-    if over in ("state", "history"):
-        return _other(scene, str(over), bounds or {}, pieces)
-    free = (over,) if isinstance(over, str) else tuple(over)
+    bounds = arguments.bounds_by_name("bounds", {} if bounds is None else bounds, '"p": (1.0, 2.0)')
+    if isinstance(over, str) and over in ("state", "history"):
+        return _other(scene, str(over), bounds, pieces)
+    free = arguments.listed_names("over", over, "p")
     for name in free:
         arguments.one_of("over", name, OVER)
     if "p" not in free:
         raise ValueError(f'Argument `over` must hold "p", whose smallest value is sought, but is {free!r}.')
     own = float(scene.load.duration)
-    given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **(bounds or {})}
+    given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **bounds}
     unknown = sorted(set(given) - set(OVER))
     if unknown:
         raise ValueError(
             f"Argument `bounds` must name what of a kick is free ({', '.join(OVER)}), but has {unknown[0]!r}."
         )
     for name, pair in given.items():
+        if arguments.numeric_array(f"bounds[{name!r}]", pair).shape != (2,):
+            raise ValueError(f"Argument `bounds[{name!r}]` must be two numbers, the lower one first, but is {pair!r}.")
         arguments.real_number(f"bounds[{name!r}][0]", pair[0], minimum=1 if name == "p" else 0)
         arguments.real_number(f"bounds[{name!r}][1]", pair[1], above=float(pair[0]))
     shortest, longest = given["duration"] if "duration" in free else (own, own)

@@ -171,12 +171,7 @@ def _derivatives(
     of_saddle = returned(scene, stepper, directions, saddle.closed.point, saddle.closed.crossings)
     moved = (weights * of_saddle.y_parameter[:, saddle.closed.crossings - 1]) @ saddle.left / (1 - saddle.multiplier)
     value = (weights * path.y_parameter[:, place]) @ saddle.left - moved
-    found = dict(zip(names, (-value[1:] / value[0]).tolist(), strict=True))
-    if float(np.asarray(scene.restitution)) == 0 and "restitution" in found:
-        # At restitution 0 the derivative misses the short flight after a small rebound. The additional impulse of the impact is
-        # what the forces during the flight and the next impact lack, so to first order nothing changes.
-        found["restitution"] = 0.0
-    return found
+    return dict(zip(names, (-value[1:] / value[0]).tolist(), strict=True))
 
 
 @in_double_precision

@@ -95,6 +95,7 @@ def raise_critical_friction(
     **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
     critical friction.
     """
+    _checked_bounds(structure, bounds, tied or {})
     if target is not None:
         arguments.real_number("target", target, above=0)
 
@@ -219,12 +220,13 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
 
 def _check_bounds(structure: Structure, bounds, tied):
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    bounds = arguments.bounds_by_name("bounds", bounds, '"k1": (90e3, 110e3)')
     if not bounds:
         raise ValueError('Argument `bounds` must name at least one parameter, such as {"k1": (90e3, 110e3)}.')
     known = ", ".join(structure.parameters) or "none (it was given as matrices)"
     for key in (*bounds, *tied):
         if key not in structure.parameters:
-            near = arguments.did_you_mean(key, structure.parameters)
+            near = arguments.did_you_mean(str(key), structure.parameters)
             raise ValueError(f"Structure has no parameter `{key}`; it has: {known}.{near}")
     for key, pair in bounds.items():
         pair = arguments.bounds_about(key, pair, float(structure.parameters[key]))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..foundation import arguments
 from ..foundation.precision import Returned, in_double_precision
 from .contact_point import ContactPoint, directions, pivots
 from .structure import FromParameters, Matrices, Structure
@@ -41,6 +42,7 @@ def in_contact_coordinates(structure: Structure) -> Structure:
         >>> fj.in_contact_coordinates(structure) is structure
         True
     """
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     if structure.contacts_at_coordinates:
         return structure
     x, places = transformation(structure)

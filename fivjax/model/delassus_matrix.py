@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..foundation import arguments
 from ..foundation.kept_programs import kept
 from ..foundation.linear_solve import solve
 from ..foundation.precision import returning_numpy
@@ -51,6 +52,7 @@ def delassus(structure: Structure) -> Delassus:
         >>> round(float(G.normal[0, 0] / abs(G.coupling[0, 0])), 2)  # Painlevé's limit
         108.49
     """
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     return _delassus(structure)
 
 

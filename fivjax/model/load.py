@@ -87,6 +87,9 @@ class AbstractLoad(eqx.Module):
 class ConstantLoad(AbstractLoad):
     """A load `force` (N) that never changes.
 
+    From steady sliding nothing then happens: it is an exact fixed point. Where it is unstable, a map moves off it by one unit
+    of rounding, and its verdict is that of a small perturbation; `decided_at` then means little.
+
     **Raises:** `ValueError` if it is negative or not finite.
 
     **Example:**
@@ -120,7 +123,8 @@ class Pulse(AbstractLoad):
     r"""A kick: the load is raised from `force` to `p * force` for `duration` (Eq. 14, Fig. 8).
 
     The paper waits 40 s before the kick. Sliding equilibrium is an exact fixed point, so the wait changes nothing and
-    the default `start` is 0.
+    the default `start` is 0. With `p` = 1, or `duration` = 0, there is no kick: see `ConstantLoad`. A derivative by `start` = 0
+    is that towards later kicks; by `duration` = 0 there is none.
 
     **Arguments:** `force` in N, the factor `p` without unit, `duration` and `start` in s.
 

@@ -81,8 +81,9 @@ def check_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
     """The names of the coordinates, q0, q1, … unless given."""
     if names is None:
         return tuple(f"q{i}" for i in range(n))
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+    if isinstance(names, str):
         raise TypeError(f"Argument `coordinates` must be a list of names, but is {names!r}.")
+    names = arguments.listed_names("coordinates", names, "x")
     if len(names) != n or len(set(names)) != n:
         raise ValueError(f"Argument `coordinates` must hold {n} different names, but is {list(names)!r}.")
     return tuple(names)

@@ -202,6 +202,7 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
         >>> fj.sliding_equilibrium(scene).round(6)  # x2, y1 and y2, which is closed
         array([ 0.000217, -0.000988,  0.      ])
     """
+    arguments.instance("scene", scene, Scene, "a Scene")
     if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
         raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
     q, normal_force = _steady_sliding(scene, scene.load.force)
@@ -275,6 +276,7 @@ def painleve_friction(structure: Structure) -> Float[Array, ""]:
         >>> round(float(fj.painleve_friction(structure)), 2)
         108.49
     """
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     return _painleve_friction(in_contact_coordinates(structure))
 
 

@@ -198,15 +198,23 @@ class Structure(eqx.Module):
 
         **Raises:** what `Structure` raises for the matrices at these values.
         """
+        if not callable(matrices_of):
+            raise TypeError(
+                f"Argument `matrices_of` must be a function of the parameters, but is {arguments.describe(matrices_of)}."
+            )
+        arguments.instance("parameters", parameters, Mapping, 'a dictionary of numbers, such as {"k1": 1e5}')
+        if not parameters:
+            raise ValueError("Argument `parameters` must hold at least one. Give matrices without any to `Structure`.")
         for name, value in parameters.items():
             arguments.real_number(name, value)
         numbers = {name: real(value) for name, value in parameters.items()}
+        dampers = arguments.listed_names("dampers", dampers, "c1")
         unknown = [name for name in dampers if name not in numbers]
         if unknown:
             raise ValueError(
                 f"Argument `dampers` must name parameters, but has {unknown[0]!r}.{arguments.did_you_mean(unknown[0], numbers)}"
             )
-        source = FromParameters(numbers, tuple(numbers), matrices_of, tuple(dampers), builder)
+        source = FromParameters(numbers, tuple(numbers), matrices_of, dampers, builder)
         checked = cls(*source.matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
 

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibration.result import Calibration
+from ..foundation import arguments
 from ..foundation.quantities import QUANTITIES
 from .style import BLACK, SKY, VERMILION, new_figure
 
@@ -17,6 +18,7 @@ def calibration(fit: Calibration, *, figure: Figure | None = None) -> Figure:
 
     A limit cycle is drawn over one period, into which the recording was folded.
     """
+    arguments.instance("fit", fit, Calibration, "a calibration, such as `fivjax.calibrate(scene, data, free)`")
     rows = [(k, c) for k, recording in enumerate(fit.recordings) for c in range(len(recording.channels))]
     figure = new_figure(figure, 9.0, 1.4 + 0.19 * len(fit.names) + 2.1 * len(rows))
     axes = np.atleast_2d(figure.subplots(len(rows), 2, width_ratios=(3, 2)))

@@ -7,6 +7,7 @@ So `derivatives` also follows the guards of the trajectory and says how close it
 measures).
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable
 
 import equinox as eqx
@@ -21,9 +22,13 @@ from ..foundation.progress import reported
 from ..model.scene import Scene, refuse_painleve, scene_in_contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from .event_distance import closest_call
+from .event_distance import ClosestCall, closest_call
 from .start import checked_start, start_in_contact_coordinates, start_state
 from .trajectory import Trajectory, simulate
+
+# What has a derivative that is not worked out.
+JUMPS_AT_ONCE = "two jumps of the load, which a parameter moves apart,"
+LANDINGS_OF_SEVERAL = "a landing without restitution, of several contacts under this impact law,"
 
 
 class Derivatives(eqx.Module):
@@ -89,7 +94,8 @@ def derivatives(
 
     - `functional`: a smooth function of a `Trajectory`, written with `jax.numpy`: a peak, an energy, a line of the spectrum.
       Sums of *accelerations* over saved instants have no derivative where these jump; use differences of velocities.
-    - `wrt`: names of parameters, any of `scene.parameters`. For `start` = 0 the derivative is that towards later times.
+    - `wrt`: names of parameters, any of `scene.parameters`. For `start` = 0 the derivative is that towards later times, for
+      `restitution` = 0 that towards larger values. By `duration` = 0 there is none: give a short one, such as 1e-9 s.
     - `t1`, `dt_save`, `y0`, `method`: as in `simulate`. With `WhereSwitched` the derivatives are those of its steps, which
       are wrong after contact events.
     - `mode`: "forward" (faster up to some ten parameters) or "reverse" (keeps only the saved states in memory).
@@ -110,7 +116,7 @@ def derivatives(
         )
     if isinstance(wrt, str):
         raise TypeError(f'Argument `wrt` must be a list of names, such as ["{wrt}"], but is {wrt!r} (str).')
-    names = tuple(wrt)
+    names = arguments.listed_names("wrt", wrt, "mu")
     arguments.names_of_parameters("wrt", names, scene.parameters)
     arguments.one_of("mode", mode, ("forward", "reverse"))
     arguments.real_number("margin", margin, minimum=0)
@@ -125,8 +131,11 @@ def derivatives(
     begin = start_state(inner, None if y0 is None else start_in_contact_coordinates(scene, y0))
     if y0 is not None:
         given = begin if inner is scene else checked_start(scene.structure.size, y0)
-    value, by_name = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
-    calls = closest_call(inner, method, begin, float(t1))
+    value, by_name, moved = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
+    moved = {what: np.stack([np.atleast_1d(found[name]) for name in names]) for what, found in moved.items()}
+    slips_move = np.any(moved["belt_speed"] != 0, axis=0) & (y0 is not None)
+    calls = closest_call(inner, method, begin, float(t1), slips_move)
+    calls = _missing(scene, float(t1), moved, calls) or calls
     value = jax.tree.map(known_to_numpy, value)
     return Derivatives(
         value=value,
@@ -150,9 +159,29 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
         return value, value
 
     jacobian = jax.jacfwd if mode == "forward" else jax.jacrev
-    found, value = jacobian(of, has_aux=True)({name: scene.parameters[name] for name in names})
+
+    def of_scene(values):
+        changed = scene.replace(**values)
+        return {"belt_speed": changed.belt_speed, "jumps": changed.load.jumps, "restitution": changed.restitution}
+
+    values = {name: scene.parameters[name] for name in names}
+    found, value = jacobian(of, has_aux=True)(values)
     # For a functional of several numbers, the parameters are the last axis.
-    return value, {name: _of_parameter(found, name) for name in names}
+    return value, {name: _of_parameter(found, name) for name in names}, jax.jacfwd(of_scene)(values)
+
+
+def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: ClosestCall) -> ClosestCall | None:
+    """Something whose derivative is not worked out; `moved`: the derivatives of parts of the scene, a row each."""
+    jumps, apart = np.asarray(scene.load.jumps), np.any(np.diff(moved["jumps"], axis=-1) != 0, axis=0)
+    # The load between two jumps at one instant is not known.
+    at_once = jumps[1:][(np.diff(jumps) == 0) & apart & (jumps[1:] >= 0) & (jumps[1:] < t1)]
+    if len(at_once):
+        return dataclasses.replace(calls, closest=0.0, at=float(at_once[0]), event=JUMPS_AT_ONCE)
+    inelastic = np.any(moved["restitution"] != 0, axis=0) & (np.atleast_1d(scene.restitution) == 0)
+    several = len(scene.structure.places) > 1 and scene.impact_law != "coulomb"
+    if several and calls.landed and np.any(inelastic):
+        return dataclasses.replace(calls, closest=0.0, event=LANDINGS_OF_SEVERAL)
+    return None
 
 
 def _finite(value) -> bool:

@@ -10,6 +10,9 @@ are measured, too.
 With several contacts, an event of one acts at once on those that the mass matrix couples with it: their order matters, and an
 event of one may leave another's guard close to zero. Events of contacts that only springs and dampers couple may coincide: in
 either order the motion after them is the same to first order.
+
+At the start a force may be close to where another mode begins. A slip that is zero there stays zero, unless a parameter changes
+it: then a contact that slides has a derivative on one side only, and one that sticks must be held by the friction of sliding.
 """
 
 import equinox as eqx
@@ -39,6 +42,11 @@ DECISIONS = (
     "the slip running out at the edge of the friction cone, where the contact either sticks or slips back",
     "sliding that begins without a normal force",
 )
+OF_START = (
+    "a slip that starts at zero, which a parameter changes",
+    "a start that sticks, whose slip a parameter changes, at the edge of the friction cone of sliding",
+    "a start without slip at the edge of the friction cone",
+)
 # The first two for several contacts, which are decided together.
 DECISIONS_OF_SEVERAL = (
     "impulses of several contacts at the edge of a friction cone, or of none",
@@ -54,22 +62,31 @@ class ClosestCall(eqx.Module):
     closest: float  # relative; infinite without any
     at: float  # s
     event: str
+    landed: bool = False  # whether a contact has come back to the belt
 
 
-def closest_call(scene: Scene, method: AbstractStepper, y0, t1: float) -> ClosestCall:
-    """The smallest distance, found by following the trajectory advance by advance."""
+def closest_call(
+    scene: Scene, method: AbstractStepper, y0, t1: float, slips_move: Bool[np.ndarray, "*c"] | bool = False
+) -> ClosestCall:
+    """The smallest distance, found by following the trajectory advance by advance.
+
+    `slips_move`: which contacts' slips at the start change with a parameter.
+    """
     mechanics = Mechanics(scene)
     jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
     ends = [*jumps, t1]
     y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
-    seen = _Seen(mechanics)
+    seen = _Seen(mechanics, np.broadcast_to(slips_move, len(mechanics.places)))
+    seen.begin(*map(np.atleast_1d, _start(mechanics, contact, scene.load(jnp.asarray(0.5 * ends[0])), y0)))
     for end in ends:
         load = scene.load(jnp.asarray(0.5 * (t + end)))
-        begin = t
+        begins = True
         while t < end:
             look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
             arrives = bool(look.h >= end - t)
-            happened = seen.add(np.atleast_1d(contact.status), look, t, 0 < t == begin, arrives)
+            happened = seen.add(np.atleast_1d(contact.status), look, t, begins, arrives)
+            # A mode that begins with an event there has begun at the edge of that event.
+            begins = False
             at = t + float(look.h)
             t = end if arrives else at
             y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
@@ -99,8 +116,8 @@ class _Look(eqx.Module):
 class _Seen:
     """The distances found on a trajectory so far."""
 
-    def __init__(self, mechanics: Mechanics):
-        self.mechanics, self.several = mechanics, mechanics.several
+    def __init__(self, mechanics: Mechanics, slips_move: Bool[np.ndarray, " c"]):
+        self.mechanics, self.several, self.slips_move = mechanics, mechanics.several, slips_move
         count = len(mechanics.places)
         self.coupled = np.ones((1, 1), bool)
         if self.several:
@@ -112,16 +129,25 @@ class _Seen:
         # Distances by guard, in its own unit, and decisions, which are relative already.
         self.calls: list[tuple[tuple[int, int, int], float, float]] = []
         self.decisions: list[tuple[float, float, str]] = []
-        self.events = 0
+        self.events, self.landed = 0, False
         # Contacts on which another's event has just acted while their own status lasted, and their guards before it.
         self.struck = np.zeros(count, bool)
         self.before = np.zeros((count, 2))
 
-    def add(self, status: np.ndarray, look: _Look, t: float, after_jump: bool, arrives: bool) -> bool:
-        """Add an advance. Returns whether it ended in an event."""
+    def begin(self, status: np.ndarray, slip: np.ndarray, held: np.ndarray, at_rest: np.ndarray) -> None:
+        """Add the start, from `_start`."""
+        slides, sticks = (self.slips_move & (status == of) for of in (Status.SLIDE, Status.STICK))
+        if np.any(slides & (slip == 0)):
+            self.decisions.append((0.0, 0.0, OF_START[0]))
+        self.decisions += [(max(float(margin), 0.0), 0.0, OF_START[1]) for margin in held[sticks]]
+        without_slip = (status != Status.DETACH) & (slip == 0)
+        self.decisions += [(float(margin), 0.0, OF_START[2]) for margin in at_rest[without_slip]]
+
+    def add(self, status: np.ndarray, look: _Look, t: float, begins: bool, arrives: bool) -> bool:
+        """Add an advance, which `begins` at the start or at a jump of the load. Returns whether it ended in an event."""
         after = np.atleast_1d(look.contact.status)
         at = t + float(look.h)
-        relevant = [self._of_contact(i, int(s), look, t, after_jump) for i, s in enumerate(status)]
+        relevant = [self._of_contact(i, int(s), look, t, begins) for i, s in enumerate(status)]
         fired = [i for i in range(len(status)) if relevant[i] and self._fires(i, int(status[i]), int(after[i]), look)]
         for i in fired:
             key = (i, int(status[i]))
@@ -142,6 +168,7 @@ class _Seen:
             names = DECISIONS_OF_SEVERAL if self.several else DECISIONS
             self.decisions += [(float(m), at, name) for m, name in zip(look.decisions, names, strict=True)]
             self.events += 1
+            self.landed |= bool(np.any((status == Status.DETACH) & (after != Status.DETACH)))
         elif arrives:
             # An event at a jump of the load, or at the end, may come before or after it.
             for i, own in enumerate(relevant):
@@ -151,7 +178,7 @@ class _Seen:
         self.struck, self.before = felt & (after == status), look.guards[-1]
         return bool(fired)
 
-    def _of_contact(self, i: int, status: int, look: _Look, t: float, after_jump: bool) -> list[int]:
+    def _of_contact(self, i: int, status: int, look: _Look, t: float, begins: bool) -> list[int]:
         """Add the distances of the guards of one contact inside an advance. Returns the guards that count."""
         # A guard that is a rounding error all the time does not count: with zero friction the friction cone has no width.
         relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
@@ -161,9 +188,12 @@ class _Seen:
             self.largest[key] = max(self.largest.get(key, 0.0), float(np.abs(guard).max()))
             turns = np.flatnonzero(look.turns[:, i, which])
             self.calls += [(key, float(look.lowest[at, i, which]), t + float(look.h) * at / LOOKS) for at in turns]
-            # A jump of the load, or another contact's event, may leave a guard close to zero, on either side.
+            # The start, a jump of the load or another contact's event may leave a guard close to zero, on either side. At the
+            # start, what is given stays as it is: the gap, and the slip unless it moves.
             jumped = abs(float(guard[0]) - self.before[i, which]) > 1e-6 * self.largest[key]
-            if after_jump or (self.struck[i] and jumped):
+            is_force = status == Status.STICK or (status == Status.SLIDE and which == 0)
+            moves = t > 0 or is_force or (status == Status.SLIDE and self.slips_move[i] and guard[0] != 0)
+            if (begins and moves) or (self.struck[i] and jumped):
                 self.calls.append((key, abs(float(guard[0])), t))
         return relevant
 
@@ -183,7 +213,24 @@ class _Seen:
             return f"{event} (contact {contact})" if self.several else event
 
         closest = [(value / max(self.largest[key], 1e-300), at, name(*key)) for key, value, at in self.calls]
-        return ClosestCall(self.events, *min(closest + self.decisions, default=(float("inf"), float("nan"), "none")))
+        nearest = min(closest + self.decisions, default=(float("inf"), float("nan"), "none"))
+        return ClosestCall(self.events, *nearest, self.landed)
+
+
+@compiled
+def _start(mechanics: Mechanics, contact: Contact, load, y):
+    """The status of each contact, its slip (m/s), and two relative margins: by which the friction of sliding would hold it, and
+    from the edge of the friction cone without slip.
+    """
+    tangential, normal = physics.contact_forces(mechanics, contact, load, y)
+    slip = physics.relative_velocity(mechanics, y)
+    held, need = mechanics.friction(jnp.zeros_like(slip)) * normal, jnp.abs(tangential)
+    if mechanics.several:
+        at_rest = physics.clearness_of_modes(mechanics, load, y, contact)
+    else:
+        holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, y))
+        at_rest = _margin(mechanics.friction.static, *holding)
+    return contact.status, slip, (held - need) / jnp.where(held + need > 0, held + need, 1.0), at_rest
 
 
 @compiled

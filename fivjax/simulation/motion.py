@@ -24,6 +24,7 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
+from .jump_instants import Begun, begun_at
 from .rows import grown, settled
 
 
@@ -143,6 +144,13 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
     contact = physics.status_from_forces(mechanics, load, y0)
     ledger = None if accounts_of is None else accounts.open_ledger(accounts_of, y0)
     series = jnp.zeros((method.order_ + 1, y0.shape[0]), y0.dtype).at[0].set(y0)
+
+    def enter(ledger, segment: Segment):
+        return None if accounts_of is None else accounts.enter(accounts_of, method, mechanics, ledger, segment)
+
+    start = Begun(none, physics.stuck(mechanics, contact, y0), ledger)
+    if method.for_deviations:
+        start = begun_at(scene, mechanics, contact, y0, none, ledger, enter)
     begin = Step(
         t=none,
         y=y0,
@@ -151,10 +159,10 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
         series=series,
         unit=jnp.ones_like(none),
         ledger=ledger,
-        end=none,
-        y_end=physics.stuck(mechanics, contact, y0),
+        end=start.t,
+        y_end=start.y,
         contact_end=contact,
-        ledger_end=ledger,
+        ledger_end=start.total,
         highest=jnp.abs(load),
         count=no,
         events=no,

@@ -19,10 +19,12 @@ from ..foundation.precision import known_to_numpy
 from ..foundation.progress import stage, tick
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
-from ..steppers.base import AbstractStepper, rates
+from ..steppers.base import AbstractStepper
+from ..steppers.core import Segment
 from . import energy as accounts
 from .ending import GROWTH
 from .energy import EnergyData, Ledger
+from .jump_instants import Begun, begun_at, load_before, moment
 from .stretches import Begin, go_on
 
 # Intervals between saved instants in a part.
@@ -190,28 +192,34 @@ def states_at(
     mechanics = Mechanics(scene)
     ends = _ends(scene, instants)
 
+    def enter(ledger, segment: Segment):
+        return ledger if energy_data is None else accounts.enter(energy_data, method, mechanics, ledger, segment)
+
     def to_next(carry, end):
         t, y, contact, ledger = carry
         h = end - t
         load = scene.load(0.5 * (t + end))
-        # If a jump coincides with an instant, the time between them is zero but has a derivative: the motion in that time is
-        # under the load just before the jump.
-        before = scene.load(end - 1e-9 * jnp.maximum(1.0, jnp.abs(end)))
-        drift = jax.lax.stop_gradient(rates(mechanics, contact, before, y)) * (h - jax.lax.stop_gradient(h))
+        # If a jump coincides with an instant, the motion between them is under the load just before the jump.
+        still = moment(mechanics, contact, load_before(scene, end), y, h - jax.lax.stop_gradient(h))
         begin = Begin(mechanics, contact, load, y, h, ledger, energy_data)
-        moved, following, ledger, reached = go_on(begin, method, most, derivatives)
+        moved, following, entered, reached = go_on(begin, method, most, derivatives)
+        if derivatives is not None and energy_data is not None:
+            entered = jax.lax.cond(h > 0, lambda: entered, lambda: enter(ledger, still))
         # States that were not reached are NaN; counts are kept.
         moved, ledger = jax.tree.map(
-            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, ledger)
+            lambda leaf: jnp.where(reached, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, (moved, entered)
         )
-        y = jnp.where(h > 0, moved, y + drift)
+        y = jnp.where(h > 0, moved, still.after.y)
         return (end, y, following, ledger), (y, following, ledger)
 
     contact0, ledger0 = begun(scene, y0, instants, energy_data) if at_start is None else at_start
     # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
-    begin = instants[0], physics.stuck(mechanics, contact0, y0), contact0, ledger0
-    _, after = jax.lax.scan(step, begin, ends)
+    if derivatives is None:
+        start = Begun(instants[0], physics.stuck(mechanics, contact0, y0), ledger0)
+    else:
+        start = begun_at(scene, mechanics, contact0, y0, instants[0], ledger0, enter)
+    _, after = jax.lax.scan(step, (start.t, start.y, contact0, start.total), ends)
     rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
 
     def with_start(first, rest):
@@ -224,7 +232,10 @@ def begun(
     scene: Scene, y0: State, instants: Float[Array, " T"], energy_data: EnergyData | None
 ) -> tuple[Contact, Ledger | None]:
     """The contact mode and the ledger of a run that begins at the first of these instants."""
-    load = scene.load(0.5 * (instants[0] + _ends(scene, instants)[0]))
+    # The load at a jump itself is not defined.
+    ends = _ends(scene, instants)
+    until = jnp.min(jnp.where(ends > instants[0], ends, jnp.inf))
+    load = scene.load(jnp.where(jnp.isfinite(until), 0.5 * (instants[0] + until), instants[0]))
     contact = physics.status_from_forces(Mechanics(scene), load, y0)
     return contact, None if energy_data is None else accounts.open_ledger(energy_data, y0)
 

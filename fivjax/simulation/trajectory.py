@@ -206,6 +206,9 @@ def simulate(
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
+    # They say how many rows there are.
+    arguments.known("t1", t1)
+    arguments.known("dt_save", dt_save)
     arguments.real_number("t1", t1, above=0)
     arguments.real_number("dt_save", dt_save, above=0)
     arguments.truth("energy", energy)

@@ -330,6 +330,111 @@ def test_method_of_simulate(paper_scene):
         fj.simulate(paper_scene, method=diffrax.Dopri5())
 
 
+@pytest.mark.parametrize("name", ["t1", "dt_save"])
+def test_times_that_are_traced(paper_scene, name):
+    """How many rows there are cannot depend on what JAX traces: a sentence, where JAX would name its own machinery."""
+    with refused(TypeError, f"`{name}`", "traced"):
+        jax.jvp(lambda x: fj.simulate(paper_scene, **{"t1": 0.1, "dt_save": 0.01, name: x}).t[-1], (0.1,), (1.0,))
+
+
+# -------------------------------------------------------------------------------------- other kinds of things
+
+STRUCTURES = [fj.painleve_friction, fj.delassus, fj.in_contact_coordinates]
+
+
+@pytest.mark.parametrize("given", [None, 1.0, "a", [1, 2], {}])
+def test_what_is_no_structure_or_scene(given):
+    """Named with its kind, where Python would name an attribute that it lacks."""
+    for function in STRUCTURES:
+        with refused(TypeError, "`structure`", "belt_oscillator()"):
+            function(given)
+    with refused(TypeError, "`scene`", "a Scene"):
+        fj.sliding_equilibrium(given)
+
+
+@pytest.mark.parametrize("given", [1.0, "a", [1, 2], {}, True])
+def test_what_is_no_cycle(paper_scene, given):
+    with refused(TypeError, "`cycle`", "limit_cycle(scene)"):
+        fj.saddle_cycle(paper_scene, given)
+
+
+def in_names(scene):
+    structure, one = scene.structure, lambda run: run.velocity[-1, 0]
+    return {
+        "wrt": lambda given: fj.derivatives(one, scene, given),
+        "over": lambda given: fj.smallest_kick(scene, over=given),
+        "free": lambda given: fj.design.raise_critical_perturbation(scene, free=given),
+        "coordinates": lambda given: fj.Structure(
+            np.eye(3), np.zeros((3, 3)), np.eye(3), [0.0, 0.0, -1.0], coordinates=given
+        ),
+        "bounds": lambda given: fj.design.lower_growth_rate(structure, given, mu=0.3),
+    }
+
+
+@pytest.mark.parametrize("name", ["wrt", "over", "free", "coordinates"])
+@pytest.mark.parametrize("given", [1.0, [1, 2], {"k1": 1.0}, 1j])
+def test_what_is_no_list_of_names(paper_scene, name, given):
+    with refused(TypeError, f"`{name}`", "list of names"):
+        in_names(paper_scene)[name](given)
+
+
+@pytest.mark.parametrize("given", [1.0, [1, 2], "a", True, 0])
+def test_what_is_no_dictionary_of_bounds(paper_scene, given):
+    """Zero is no bounds either, although it is as false as none."""
+    for call in (
+        lambda: fj.design.lower_growth_rate(paper_scene.structure, given, mu=0.3),
+        lambda: fj.design.raise_critical_friction(paper_scene.structure, given),
+        lambda: fj.design.raise_critical_perturbation(paper_scene, free="k1", bounds=given),
+        lambda: fj.smallest_kick(paper_scene, bounds=given),
+    ):
+        with refused(TypeError, "`bounds`", "a dictionary"):
+            call()
+    with refused(ValueError, "`bounds['p']`", "two numbers"):
+        fj.smallest_kick(paper_scene, bounds={"p": 3.0})
+
+
+@pytest.mark.parametrize("given", ["a", {}, 1.0, None])
+def test_what_are_no_starts(paper_scene, given):
+    """By the name of the argument, and before a kick is followed to its end."""
+    with refused(TypeError, "`starts`"):
+        fj.limit_cycles(paper_scene, starts=given)
+    with refused(TypeError, "`starts[0]`", "'a'"):
+        fj.limit_cycles(paper_scene, starts=["a"])
+
+
+@pytest.mark.parametrize("given", [None, 1.0, "a", [1, 2]])
+def test_what_no_structure_is_made_of(given):
+    """Refused before JAX is given a function that is none."""
+    with refused(TypeError, "`matrices_of`", "a function"):
+        fj.Structure.from_parameters(given, {"k": 1.0})
+    with refused(TypeError, "`parameters`", "a dictionary"):
+        fj.Structure.from_parameters(lambda k: None, given)
+    with refused(ValueError, "`parameters`", "at least one"):
+        fj.Structure.from_parameters(lambda: None, {})
+
+
+@pytest.mark.parametrize("given", [None, 1.0, [1, 2], {}])
+def test_what_is_no_path(given):
+    for call in (
+        lambda: fj.save(DATASET, given),
+        lambda: fj.open(given),
+        lambda: fj.read_structure(given, units="SI"),
+        lambda: fj.read_matrices(given),
+        lambda: fj.read_recording(given),
+    ):
+        with refused(TypeError, "`path`", "pathlib.Path"):
+            call()
+
+
+@pytest.mark.parametrize("given", [None, "a", 1.5, [1, 2], {}, True])
+def test_what_is_no_node(given):
+    with refused(TypeError, "`node`", "number of a node"):
+        fj.NodeContact(given, "x", "y")
+    if given is not None:
+        with refused(TypeError, "`against`", "number of a node"):
+            fj.NodeContact(1, "x", "y", given)
+
+
 # --------------------------------------------------------------------------------------------- files
 
 DATASET = xr.Dataset({"a": ("x", np.arange(3.0))})

@@ -303,6 +303,7 @@ def test_a_slice_of_a_map_is_selected_by_the_call_that_the_sentence_gives():
         (lambda: plot.energy.balance(None), "must be a trajectory"),
         (lambda: plot.energy.balance(still()), r"`simulate\(..., energy=True\)`"),
         (lambda: plot.energy.per_cycle(a_map()), r"what `fj.energy_per_cycle\(run\)` returns"),
+        (lambda: plot.calibration(None), r"such as `fivjax.calibrate\(.*\)`, but is None"),
         (lambda: plot.response(still(), "speed"), "`quantity` must be one of"),
     ],
 )
