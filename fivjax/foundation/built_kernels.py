@@ -17,7 +17,7 @@ import numpy as np
 from .blocks import in_threads, workers
 from .kept_programs import kept_value
 from .kernel_text import Form, text, written
-from .warp_library import ONE_AT_A_TIME, folder_of_texts, gpus_for, load, warp
+from .warp_library import ONE_AT_A_TIME, compiler_flags, folder_of_texts, gpus_for, load, warp
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
 WIDTHS = (1, 2, 4, 8, 16)
@@ -206,10 +206,7 @@ wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else
     space = {"wp": wp, "body": body}
     exec(compile(code, place, "exec"), space)
     module = wp.get_module(f"fivjax.kernel_{name}")
-    # What is compared with itself is compared to see whether it is a number. The same for all: Warp's headers are compiled anew
-    # for other flags.
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -O3 -ffp-contract=fast -Wno-tautological-compare"
-    module.options.update(max_unroll=1, cpu_compiler_flags=flags, enable_backward=False)
+    module.options.update(max_unroll=1, cpu_compiler_flags=compiler_flags(), enable_backward=False)
     kernel = wp.kernel(space["followed"], enable_backward=False, module=module)
     load(module, ["cpu"])
     return kernel

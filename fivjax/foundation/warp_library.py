@@ -79,6 +79,15 @@ def _init_elsewhere(wp) -> None:
             wp.config.kernel_cache_dir = before
 
 
+def compiler_flags() -> str:
+    """Those of all kernels on a CPU: with the same ones Warp compiles its own headers only once in a process."""
+    # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster. Loops over few coordinates
+    # are slower in vectors: an energy ledger takes five times as long. What is compared with itself is compared to see whether
+    # it is a number.
+    own = warp().config.cpu_compiler_flags or "-march=native"
+    return f"{own} -O3 -fno-vectorize -ffp-contract=fast -Wno-tautological-compare"
+
+
 def folder_of_texts() -> Path | None:
     """Where the code of kernels is kept, if it can be."""
     return kept_kernels.folder_of_texts(warp())

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..foundation.warp_library import warp
+from ..foundation.warp_library import compiler_flags, warp
 from ..section.crossings import MOST_TO_CROSSING
 from ..steppers.kernel_advance import stepping
 from ..steppers.kernel_laws import Form
@@ -45,9 +45,7 @@ def programs(form: Form) -> Programs:
     size, columns_type = state._length_, wp.types.vector(9, int)
     zero, infinite = real(0.0), real(np.inf)
     module = wp.get_module(f"fivjax.maps.matrix_kernels.{of.name}")
-    # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster.
-    flags = f"{wp.config.cpu_compiler_flags or ''} -O3 -ffp-contract=fast".strip()
-    module.options.update(max_unroll=1, cpu_compiler_flags=flags)
+    module.options.update(max_unroll=1, cpu_compiler_flags=compiler_flags())
 
     @wp.func
     def state_in(rows: wp.array2d(dtype=real), i: int, first: int) -> state:
