@@ -23,9 +23,15 @@ from jaxtyping import Array, Bool, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
+from ..foundation.carried import depending_on
 from ..foundation.compiling import compiled
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.polynomial import value_and_rate
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper, rates
+from ..steppers.core import next_part
+from ..steppers.event_exact import EventExact
+from ..steppers.kernel_scope import has_kernel
 
 # Instants within one advance at which the guards are evaluated; between two of them, derivatives tell a guard's course.
 LOOKS = 32
@@ -72,7 +78,7 @@ def closest_call(
 
     `slips_move`: which contacts' slips at the start change with a parameter.
     """
-    mechanics = Mechanics(scene)
+    mechanics, by_kernel = Mechanics(scene), has_kernel(scene, method)
     jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
     ends = [*jumps, t1]
     y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
@@ -81,18 +87,60 @@ def closest_call(
     for end in ends:
         load = scene.load(jnp.asarray(0.5 * (t + end)))
         begins = True
-        while t < end:
-            look = jax.tree.map(np.asarray, _look(method, mechanics, contact, load, y, jnp.asarray(end - t)))
-            arrives = bool(look.h >= end - t)
+        for look in _looks_until(_Asked(method), mechanics, contact, load, y, end - t, by_kernel):
+            arrives = bool(look.arrives)
             happened = seen.add(np.atleast_1d(contact.status), look, t, begins, arrives)
             # A mode that begins with an event there has begun at the edge of that event.
             begins = False
-            at = t + float(look.h)
-            t = end if arrives else at
-            y, contact = jnp.asarray(look.y), jax.tree.map(jnp.asarray, look.contact)
+            t = end if arrives else t + float(look.h)
+            y, contact = look.y, look.contact
             if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not happened):
                 return ClosestCall(seen.events, 0.0, t, "the motion stopping to be finite")
     return seen.closest()
+
+
+class _Asked(eqx.Module):
+    """How the trajectory is followed, fixed when that is traced."""
+
+    method: AbstractStepper = eqx.field(static=True)
+
+
+def _looks_until(asked: _Asked, mechanics: Mechanics, contact: Contact, load, y, left: float, by_kernel: bool):
+    """The advances from here for so much time (s), one after the other."""
+    # So many are followed in one call, and the time at which each of them would find nothing left.
+    over, time = np.zeros(32), np.asarray(left)
+    while time > 0:
+        (y, contact, time), looks = _looks((asked, mechanics, contact, load, y, time), over, by_kernel=by_kernel)
+        looks = jax.tree.map(np.asarray, looks)
+        for row in range(len(over)):
+            look = jax.tree.map(lambda leaf, row=row: leaf[row], looks)
+            yield look
+            if look.arrives:
+                return
+
+
+def _follow(args, over: Float[Array, " k"]):
+    asked, mechanics, contact, load, y, left = args
+    begin = depending_on((mechanics, load, left), (y, contact, left))
+
+    def further(now, over):
+        y, contact, left = now
+        goes_on = left > over
+
+        def look() -> _Look:
+            return _look(asked.method, mechanics, contact, load, y, left)
+
+        def none() -> _Look:
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))
+
+        found = jax.lax.cond(goes_on, look, none)
+        after = found.y, found.contact, jnp.where(found.arrives, 0.0, left - found.h)
+        return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, now), found
+
+    return jax.lax.scan(further, begin, over)
+
+
+_looks = KernelFunction(_follow)
 
 
 class _Look(eqx.Module):
@@ -101,6 +149,7 @@ class _Look(eqx.Module):
     y: Float[Array, " state"]
     contact: Contact
     h: Float[Array, ""]
+    arrives: Bool[Array, ""]  # whether the time that was left is over
     turned: Bool[Array, " c"]  # whether the contact has reversed its slip
     ended: Bool[Array, " c"]  # whether one of the contact's guards ran out
     guards: Float[Array, "l c 2"]
@@ -233,12 +282,18 @@ def _start(mechanics: Mechanics, contact: Contact, load, y):
     return contact.status, slip, (held - need) / jnp.where(held + need > 0, held + need, 1.0), at_rest
 
 
-@compiled
-def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
-    after = method.advance(mechanics, contact, load, y, h)
+def _look(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     # Just before the end, where the status is still the same.
     shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
-    inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
+    if isinstance(method, EventExact):
+        part, is_last = next_part(h, method.dt)
+        after, series, unit = method.with_series(mechanics, contact, load, y, part)
+        arrives = is_last & (after.h >= part)
+        inside = jax.lax.map(lambda share: value_and_rate(series, unit, share * after.h)[0], shares)
+    else:
+        after = method.advance(mechanics, contact, load, y, h)
+        arrives = after.h >= h
+        inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
     states = jnp.concatenate([y[None], inside])
 
     def along(function):
@@ -248,7 +303,8 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
     orders = [lambda state: physics.guards(mechanics, contact, load, state).reshape(-1, 2)]
     for _ in range(3):
         orders.append(along(orders[-1]))
-    value, slope, bend, third = (jax.vmap(order)(states) for order in orders)
+    # A loop, which a kernel keeps as one.
+    value, slope, bend, third = jax.lax.map(lambda state: tuple(order(state) for order in orders), states)
     # Where the slope is zero, by a parabola; at most half an interval to either side, and not beyond the ends.
     to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
     spacing = after.h / LOOKS
@@ -271,6 +327,7 @@ def _look(method, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
         after.y,
         after.contact,
         after.h,
+        arrives,
         turned,
         ended,
         value,
