@@ -5,7 +5,6 @@ import stat
 from io import BytesIO
 from pathlib import Path
 
-from ..foundation import arguments
 from ..foundation.whole_files import try_to_write, write_whole
 
 
@@ -14,6 +13,9 @@ def check_writable(path: str | Path) -> Path:
 
     **Raises:** `ValueError` with the reason.
     """
+    # Not above: a command line that only asks for its version or help starts without JAX, which this imports.
+    from ..foundation import arguments
+
     path = arguments.path("path", path)
     try:
         _check(path, _place(path))

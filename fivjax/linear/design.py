@@ -95,7 +95,7 @@ def raise_critical_friction(
     **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
     critical friction.
     """
-    _checked_bounds(structure, bounds, tied or {})
+    _check_bounds(structure, bounds, tied or {})
     if target is not None:
         arguments.real_number("target", target, above=0)
 

@@ -73,7 +73,7 @@ def basins(
       velocities (m/s) by these names with a `d` in front; and any parameters of the scene, as in `bistability_map`.
       Displacements are totals, as in `y0` of `simulate`, not deviations from sliding.
     - `kick`: whether the load goes through its kick; else it has its final value from the start.
-    - `method`, `t_max`, `memory`, `one_trajectory`, `executor`, `resume`: as in `bistability_map`.
+    - `method`, `t_max`, `memory`, `progress`, `executor`, `resume`: as in `bistability_map`.
 
     **Returns:** a dataset like that of `bistability_map`, with `verdict`, `amplitude` and `attractor` over the axes and the
     table of attractors. Over the attractors there is also `share`, the share of states that lead there, with `share_low` and

@@ -59,7 +59,7 @@ def bistability_map(
       stepped through.
     - `memory`: the memory that all jobs running at a time in this process may take, in bytes; at least one job always runs.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
-    - `one_trajectory`: whether to show a progress bar; unless given, in terminals and notebooks.
+    - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.
     - `resume`: a file in which finished jobs are kept while the map runs, every few seconds; or a folder named `*.zarr`, for
       maps of many million trajectories, in which each job is kept at once and which `xarray.open_zarr` reads at any time (extra
       `fivjax[zarr]`). If it exists, the map goes on from there: after any interruption the same call, on this machine or

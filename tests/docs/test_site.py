@@ -2,6 +2,7 @@
 
 import doctest
 import importlib.util
+import inspect
 import re
 import shutil
 import subprocess
@@ -113,6 +114,28 @@ def test_every_public_function_and_class_has_an_example():
     }
     # Results, shown where they are made.
     assert without <= {"Calibration", "CycleDerivatives", "Derivatives", "Reduction"}
+
+
+def documented_arguments(doc: str):
+    """The names that begin the items of a docstring's list of arguments."""
+    listed = re.search(r"\*\*Arguments:\*\*\n\n(.*?)(?:\n\n[ ]*\*\*|\Z)", inspect.cleandoc(doc), re.S)
+    for item in re.findall(r"^- ((?:`[^`]+`(?:, | and )?)+)", listed.group(1) if listed else "", re.M):
+        yield from (name.lstrip("*") for name in re.findall(r"`([^`]+)`", item))
+
+
+def test_documented_arguments_are_those_of_the_function():
+    """Rejects an argument that a rename, or a slip of one, has left in a docstring."""
+    assert list(
+        documented_arguments("A map.\n\n**Arguments:**\n\n- `a`, `b`: numbers.\n- `**axes`: `c`.\n\n**Returns:** `d`.")
+    ) == ["a", "b", "axes"]
+    asked = [fj, fj.cea, fj.design, fj.energy, fj.plot]
+    functions = {getattr(of, name) for of in asked for name in dir(of) if inspect.isfunction(getattr(of, name))}
+    told = {f: list(documented_arguments(f.__doc__ or "")) for f in functions}
+    assert sum(map(len, told.values())) > 100
+    wrong = {
+        (f.__name__, name) for f, names in told.items() for name in names if name not in inspect.signature(f).parameters
+    }
+    assert not wrong
 
 
 def test_every_public_name_has_a_place_in_the_reference():
