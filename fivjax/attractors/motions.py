@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status
 from ..section.return_maps import Section
 
 # Motions of a group from which attractors are sought at a time.
@@ -36,11 +35,3 @@ def far_apart(
             away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
         picked += mine
     return np.array(picked, int)
-
-
-def section_at(
-    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
-) -> Section:
-    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
-    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
-    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))

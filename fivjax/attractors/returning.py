@@ -5,9 +5,9 @@ from typing import Protocol, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import ReturnMaps, Section, section_at
 from . import tube
-from .motions import Motions, section_at
+from .motions import Motions
 from .tube import Tube
 
 # Starts on a tube's edge are back when they are in this share of it, which is less than what captures: next to a slow fade

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import ReturnMaps, Section, section_at
 from .catalogue import Attractors, Catalogue
 from .cycles import CROSSINGS, Recurrence
-from .motions import Motions, far_apart, section_at
+from .motions import Motions, far_apart
 
 # Groups whose motions are followed at once: the paths of those that may be on tori take memory, some 0.2 MB each.
 TOGETHER = 256

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps
+from ..section.return_maps import ReturnMaps, section_at
 from . import tube
 from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
 from .divergence import growth_rates
-from .motions import NOMINATED, Motions, section_at
+from .motions import NOMINATED, Motions
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
 from .tube import Tube, thin, tree_of
 

@@ -14,12 +14,11 @@ What a torus is accepted by is in `attractors.tori`; here it is only described.
 import numpy as np
 from jaxtyping import Float
 
-from ..attractors.motions import section_at
 from ..attractors.tori import Torus, smooth_mean
 from ..contact import Contact
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import ReturnMaps, Section, section_at
 from ..steppers.event_exact import EventExact
 from .around import seen_around, word
 from .cycle import LimitCycle, under_final_load

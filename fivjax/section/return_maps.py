@@ -5,6 +5,7 @@ where there are some; derivatives, which those by matrices do not have, are then
 in blocks of one size.
 """
 
+import functools
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -74,6 +75,14 @@ class Section(NamedTuple):
         """As one array, with what else there is of each row."""
         status, direction = np.asarray(self.status, np.int32), np.asarray(self.direction, float)
         return flatten((np.asarray(self.y), status, direction, *more))
+
+
+def section_at(
+    y: Float[np.ndarray, "m 2n"], normal: int | np.ndarray, direction: Float[np.ndarray, "m *contacts"]
+) -> Section:
+    """States of the section with the contact mode that they tell, and the direction of friction if they slide."""
+    status = np.where(y[:, normal] > 0, int(Status.DETACH), int(Status.SLIDE)).astype(np.int32)
+    return Section(y, status, np.where(status == Status.SLIDE, direction, 1.0))
 
 
 class Images(NamedTuple):
@@ -225,20 +234,27 @@ class ReturnMaps:
 
     def _differences(self, group, at: Section, crossings):
         """The derivative over many crossings, as a product over a few at a time: over a long time differences do not stay
-        small.
+        small. All are taken side by side, from where the motion is at the beginning of each.
         """
-        left, here = np.broadcast_to(crossings, len(group)).copy(), Section(*(np.array(part) for part in at))
-        time = np.zeros(len(group))
-        derivatives = np.zeros((*at.y.shape, at.y.shape[1]))
-        derivatives[:] = np.eye(at.y.shape[1])
-        while len(rows := np.flatnonzero(left > 0)):
-            part = np.minimum(left[rows], DIFFERENCED)
-            base, taken, slopes = self._differences_of_few(group[rows], here.rows(rows), part)
-            here.put(rows, base)
-            time[rows] += taken
-            derivatives[rows] = slopes @ derivatives[rows]
-            left[rows] -= part
-        return here, time, derivatives
+        crossings = np.broadcast_to(crossings, len(group))
+        parts, most = -(-crossings // DIFFERENCED), int(np.max(crossings, initial=1))
+        row = np.repeat(np.arange(len(group)), parts)
+        part = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
+        starts = at.rows(row)
+        later = np.flatnonzero(part)
+        if len(later):
+            # The last states of each motion are kept, the newest last.
+            path = self.returns(group, at, crossings, most).path
+            y = path[row[later], most - crossings[row[later]] + DIFFERENCED * part[later] - 1]
+            starts.put(later, section_at(y, self.normal, self.sliding[group[row[later]]]))
+        counts = np.minimum(DIFFERENCED, crossings[row] - DIFFERENCED * part)
+        ends, times, slopes = self._differences_of_few(group[row], starts, counts)
+        last = np.cumsum(parts) - 1
+        derivatives = np.empty((*at.y.shape, at.y.shape[1]))
+        for k, (end, count) in enumerate(zip(last.tolist(), parts.tolist(), strict=True)):
+            own = slopes[end + 1 - count : end + 1]
+            derivatives[k] = functools.reduce(lambda product, slope: slope @ product, own[1:], own[0])
+        return ends.rows(last), np.bincount(row, times, len(group)), derivatives
 
     def _differences_of_few(self, group, at: Section, crossings):
         """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""

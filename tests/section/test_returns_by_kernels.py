@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.attractors.motions import section_at
 from fivjax.maps.groups import Task, shared_by
 from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
-from fivjax.section.return_maps import ReturnMaps, Section
+from fivjax.section.return_maps import ReturnMaps, Section, section_at
 from fivjax.steppers.propagation import Propagation
 
 CROSSINGS = 6
