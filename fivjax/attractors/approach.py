@@ -18,7 +18,7 @@ from . import tube
 from .cycles import CROSSINGS, StableCycle, capturing_cycles
 from .motions import Motions
 from .returning import starts_beyond, starts_on_edges, tubes_returned_to
-from .tube import Tube
+from .tube import Tube, thin
 
 
 class Ways(NamedTuple):
@@ -32,8 +32,9 @@ class Ways(NamedTuple):
 ABOUT = Ways(0.1, 0, 32)
 # About a torus that is locked to a cycle of many crossings: along it motions take long.
 LOCKED = Ways(tube.RADIUS, 48, 128)
-# Motions that are followed until they lead into a cycle, and the most returns in which they do.
-PILOTS, LONGEST = 4, 16384
+# Motions that are followed until they lead into a cycle, the most returns in which they do, and how many of their states are
+# kept at least, where there are more.
+PILOTS, LONGEST, ONWARD = 4, 16384, 1024
 
 
 class Approach(NamedTuple):
@@ -88,15 +89,20 @@ def _ways_in(
     paths = np.swapaxes((maps.weights * paths).reshape(len(cycles), count, ways.kept, size), 1, 2)
     each = np.arange(len(own)).reshape(-1, count)
     onward = _led_in(maps, Motions(own, at), each[:, :PILOTS], cycles, ways)
-    led = {k: states for k, states in enumerate(onward) if states is not None and np.all(np.isfinite(paths[k]))}
+    # On long ways states lie close together.
+    led = {
+        k: thin(np.concatenate([np.zeros((0, size)), *states]), ONWARD)
+        for k, states in enumerate(onward)
+        if states is not None and np.all(np.isfinite(paths[k]))
+    }
     found: list[Float[np.ndarray, "k 2n"] | None] = [None] * len(cycles)
     if led:
         rows = list(led)
-        tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), *led[k]]), tube.RADIUS) for k in rows]
+        tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), led[k]]), tube.RADIUS) for k in rows]
         others = at.rows(each[rows, PILOTS:].ravel())
         for place in tubes_returned_to(maps, group[rows], tubes, others, report)[0].tolist():
             k = rows[place]
-            found[k] = np.concatenate([paths[k].reshape(-1, size), *led[k]])
+            found[k] = np.concatenate([paths[k].reshape(-1, size), led[k]])
     return found
 
 
