@@ -93,7 +93,9 @@ def to_crossing(
     """
     none, zero = jnp.zeros((), jnp.int32), jnp.zeros((), start.y.dtype)
     contact = Contact(start.contact.status.astype(jnp.int32), start.contact.direction)
-    begin = _Way(start.y, contact, kick, jax.lax.stop_gradient(longest), none, none, none, zero)
+    # How long is waited for a return moves with the scene, the return's time does not move with that.
+    longest = jax.lax.stop_gradient(longest)
+    begin = _Way(start.y, contact, kick, longest, none, none, none, zero)
     begin = depending_on((mechanics, longest), begin)
 
     def further(way: _Way) -> _Way:

@@ -37,13 +37,15 @@ def higher_peak(
 
 
 def peak_of_series(speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
-    samples = end * jnp.linspace(0.0, 1.0, SAMPLES)
-    values, _ = value_and_slope(speeds, samples)
-    # To first order the value at the peak does not depend on the instant of the peak.
-    sizes = jnp.abs(values)
+    # To first order the value at a peak does not depend on its instant; but at the advance's end, where an event ends it or the
+    # slope jumps, the instant is the event's.
+    until = jax.lax.stop_gradient(end)
+    samples = until * jnp.linspace(0.0, 1.0, SAMPLES)
+    sizes = jnp.abs(value_and_slope(speeds, samples)[0])
     # Not `argmax`, which JAX lowers in single precision when a caller's own `jit` is in it.
     largest = jax.lax.stop_gradient(jnp.max(jnp.where(sizes == jnp.max(sizes), samples, 0.0)))
-    x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, end, PEAK_STEPS))
-    refined, _ = value_and_slope(speeds, x)
-    ends = jnp.stack([jnp.max(sizes), jnp.abs(refined)])
-    return jnp.where(h > 0, jnp.max(ends), 0.0)
+    x = jax.lax.stop_gradient(extremum(speeds, largest, 0.0, until, PEAK_STEPS))
+    # Where Newton's method leads to a lower one, the sample counts.
+    x = jnp.where(jnp.abs(value_and_slope(speeds, x)[0]) >= jnp.max(sizes), x, largest)
+    peak, _ = value_and_slope(speeds, jnp.where(x >= until, end, x))
+    return jnp.where(h > 0, jnp.abs(peak), 0.0)

@@ -89,3 +89,23 @@ def with_falling_friction(cycle: fj.LimitCycle) -> fj.LimitCycle:
     """The cycle as one of a scene with falling friction."""
     scene = fj.Scene(SCENE.structure, fj.ExponentialDecay(0.2, 0.1, 0.5), belt_speed=1.0, load=fj.ConstantLoad(100.0))
     return eqx.tree_at(lambda c: c.scene, cycle, scene, is_leaf=lambda leaf: isinstance(leaf, fj.Scene))
+
+
+@pytest.mark.parametrize(("restitution", "at_an_event"), [(0.0, False), (0.5, True)])
+def test_derivatives_of_period_and_amplitude_are_differences_of_cycles(restitution, at_an_event):
+    """Also by parameters that change how long is waited for a return; and where the fastest instant is that of an impact."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.5), restitution=restitution)
+    cycle, names = fj.limit_cycle(scene), ["mu", "belt_speed", "k1", "m1", "c2"]
+    found = fj.cycle_derivatives(cycle, names)
+    run = fj.simulate(cycle.scene, cycle.period, cycle.period / 2000, y0=np.split(np.asarray(cycle.state), 2))
+    rate = np.diff(np.abs(np.asarray(run.velocity)[:, 0]))[np.argmax(np.abs(np.asarray(run.velocity)[:, 0])) - 1]
+    assert (rate > 1e-5) == at_an_event
+    for name in names:
+        step = 1e-5 * float(scene.parameters[name])
+        ahead, behind = (
+            fj.limit_cycle(scene.replace(**{name: float(scene.parameters[name]) + h}), start=cycle)
+            for h in (step, -step)
+        )
+        for what in ("period", "amplitude"):
+            difference = (getattr(ahead, what) - getattr(behind, what)) / (2 * step)
+            np.testing.assert_allclose(getattr(found, what)[name], difference, rtol=1e-5)
