@@ -58,12 +58,8 @@ def approaches(
             continue
         report(0)
         states = _ways_in(maps, group[chosen], [cycles[k] for k in chosen], ways, report)
-        led = [k for k, one in zip(chosen, states, strict=True) if one is not None]
-        tried = [
-            Approach(cycles[k], Tube(one, tube.RADIUS))
-            for k, one in zip(chosen, states, strict=True)
-            if one is not None
-        ]
+        led = [chosen[place] for place in states]
+        tried = [Approach(cycles[k], Tube(own, tube.RADIUS)) for k, own in zip(led, states.values(), strict=True)]
         for place in _drawn_in(maps, group[led], tried, report).tolist():
             found[led[place]] = tried[place]
     return found
@@ -76,9 +72,9 @@ def _returns_from(cycle: StableCycle, away: float) -> float:
 
 def _ways_in(
     maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], ways: Ways, report
-) -> list[Float[np.ndarray, "k 2n"] | None]:
-    """The weighted states through which motions come into each cycle that start about it, the first of all motions first; None
-    where they do not: pilots come into its neighbourhood, and the others to where those have been.
+) -> dict[int, Float[np.ndarray, "k 2n"]]:
+    """The weighted states through which motions come into each cycle that start about it, the first of all motions first, by
+    the cycle's place: of those where pilots come into its neighbourhood, and the others to where those have been.
     """
     count, size = tube.STARTS, len(maps.weights)
     about = [Tube(np.resize(maps.weights * cycle.points, (count, size)), ways.away) for cycle in cycles]
@@ -92,28 +88,26 @@ def _ways_in(
     # On long ways states lie close together.
     led = {
         k: thin(np.concatenate([np.zeros((0, size)), *states]), ONWARD)
-        for k, states in enumerate(onward)
-        if states is not None and np.all(np.isfinite(paths[k]))
+        for k, states in onward.items()
+        if np.all(np.isfinite(paths[k]))
     }
-    found: list[Float[np.ndarray, "k 2n"] | None] = [None] * len(cycles)
-    if led:
-        rows = list(led)
-        tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), led[k]]), tube.RADIUS) for k in rows]
-        others = at.rows(each[rows, PILOTS:].ravel())
-        for place in tubes_returned_to(maps, group[rows], tubes, others, report)[0].tolist():
-            k = rows[place]
-            found[k] = np.concatenate([paths[k].reshape(-1, size), led[k]])
-    return found
+    if not led:
+        return {}
+    rows = list(led)
+    tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), led[k]]), tube.RADIUS) for k in rows]
+    others = at.rows(each[rows, PILOTS:].ravel())
+    back, _ = tubes_returned_to(maps, group[rows], tubes, others, report)
+    return {k: np.concatenate([paths[k].reshape(-1, size), led[k]]) for k in (rows[place] for place in back)}
 
 
 def _led_in(
     maps: ReturnMaps, motions: Motions, each: Int[np.ndarray, "c pilots"], cycles: list[StableCycle], ways: Ways
-) -> list[list[Float[np.ndarray, "k 2n"]] | None]:
-    """Further weighted states of pilots, which have these rows for each cycle, until they are in its neighbourhood; None where
-    they do not come there in twice the time that the cycle's multiplier says.
+) -> dict[int, list[Float[np.ndarray, "k 2n"]]]:
+    """Further weighted states of pilots, which have these rows for each cycle, until they are in its neighbourhood, by the
+    cycle's place: of those where they come there in twice the time that the cycle's multiplier says.
     """
     within = np.array([ways.kept + tube.HOME + 2 * _returns_from(cycle, ways.away) for cycle in cycles])
-    states: list[list | None] = [[] for _ in cycles]
+    states: dict[int, list] = {k: [] for k in range(len(cycles))}
     # Of a torus that is locked weakly it is enough that it is drawn in: on a closed curve that has a periodic motion all others
     # come to such ones.
     weakly = np.array([len(cycle.points) > CROSSINGS for cycle in cycles]) & (within > LONGEST)
@@ -128,7 +122,7 @@ def _led_in(
         for k in np.unique(of[left]).tolist():
             # One that is late tells of all.
             if done >= within[k] or not np.all(np.isfinite(at.y[each[k]])):
-                states[k] = None
+                del states[k]
                 left[each[k]] = False
         rows = np.flatnonzero(left)
         if not len(rows):
@@ -137,9 +131,7 @@ def _led_in(
         ends, paths = maps.path(motions.group[rows], at.rows(rows), further)
         at.put(rows, ends)
         for row, path in zip(rows.tolist(), maps.weights * paths, strict=True):
-            part = states[of[row]]
-            assert part is not None
-            part.append(path)
+            states[of[row]].append(path)
         done += further
 
 

@@ -29,7 +29,7 @@ from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper, rates
-from ..steppers.core import next_part
+from ..steppers.core import left_after, next_part
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 
@@ -88,7 +88,7 @@ def closest_call(
         load = scene.load(jnp.asarray(0.5 * (t + end)))
         begins = True
         for look in _looks_until(_Asked(method), mechanics, contact, load, y, end - t, by_kernel):
-            arrives = bool(look.arrives)
+            arrives = bool(look.left == 0)
             happened = seen.add(np.atleast_1d(contact.status), look, t, begins, arrives)
             # A mode that begins with an event there has begun at the edge of that event.
             begins = False
@@ -115,7 +115,7 @@ def _looks_until(asked: _Asked, mechanics: Mechanics, contact: Contact, load, y,
         for row in range(len(over)):
             look = jax.tree.map(lambda leaf, row=row: leaf[row], looks)
             yield look
-            if look.arrives:
+            if look.left == 0:
                 return
 
 
@@ -134,7 +134,7 @@ def _follow(args, over: Float[Array, " k"]):
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))
 
         found = jax.lax.cond(goes_on, look, none)
-        after = found.y, found.contact, jnp.where(found.arrives, 0.0, left - found.h)
+        after = found.y, found.contact, found.left
         return jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, now), found
 
     return jax.lax.scan(further, begin, over)
@@ -149,7 +149,7 @@ class _Look(eqx.Module):
     y: Float[Array, " state"]
     contact: Contact
     h: Float[Array, ""]
-    arrives: Bool[Array, ""]  # whether the time that was left is over
+    left: Float[Array, ""]  # of the time that was given, s
     turned: Bool[Array, " c"]  # whether the contact has reversed its slip
     ended: Bool[Array, " c"]  # whether one of the contact's guards ran out
     guards: Float[Array, "l c 2"]
@@ -288,11 +288,9 @@ def _look(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load,
     if isinstance(method, EventExact):
         part, is_last = next_part(h, method.dt)
         after, series, unit = method.with_series(mechanics, contact, load, y, part)
-        arrives = is_last & (after.h >= part)
         inside = jax.lax.map(lambda share: value_and_rate(series, unit, share * after.h)[0], shares)
     else:
-        after = method.advance(mechanics, contact, load, y, h)
-        arrives = after.h >= h
+        after, is_last = method.advance(mechanics, contact, load, y, h), jnp.ones((), bool)
         inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
     states = jnp.concatenate([y[None], inside])
 
@@ -327,7 +325,7 @@ def _look(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load,
         after.y,
         after.contact,
         after.h,
-        arrives,
+        left_after(after, h, is_last),
         turned,
         ended,
         value,
