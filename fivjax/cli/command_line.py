@@ -62,6 +62,9 @@ def main(arguments: list[str] | None = None, interrupt: Callable[[int, FrameType
             said = error if isinstance(error, Interrupted) else "Interrupted; nothing was written."
             print(f"fivjax: {said}", file=sys.stderr)
             return exit_code(received[0] if received else signal.SIGINT)
+        if isinstance(error, MemoryError):
+            print(f"fivjax: There is not enough memory for that ({error}); ask for less.", file=sys.stderr)
+            return 1
         if isinstance(error, OSError):
             print(f"fivjax: A result could not be written: {error}.", file=sys.stderr)
             return 1

@@ -23,8 +23,10 @@ from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, known_to_numpy, refusing_reverse_in_single_precision
 from ..model.printing import as_call
 from ..model.scene import Scene
+from ..model.sliding import contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import ByMethod, Point, motion_to_section
+from ..section.free_directions import zero_on_section
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from .cycle import LimitCycle, point_of, under_final_load
@@ -225,6 +227,7 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
     image = _image(scene, contact, crossings)
     weights = jnp.asarray(scene.structure.weights)
     units = jnp.eye(len(guess), dtype=guess.dtype)
+    on_section = zero_on_section(scene.structure.size, contact_coordinates(scene.structure)[0])
 
     def going(carry):
         count, root, _, halved = carry
@@ -237,7 +240,7 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
 
     def further(carry):
         count, root, step, halved = carry
-        tried = root.y + step
+        tried = jnp.where(on_section, 0.0, root.y + step)
         back, tangents, (mode, arrived) = jax.vmap(
             lambda unit: jax.jvp(image, (tried,), (unit,), has_aux=True), out_axes=(None, -1, None)
         )(units)

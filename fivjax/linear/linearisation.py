@@ -38,7 +38,7 @@ class LinearSliding(eqx.Module):
     remainder_curvature: Float[Array, "*contacts"]
     reach: Float[Array, ""]  # the share of all margins up to which these bounds hold, and no contact lifts off
     direction: Float[Array, "*contacts"]  # of the friction force
-    exists: Bool[Array, ""]  # whether there is steady sliding, with normal forces that are not negative
+    exists: Bool[Array, ""]  # whether there is steady sliding, with normal forces that press
     solvable: Bool[Array, ""]  # whether the contact problem has a unique solution in both directions of slip
 
 
@@ -93,7 +93,7 @@ def linear_sliding(scene: Scene) -> LinearSliding:
         remainder_curvature=curvature / compliance**2 + 2 * jnp.abs(g_tn) * slope**2 / compliance**3,
         reach=jnp.full_like(compliance, LOWEST_SLIP),
         direction=direction,
-        exists=(normal_force >= 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
+        exists=(normal_force > 0) & jnp.all(jnp.isfinite(q)) & (direction != 0),
         solvable=physics.slides_uniquely(mechanics),
     )
 
@@ -155,7 +155,7 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
         remainder_curvature=curvature * speed**2 * forces,
         reach=jnp.minimum(LOWEST_SLIP, jnp.min(forces / each)),
         direction=direction,
-        exists=jnp.all((normal_force >= 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
+        exists=jnp.all((normal_force > 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
         solvable=physics.slides_uniquely(mechanics),
     )
 

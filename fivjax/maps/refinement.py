@@ -35,7 +35,7 @@ class Refined(NamedTuple):
 
 def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
     """An axis with each of its intervals halved `halvings` times."""
-    parts = 2**halvings
+    parts = 2**halvings if len(values) > 1 else 1
     share = np.arange(parts) / parts
     inside = values[:-1, None] + share * np.diff(values)[:, None]
     return np.append(inside.ravel(), values[-1])
@@ -81,7 +81,7 @@ def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -
 
 def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray, "*grid"]:
     """The indices of every so many-th point along each axis of a grid of this shape."""
-    along = (math.prod(shape[axis + 1 :]) * np.arange(0, length, step, dtype=kind) for axis, length in enumerate(shape))
+    along = (math.prod(shape[axis + 1 :]) * np.arange(0, length, min(step, length), dtype=kind) for axis, length in enumerate(shape))
     return functools.reduce(np.add, np.ix_(*along))
 
 

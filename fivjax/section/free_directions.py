@@ -5,9 +5,18 @@ subspace, with a basis that is orthonormal in weighted coordinates.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
+
+
+def zero_on_section(size: int, tangential: int | Int[np.ndarray, " c"]) -> Bool[np.ndarray, " state"]:
+    """Which entries of the state are zero on the section, in a structure of `size` coordinates: with one contact its tangential
+    velocity, with several none, because only a sum of velocities is.
+
+    A velocity just below zero, by rounding, would cross the section at once, as if a period had passed.
+    """
+    return (np.arange(2 * size) == size + tangential) if np.ndim(tangential) == 0 else np.zeros(2 * size, bool)
 
 
 def free_coordinates(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:

@@ -331,6 +331,21 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
     np.testing.assert_allclose(back, y, atol=1e-9 * np.max(np.abs(y)))
 
 
+def test_newton_s_points_lie_on_the_section_in_spite_of_rounding():
+    """A tangential velocity of -1e-22 m/s would rise through zero at once: a "cycle" that closes after no time."""
+    mass = np.diag([1.0328, 1.4485, 1.4689]) + np.array([[0, 0.0241, 0.0012], [0.0241, 0, -0.0149], [0.0012, -0.0149, 0]])
+    stiffness = np.array([[2.4397, 0.6167, 1.4575], [0.6167, 4.9068, 0.135], [1.4575, 0.135, 3.6783]])
+    structure = fj.Structure(
+        mass, 0.02 * mass + 0.01 * stiffness, stiffness, [-0.2283, 0.0394, -0.7886], contacts=[fj.ContactPoint(1, 2)]
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.6766), belt_speed=0.3, load=fj.ConstantLoad(1.7822))
+    cycle = fj.limit_cycle(scene)
+    slope = fj.cycle_derivatives(cycle, ["mu"]).period["mu"]
+    for change in np.random.default_rng(0).uniform(-2e-5, 2e-5, 12):
+        period = fj.limit_cycle(scene.replace(mu=0.6766 + change), start=cycle).period
+        assert period == pytest.approx(cycle.period + slope * change, rel=1e-8)
+
+
 @pytest.mark.parametrize("patient", [False, True])
 def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
     """Newton's method for arctan(5 (x - 2)) = 0 overshoots from 2.5, to where nothing returns: half the step does better."""
@@ -346,7 +361,9 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
         jacobian[:, 0, 0] = slope
         return at._replace(y=y), np.ones(len(x)), jacobian
 
-    maps = SimpleNamespace(weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived)
+    maps = SimpleNamespace(
+        weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived, tangential=0
+    )
     starts = np.array([[2.5, 0.0], [0.5, 0.0]])
     guess = Section(starts, np.ones(2, np.int32), np.ones(2))
     closed = close(maps, np.zeros(2, int), guess, 1, patient)  # type: ignore[arg-type]

@@ -195,6 +195,9 @@ def test_failures_are_verdicts_of_their_own(paper_scene):
     unloaded = fj.bistability_map(paper_scene, belt_speed=[0.0, 3.0], p=p, progress=False)
     assert np.all(unloaded["verdict"].sel(belt_speed=0.0) == fj.Verdict.NO_EQUILIBRIUM)
     assert np.all(unloaded["verdict"].sel(belt_speed=3.0) == fj.Verdict.SLIDING)
+    # What nothing presses against the belt does not slide on it.
+    weightless = fj.bistability_map(paper_scene.replace(force=0.0), belt_speed=[1.0, 3.0], p=p, progress=False)
+    assert np.all(weightless["verdict"] == fj.Verdict.NO_EQUILIBRIUM)
 
 
 @pytest.mark.slow

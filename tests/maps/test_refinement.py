@@ -79,6 +79,12 @@ def test_after_an_interrupt_the_finer_places_are_not_run():
     np.testing.assert_array_equal(found[computed], truth[computed])
 
 
+def test_an_axis_of_one_value_is_never_too_fine():
+    np.testing.assert_array_equal(finer_axis(np.array([0.2]), 100), [0.2])
+    cells = refine_grid((1, 1), 100, 0.0, lambda places, what: not_run(len(places), False))
+    assert cells.places.tolist() == [0]
+
+
 def test_a_refined_map_equals_the_full_one(tmp_path):
     """The paper's map: the computed cells have the full map's numbers, the others its verdicts; also when resumed."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, 1.2))
