@@ -15,6 +15,8 @@ FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
 MEETS_SLIDING = "amplitude meets the sliding equilibrium"
 # Multipliers this close to the real axis count as real.
 REAL = 1e-9
+# How far from the unit circle a multiplier may be found where it passes it.
+ON_CIRCLE = 1e-6
 # A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability limit.
 LEVEL = 1e-8
 
@@ -66,8 +68,9 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
             s, at = _root(place, lambda at, test=test: test(multipliers_of(at.images)), length, *values)
             if at is not None:
                 which = critical_multiplier(multipliers_of(at.images), name)
-                if which is not None:
-                    found.append((s, Special(name, curve, at, multiplier=complex(which))))
+                # Two real multipliers may have the product one, too.
+                if which is not None and abs(abs(which) - 1) <= ON_CIRCLE:
+                    found.append((s, Special(name, curve, at, multiplier=which)))
     return [special for _, special in sorted(found, key=lambda pair: pair[0])]
 
 
@@ -77,18 +80,22 @@ def doubling(values: Complex[np.ndarray, " m"]) -> float:
 
 
 def pairing(values: Complex[np.ndarray, " m"]) -> float:
-    """A function that changes its sign where a pair of conjugate multipliers passes the unit circle."""
-    upper = values[values.imag > REAL * np.maximum(np.abs(values), REAL)]
-    return float(np.prod(np.abs(upper) - 1)) if len(upper) else np.nan
+    """A function that changes its sign where a pair of conjugate multipliers passes the unit circle: the determinant of the
+    bialternate product of the map's derivative with itself, less the identity. It is smooth where real multipliers become a
+    pair.
+    """
+    one, other = np.triu_indices(len(values), 1)
+    products = values[one] * values[other]
+    # In factors of size one, so that their product does not overflow.
+    return float(np.prod((products - 1) / (1 + np.abs(products))).real) if len(products) else np.nan
 
 
 def critical_multiplier(values: Complex[np.ndarray, " m"], name: str) -> complex | None:
-    """The multiplier that passes the unit circle."""
-    chosen = values.real < 0 if name == DOUBLING else values.imag > REAL * np.abs(values)
-    if not np.any(chosen):
-        return None
-    candidates = values[chosen]
-    return complex(candidates[np.argmin(np.abs(np.abs(candidates) - 1))])
+    """The multiplier that passes the unit circle: at -1, or as one of a pair."""
+    if name == DOUBLING:
+        return complex(values[np.argmin(np.abs(values + 1))])
+    upper = values[values.imag > REAL * np.abs(values)]
+    return complex(upper[np.argmin(np.abs(np.abs(upper) - 1))]) if len(upper) else None
 
 
 def _root(place: Callable[[float], Place | None], test: Callable[[Place], float], length: float, low, high):

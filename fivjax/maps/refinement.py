@@ -81,7 +81,10 @@ def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -
 
 def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray, "*grid"]:
     """The indices of every so many-th point along each axis of a grid of this shape."""
-    along = (math.prod(shape[axis + 1 :]) * np.arange(0, length, min(step, length), dtype=kind) for axis, length in enumerate(shape))
+    along = (
+        math.prod(shape[axis + 1 :]) * np.arange(0, length, min(step, length), dtype=kind)
+        for axis, length in enumerate(shape)
+    )
     return functools.reduce(np.add, np.ix_(*along))
 
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.branches.special_points import pairing
 from tests.helpers import reference
+from tests.helpers.catalogue import full_matrices
 from tests.helpers.reference import cycles
 from tests.helpers.reference.cycles import stored
 
@@ -147,6 +149,27 @@ def test_the_command_writes_branch_and_picture(branch, monkeypatch, tmp_path, ca
     said = capsys.readouterr().out
     assert "fold" in said and "The bound mu = 0.21 is reached." in said
     assert {path.name for path in tmp_path.iterdir()} == {"b-1.nc", "b-2.nc", "b.png"}
+
+
+def test_pairs_pass_the_unit_circle_where_their_product_is_one():
+    """And nothing else changes the sign: neither two real multipliers that become a pair, nor zeros that rounding makes one."""
+    pair = 0.7 * np.exp(1j * np.array([0.4, -0.4]))
+    inside = pairing(np.append(pair, [0.2, -0.1]))
+    assert inside * pairing(np.append(pair / 0.69, [0.2, -0.1])) < 0
+    for others in ([0.7, 0.69], [0.7 + 1e-3j, 0.7 - 1e-3j]):
+        assert inside * pairing(np.append(pair, others)) > 0
+    zeros = np.array([1e-17 + 1e-17j, 1e-17 - 1e-17j])
+    assert pairing(np.append(pair, zeros)) * pairing(np.append(pair, zeros.real)) > 0
+
+
+def test_a_branch_of_strongly_stable_cycles_has_no_special_points():
+    """Two of its multipliers, far inside the unit circle, become a pair and part again."""
+    scene = full_matrices()
+    branch = fj.continue_cycle(scene, "mu", (0.64, 0.69), points=12, start=fj.limit_cycle(scene), progress=False)
+    multipliers = np.asarray(branch["multipliers"])
+    assert np.abs(multipliers).max() < 0.7
+    assert np.any(multipliers.imag != 0) and np.any(np.all(multipliers.imag == 0, axis=1))
+    assert specials(branch) == []
 
 
 def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):

@@ -14,6 +14,7 @@ from fivjax.cycles.around import Round, word
 from fivjax.cycles.torus import off_the_curve
 from fivjax.section.return_maps import Section
 from tests.helpers import reference
+from tests.helpers.catalogue import full_matrices
 from tests.helpers.reference.cycles import stored
 
 REFERENCE = stored()
@@ -333,12 +334,7 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
 
 def test_newton_s_points_lie_on_the_section_in_spite_of_rounding():
     """A tangential velocity of -1e-22 m/s would rise through zero at once: a "cycle" that closes after no time."""
-    mass = np.diag([1.0328, 1.4485, 1.4689]) + np.array([[0, 0.0241, 0.0012], [0.0241, 0, -0.0149], [0.0012, -0.0149, 0]])
-    stiffness = np.array([[2.4397, 0.6167, 1.4575], [0.6167, 4.9068, 0.135], [1.4575, 0.135, 3.6783]])
-    structure = fj.Structure(
-        mass, 0.02 * mass + 0.01 * stiffness, stiffness, [-0.2283, 0.0394, -0.7886], contacts=[fj.ContactPoint(1, 2)]
-    )
-    scene = fj.Scene(structure, fj.Coulomb(0.6766), belt_speed=0.3, load=fj.ConstantLoad(1.7822))
+    scene = full_matrices()
     cycle = fj.limit_cycle(scene)
     slope = fj.cycle_derivatives(cycle, ["mu"]).period["mu"]
     for change in np.random.default_rng(0).uniform(-2e-5, 2e-5, 12):
