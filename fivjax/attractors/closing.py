@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import same_mode
+from ..contact import Status, same_mode
 from ..section.crossings import Point
 from ..section.free_directions import zero_on_section
 from ..section.return_maps import ReturnMaps, Section
@@ -98,7 +98,6 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
     step, since, running = np.full((count, size), np.nan), np.zeros(count, int), np.arange(count)
     # Of many guesses few are near a cycle: each has fewer iterations, and may miss so often in all, not in a row.
     iterations, misses = (MOST_ITERATIONS, HALVINGS) if patient else (14, 2)
-    on_section = zero_on_section(size // 2, maps.tangential)
     for _ in range(iterations):
         if not len(running):
             break
@@ -124,7 +123,9 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
         # The guess has another contact mode than its image: on from the image.
         step[running[other_mode]] = np.nan
         moved = running[~other_mode]
-        here.put(moved, at.rows(moved)._replace(y=np.where(on_section, 0.0, at.y[moved] + step[moved])))
+        closed = at.status[moved].reshape(len(moved), -1) != Status.DETACH
+        zero = zero_on_section(size // 2, maps.tangential, maps.normal, closed)
+        here.put(moved, at.rows(moved)._replace(y=np.where(zero, 0.0, at.y[moved] + step[moved])))
         here.put(running[other_mode], image.rows(other_mode))
         running = running[~done]
     return best

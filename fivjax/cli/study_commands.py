@@ -11,6 +11,7 @@ import fivjax as fj
 
 from .options import SceneOptions
 from .outputs import Overwrite, output_paths, refuse_existing, say
+from .parsing import number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,5 +65,6 @@ class Reproduce:
         begin = time.perf_counter()
         made = fj.reproduce(self.figure, self.out)
         say(report)
-        print(f"  {len(made)} figures and tables, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")
+        what = number(len(made), "figure or table", "figures and tables")
+        print(f"  {what}, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")
         print(f"  {made.summary} What differs is explained in the report.")

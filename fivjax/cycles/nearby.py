@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..attractors.closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
-from ..contact import Contact, same_mode
+from ..contact import Contact, Status, same_mode
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
@@ -227,7 +227,8 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
     image = _image(scene, contact, crossings)
     weights = jnp.asarray(scene.structure.weights)
     units = jnp.eye(len(guess), dtype=guess.dtype)
-    on_section = zero_on_section(scene.structure.size, contact_coordinates(scene.structure)[0])
+    closed = jnp.atleast_1d(contact.status != Status.DETACH)
+    zero_there = zero_on_section(scene.structure.size, *contact_coordinates(scene.structure), closed)
 
     def going(carry):
         count, root, _, halved = carry
@@ -240,7 +241,7 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
 
     def further(carry):
         count, root, step, halved = carry
-        tried = jnp.where(on_section, 0.0, root.y + step)
+        tried = jnp.where(zero_there, 0.0, root.y + step)
         back, tangents, (mode, arrived) = jax.vmap(
             lambda unit: jax.jvp(image, (tried,), (unit,), has_aux=True), out_axes=(None, -1, None)
         )(units)

@@ -268,17 +268,21 @@ def _closed_from(scene: Scene, start) -> LimitCycle | None:
 
 def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
     """A point of the section to begin at, and the numbers of crossings per period to try."""
-    status, only = None, np.zeros(1, int)
+    status, direction, only = None, None, np.zeros(1, int)
     if isinstance(start, LimitCycle):
         # The point of the other scene's cycle need not be on this scene's section, if an impact falls on the section.
-        start, status = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation, start.contact.status
+        status, direction = start.contact.status, start.contact.direction
+        start = np.asarray(sliding_state(scene, scene.load.final)) + start.deviation
     elif isinstance(start, tuple | list) and len(start) == 2:
         start, status = start
     y = np.asarray(_state_of(scene, start) - np.asarray(sliding_state(scene, scene.load.final)))
     at = maps.in_contact(only, y[None])
     if status is not None:
-        known = [int(Status(int(one))) for one in np.atleast_1d(status)]
-        at = at._replace(status=np.asarray(known, np.int32).reshape(at.status.shape))
+        known = np.array([int(Status(int(one))) for one in np.atleast_1d(status)], np.int32)
+        if direction is None:
+            slip = scene.belt_speed - y[scene.structure.size + maps.tangential]
+            direction = np.where((known == Status.SLIDE) & (slip != 0), np.sign(slip), 1.0)
+        at = at._replace(status=known.reshape(at.status.shape), direction=np.reshape(direction, at.direction.shape))
     first = maps.returns(only, at, 1).at
     _, path = maps.path(only, first, MOST_CROSSINGS)
     path = maps.weights * path[0]

@@ -96,19 +96,32 @@ def read_recording(
     for name, meaning in columns.items():
         unit = _unit(path, name, channel(meaning).quantity, units)
         signals[channel(meaning)] = scale * unit * _vector(path, name, found[name])
-    rate = own_rate if rate is None else rate
-    if rate is None:
-        time = next((name for name in found if name.lower() in ("t", "time")), None) if time is None else time
-        if time is None:
-            raise ValueError(f"File `{path}` has no column `t` or `time`; name it with `time`, or give `rate` in Hz.")
+    time = next((name for name in found if name.lower() in ("t", "time")), None) if time is None else time
+    if own_rate is not None:
+        base = float(own_rate)
+    elif time is not None:
         _must_have(path, found, time)
         base = _unit(path, time, "time", units) * _vector(path, time, found[time])
-    else:
+    elif rate is not None:
         base = float(rate)
+    else:
+        raise ValueError(f"File `{path}` has no column `t` or `time`; name it with `time`, or give `rate` in Hz.")
+    if rate is not None:
+        _must_agree(path, base, float(rate))
     try:
         return Recording(base, signals, regime, **about)
     except ValueError as error:
         raise ValueError(f"File `{path}`: {error}") from None
+
+
+def _must_agree(path: Path, base: float | np.ndarray, rate: float) -> None:
+    """The sampling rate of a file with that which is given; they may differ by rounding of what is written in files."""
+    own = base if isinstance(base, float) else (len(base) - 1) / (base[-1] - base[0]) if len(base) > 1 else rate
+    if not np.isclose(own, rate, rtol=1e-2):
+        raise ValueError(
+            f"File `{path}` has a time base of its own, of {own:g} Hz, but `rate` is {rate:g} Hz. Leave out `rate`; if the "
+            f"file's times are wrong, correct them there."
+        )
 
 
 def _csv(path: Path):

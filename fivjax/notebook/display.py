@@ -60,7 +60,7 @@ def show(result, **options) -> Figure:
 
 # The function that draws a dataset, by the variables that it has.
 _PICTURES = (
-    (lambda d: "verdict" in d and d["verdict"].ndim == 2, plot.bistability),
+    (lambda d: "verdict" in d, plot.bistability),
     (lambda d: "special" in d and "word" in d, plot.branch),
     (lambda d: "manifold" in d and "path" in d, plot.boundary_section),
     (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),

@@ -10,13 +10,18 @@ from jaxtyping import Bool, Float, Int
 from ..contact import Status
 
 
-def zero_on_section(size: int, tangential: int | Int[np.ndarray, " c"]) -> Bool[np.ndarray, " state"]:
-    """Which entries of the state are zero on the section, in a structure of `size` coordinates: with one contact its tangential
-    velocity, with several none, because only a sum of velocities is.
+def zero_on_section(
+    size: int, tangential: int | Int[np.ndarray, " c"], normal: int | Int[np.ndarray, " c"], closed
+) -> Bool[np.ndarray, "... state"]:
+    """Which entries of a state on the section are zero, in a structure of `size` coordinates: the gaps of contacts that are
+    `closed` `(..., c)`, and their rates; with one contact also its tangential velocity (with several, only a sum of them is).
 
-    A velocity just below zero, by rounding, would cross the section at once, as if a period had passed.
+    They are to be exactly zero where a state is computed. A velocity just below zero, by rounding, would cross the section at
+    once, as if a period had passed; a gap just above it would be open.
     """
-    return (np.arange(2 * size) == size + tangential) if np.ndim(tangential) == 0 else np.zeros(2 * size, bool)
+    entries = np.arange(2 * size)
+    zero = (closed[..., None] & (entries % size == np.reshape(normal, (-1, 1)))).any(-2)
+    return zero | (entries == size + tangential) if np.ndim(tangential) == 0 else zero
 
 
 def free_coordinates(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:

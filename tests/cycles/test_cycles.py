@@ -358,10 +358,10 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
         return at._replace(y=y), np.ones(len(x)), jacobian
 
     maps = SimpleNamespace(
-        weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived, tangential=0
+        weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived, tangential=0, normal=0
     )
     starts = np.array([[2.5, 0.0], [0.5, 0.0]])
-    guess = Section(starts, np.ones(2, np.int32), np.ones(2))
+    guess = Section(starts, np.full(2, fj.Status.DETACH, np.int32), np.ones(2))
     closed = close(maps, np.zeros(2, int), guess, 1, patient)  # type: ignore[arg-type]
     assert closed.found.tolist() == [True, False]
     assert closed.at.y[0, 0] == pytest.approx(2.0, abs=1e-10)

@@ -50,6 +50,13 @@ def test_the_sample_recording_is_read():
     assert len((Path(__file__).parents[2] / "notebooks" / "decay.csv").read_text()) < 50_000
 
 
+def test_a_rate_that_contradicts_the_file_s_own_times_is_refused(tmp_path):
+    path = csv(tmp_path, table("t,a0", zip(T, A, strict=True)))
+    np.testing.assert_allclose(fj.read_recording(path, rate=RATE).t, T, atol=1e-12)
+    with pytest.raises(ValueError, match=f"time base of its own, of {RATE:g} Hz, but `rate` is 1 Hz"):
+        fj.read_recording(path, rate=1.0)
+
+
 def test_noise_by_channel_or_one_for_all():
     assert fj.Recording(T, {"a0": A, "v1": V}, noise=0.2).noise.tolist() == [0.2, 0.2]
     assert fj.Recording(T, {"a0": A, "v1": V}, noise={"v1": 0.1, "a0": 0.3}).noise.tolist() == [0.3, 0.1]

@@ -135,6 +135,8 @@ def test_the_limit_cycle_of_one_of_two_contacts_is_its_own():
     assert cycle.amplitude == pytest.approx(own.amplitude, rel=1e-12)
     assert cycle.stable
     assert not cycle.in_family
+    for start in (cycle, (cycle.state, cycle.contact.status), cycle.state):
+        assert fj.limit_cycle(scene, start=start).period == pytest.approx(cycle.period, rel=1e-12)
     sliding = np.exp(fj.cea.eigenvalues(fj.belt_oscillator(), 0.02) * cycle.period)
     for value in np.concatenate([own.multipliers[:4], sliding]):
         assert np.min(np.abs(cycle.multipliers - value)) < 1e-6

@@ -11,6 +11,7 @@ import fivjax as fj
 from fivjax.maps.groups import Task, shared_by
 from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
+from fivjax.section.free_directions import zero_on_section
 from fivjax.section.return_maps import ReturnMaps, Section, section_at
 from fivjax.steppers.propagation import Propagation
 
@@ -108,3 +109,12 @@ def test_each_rise_of_the_velocity_is_a_crossing():
             break
         count += 1
     assert count == expected and count > 100
+
+
+def test_what_is_zero_on_the_section():
+    """With one contact its tangential velocity, with several none; and gaps that are closed, with their rates."""
+    assert np.flatnonzero(zero_on_section(3, 0, 2, np.array([True]))).tolist() == [2, 3, 5]
+    assert np.flatnonzero(zero_on_section(3, 0, 2, np.array([False]))).tolist() == [3]
+    places = np.array([0, 2]), np.array([1, 3])
+    rows = zero_on_section(4, *places, np.array([[True, False], [True, True], [False, False]]))
+    assert [np.flatnonzero(row).tolist() for row in rows] == [[1, 5], [1, 3, 5, 7], []]
