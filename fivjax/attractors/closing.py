@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..contact import Status, same_mode
+from ..contact import same_mode
 from ..section.crossings import Point
 from ..section.free_directions import zero_on_section
 from ..section.return_maps import ReturnMaps, Section
@@ -123,8 +123,7 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
         # The guess has another contact mode than its image: on from the image.
         step[running[other_mode]] = np.nan
         moved = running[~other_mode]
-        closed = at.status[moved].reshape(len(moved), -1) != Status.DETACH
-        zero = zero_on_section(size // 2, maps.tangential, maps.normal, closed)
+        zero = zero_on_section(size // 2, maps.tangential, maps.normal, at.status[moved])
         here.put(moved, at.rows(moved)._replace(y=np.where(zero, 0.0, at.y[moved] + step[moved])))
         here.put(running[other_mode], image.rows(other_mode))
         running = running[~done]

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..attractors.closing import CLOSED, EXACT, HALVINGS, MOST_ITERATIONS
-from ..contact import Contact, Status, same_mode
+from ..contact import Contact, same_mode
 from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.linear_solve import solve
@@ -227,8 +227,7 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
     image = _image(scene, contact, crossings)
     weights = jnp.asarray(scene.structure.weights)
     units = jnp.eye(len(guess), dtype=guess.dtype)
-    closed = jnp.atleast_1d(contact.status != Status.DETACH)
-    zero_there = zero_on_section(scene.structure.size, *contact_coordinates(scene.structure), closed)
+    zero_there = zero_on_section(scene.structure.size, *contact_coordinates(scene.structure), contact.status)
 
     def going(carry):
         count, root, _, halved = carry

@@ -116,7 +116,9 @@ def read_recording(
 
 def _must_agree(path: Path, base: float | np.ndarray, rate: float) -> None:
     """The sampling rate of a file with that which is given; they may differ by rounding of what is written in files."""
-    own = base if isinstance(base, float) else (len(base) - 1) / (base[-1] - base[0]) if len(base) > 1 else rate
+    own = base
+    if isinstance(base, np.ndarray):
+        own = (len(base) - 1) / (base[-1] - base[0]) if len(base) > 1 else rate
     if not np.isclose(own, rate, rtol=1e-2):
         raise ValueError(
             f"File `{path}` has a time base of its own, of {own:g} Hz, but `rate` is {rate:g} Hz. Leave out `rate`; if the "

@@ -104,10 +104,9 @@ def _may_be_concluded(
     steps: those whose mode has not changed in it, after the last jump of the load, and those that have not moved, are too large
     or are not finite. Cheap. `began` and `events` are the time (s) and the number of events before the round.
     """
-    yardstick = np.max(np.abs(shared.weights * shared.modes.linear.equilibrium), axis=1)
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
     quiet = np.True_ if now.steps is None else np.all(now.steps.jumps <= now.t[:, None], axis=1)
-    return (quiet & (now.events == events)) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * yardstick[group])
+    return (quiet & (now.events == events)) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * now.yardstick)
 
 
 def _conclude(

@@ -24,7 +24,8 @@ from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .groups import Shared
 
-# A deviation this much larger than the equilibrium displacements and the belt's motion counts as unbounded.
+# A deviation counts as unbounded if it is this much larger than the equilibrium displacements under the largest load, the
+# belt's motion and the start.
 UNBOUNDED_FROM = 1e9
 
 
@@ -38,6 +39,7 @@ class Progress(eqx.Module):
     crossing: State  # the last crossing of the section under the final load; NaN before the first
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
+    yardstick: Float[Array, ""]  # the weighted size of what made the motion, m
     verdict: Int[Array, ""]
     bound: Float[
         Array, ""
@@ -87,18 +89,22 @@ def at_equilibrium(scene: Scene, shared: Shared, energy: bool, for_kernel: bool)
         jnp.where(modes.linear.exists, Verdict.UNDECIDED, Verdict.NO_EQUILIBRIUM),
     )
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
+    steps, mechanics, weights = LoadSteps(scene.load), shared.mechanics, scene.structure.weights
+    largest = jnp.max(jnp.abs(steps.loads + scene.load.final)) / jnp.abs(scene.load.final)
+    belt = jnp.max(weights[scene.structure.size + mechanics.tangential] * jnp.abs(scene.belt_speed))
     return Progress(
         t=jnp.zeros((), y.dtype),
         skipped=jnp.zeros((), y.dtype),
         y=y,
-        contact=physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y),
+        contact=physics.status_from_forces(mechanics, scene.load.force - scene.load.final, y),
         crossing=jnp.full_like(y, jnp.nan),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
+        yardstick=largest * jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + belt,
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         bound=jnp.full((), jnp.inf, y.dtype),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
-        steps=LoadSteps(scene.load) if for_kernel else None,
+        steps=steps if for_kernel else None,
     )
 
 
@@ -110,8 +116,12 @@ def with_initial_values(now: Progress, scene: Scene, shared: Shared, places: tup
     y = now.y.at[at].set(jnp.where(jnp.isnan(values), now.y[at], values - equilibrium[at]))
     contact = physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y)
     energy = None if now.energy is None else EnergyRecord(open_ledger(EnergyData(scene), y), now.energy.vibration)
+    yardstick = jnp.maximum(now.yardstick, jnp.max(jnp.abs(scene.structure.weights * y)))
     return eqx.tree_at(
-        lambda now: (now.y, now.contact, now.energy), now, (y, contact, energy), is_leaf=lambda leaf: leaf is None
+        lambda now: (now.y, now.contact, now.yardstick, now.energy),
+        now,
+        (y, contact, yardstick, energy),
+        is_leaf=lambda leaf: leaf is None,
     )
 
 
@@ -149,6 +159,7 @@ def with_step(setting: Setting, now: Progress) -> Progress:
         crossing=jnp.where(crossed, rise.at, now.crossing),
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
+        yardstick=now.yardstick,
         verdict=now.verdict,
         bound=now.bound,
         energy=None if now.energy is None else _with_entry(setting, now.energy, now, load, after, t),
@@ -172,16 +183,13 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
     `began` is the time (s) at which the present round of steps began.
     """
     scene, mechanics, modes = setting.scene, setting.shared.mechanics, setting.shared.modes
-    structure = scene.structure
-    weights = structure.weights
-    equilibrium, velocity = modes.linear.equilibrium, structure.size + mechanics.tangential
-    belt = weights[velocity] * jnp.abs(scene.belt_speed)
-    yardstick = jnp.max(jnp.abs(weights * equilibrium)) + (jnp.max(belt) if mechanics.several else belt)
-    grown = jnp.max(jnp.abs(weights * now.y)) > UNBOUNDED_FROM * yardstick
+    grown = jnp.max(jnp.abs(scene.structure.weights * now.y)) > UNBOUNDED_FROM * now.yardstick
     # There is no proof that several contacts stick for ever.
     jammed = jnp.asarray(False)
     if setting.shared.drift is not None:
-        jammed = sticks_forever(setting.shared.drift, mechanics.of_totals, now.contact, now.y + equilibrium)
+        jammed = sticks_forever(
+            setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
+        )
     quiet_load = jnp.all(scene.load.jumps <= now.t)
     bound = used_up(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(

@@ -11,17 +11,18 @@ from ..contact import Status
 
 
 def zero_on_section(
-    size: int, tangential: int | Int[np.ndarray, " c"], normal: int | Int[np.ndarray, " c"], closed
+    size: int, tangential: int | Int[np.ndarray, " c"], normal: int | Int[np.ndarray, " c"], status
 ) -> Bool[np.ndarray, "... state"]:
-    """Which entries of a state on the section are zero, in a structure of `size` coordinates: the gaps of contacts that are
-    `closed` `(..., c)`, and their rates; with one contact also its tangential velocity (with several, only a sum of them is).
+    """Which entries of a state on the section are zero, in a structure of `size` coordinates, by the `status` `(..., *c)`: the
+    gaps of closed contacts and their rates; with one also its tangential velocity (with several, a sum of them is).
 
     They are to be exactly zero where a state is computed. A velocity just below zero, by rounding, would cross the section at
     once, as if a period had passed; a gap just above it would be open.
     """
-    entries = np.arange(2 * size)
-    zero = (closed[..., None] & (entries % size == np.reshape(normal, (-1, 1)))).any(-2)
-    return zero | (entries == size + tangential) if np.ndim(tangential) == 0 else zero
+    entries, closed = np.arange(2 * size), status != Status.DETACH
+    if np.ndim(tangential) == 0:
+        return (closed[..., None] & (entries % size == normal)) | (entries == size + tangential)
+    return (closed[..., None] & (entries % size == np.reshape(normal, (-1, 1)))).any(-2)
 
 
 def free_coordinates(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:

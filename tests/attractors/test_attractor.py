@@ -428,7 +428,7 @@ def test_the_smooth_mean_of_a_quasi_periodic_sequence_is_its_mean(start):
 class Locked:
     """A return map of a circle that is locked to 5 turns in 13 returns, where neighbours close in by a thousandth a return."""
 
-    weights, normal, sliding = np.ones(6), 2, np.ones(1)
+    weights, tangential, normal, sliding = np.ones(6), 0, 2, np.ones(1)
     structure = SimpleNamespace(contacts=[None])
 
     def once(self, y):

@@ -33,6 +33,13 @@ def test_initial_states_lead_where_an_independent_solver_says(found):
         assert (ours, theirs.kind) in ((0, "sliding"), (1, "limit cycle"))
 
 
+def test_a_large_start_that_decays_is_not_unbounded():
+    """Without friction and inclination the tangential motion is that of a damped oscillator, whatever its size."""
+    scene = fj.Scene(fj.belt_oscillator(theta=0.0), fj.Coulomb(0.0), 1.0, fj.Pulse(100.0, 1.2))
+    found = fj.basins(scene, x2=[1.0, 1e7], dx2=[0.0, 1.0], progress=False)
+    assert np.all(found["verdict"] == fj.Verdict.SLIDING)
+
+
 def test_shares_are_counted_with_their_interval(found):
     sliding = int((found["verdict"] == 0).sum())
     assert float(found["sliding_share"]) == sliding / 36

@@ -113,8 +113,10 @@ def test_each_rise_of_the_velocity_is_a_crossing():
 
 def test_what_is_zero_on_the_section():
     """With one contact its tangential velocity, with several none; and gaps that are closed, with their rates."""
-    assert np.flatnonzero(zero_on_section(3, 0, 2, np.array([True]))).tolist() == [2, 3, 5]
-    assert np.flatnonzero(zero_on_section(3, 0, 2, np.array([False]))).tolist() == [3]
-    places = np.array([0, 2]), np.array([1, 3])
-    rows = zero_on_section(4, *places, np.array([[True, False], [True, True], [False, False]]))
-    assert [np.flatnonzero(row).tolist() for row in rows] == [[1, 5], [1, 3, 5, 7], []]
+    slide, detach = fj.Status.SLIDE, fj.Status.DETACH
+    one = zero_on_section(3, 0, 2, np.array([slide, detach]))
+    assert [np.flatnonzero(row).tolist() for row in one] == [[2, 3, 5], [3]]
+    assert zero_on_section(3, 0, 2, np.zeros(0, int)).shape == (0, 6)
+    places, status = (np.array([0, 2]), np.array([1, 3])), np.array([[slide, detach], [slide, slide], [detach, detach]])
+    several = zero_on_section(4, *places, status)
+    assert [np.flatnonzero(row).tolist() for row in several] == [[1, 5], [1, 3, 5, 7], []]
