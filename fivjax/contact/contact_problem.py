@@ -10,7 +10,7 @@ impulses. Each contact is in one of four states; every state demands something, 
 | BACKWARD | $T = -μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≥ 0$ |
 | OPEN | $T = N = 0$ | $a_n ≥ 0$ |
 
-If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to three contacts all
+If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to four contacts
 combinations are tried at once (`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to
 sticking. At an event some condition is zero up to rounding, so the state that has just `ended` must be admissible by a clear
 margin, or it would be chosen again.
@@ -31,8 +31,8 @@ from .mode_forces import mode_matrix
 
 STICK, FORWARD, BACKWARD, OPEN = range(4)
 NONE = -1
-# All combinations are tried for up to this many contacts: 64.
-MOST_ENUMERATED = 3
+# Combinations are tried for up to this many contacts: of 256 few are allowed.
+MOST_ENUMERATED = 4
 # A condition counts as met if it is violated by no more than this share of the terms in it.
 TIE = {"float64": 1e-12, "float32": 1e-5}
 
@@ -106,19 +106,31 @@ def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Arra
 
 
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
-    """By trying all combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking."""
+    """By trying combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking."""
     every = np.array(sorted(itertools.product(range(4), repeat=len(problem.slips)), key=_preference), np.int32)
+    # A contact that has just lifted off may be admissible on the belt as well; it stays off.
+    a_change = 0.1 * TIE[problem.normal.dtype.name]
+    infinite = jnp.asarray(jnp.inf, problem.normal.dtype)
 
-    def tried(best, state):
-        # A contact that has just lifted off may be admissible on the belt as well; it stays off.
-        changes = jnp.sum(state != start) * (0.1 * TIE[problem.normal.dtype.name])
-        violation = jnp.max(_judged(problem, state)) + changes
-        better = violation < best[0]
-        return (jnp.where(better, violation, best[0]), jnp.where(better, state, best[1])), None
+    def violation(state):
+        # Most combinations are not allowed, and then their forces need not be worked out.
+        allowed = jnp.all(jnp.any(problem.allowed & (state[:, None] == np.arange(4)), axis=-1))
+        return jax.lax.cond(allowed, lambda: jnp.max(_judged(problem, state)), lambda: infinite)
+
+    def going(carry):
+        # What is admissible with one change is better than all others but `start` itself, which is tried first.
+        number, least, _ = carry
+        return (number < len(every)) & (least > a_change)
+
+    def tried(carry):
+        number, least, best = carry
+        state = jnp.where(number < 0, start, jnp.asarray(every)[jnp.maximum(number, 0)])
+        own = violation(state) + jnp.sum(state != start) * a_change
+        return number + 1, jnp.minimum(own, least), jnp.where(own < least, state, best)
 
     # One after the other: what tries all at once takes long to compile.
-    begin = jnp.asarray(jnp.inf, problem.normal.dtype), jnp.asarray(every[0])
-    return jax.lax.scan(tried, depending_on(problem, begin), every)[0][1]
+    begin = jnp.full((), -1, jnp.int32), infinite, start
+    return jax.lax.while_loop(going, tried, depending_on(problem, begin))[2]
 
 
 def _preference(states: tuple[int, ...]) -> tuple[int, int]:

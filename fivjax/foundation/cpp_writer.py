@@ -41,16 +41,26 @@ FEW = 40
 class Writer:
     """Code that is being written, equation by equation."""
 
-    def __init__(self, rules: Mapping[str, Callable], types: dict[str, str] | None = None):
-        """`rules` are functions that write primitives, by name; `types` are those of the variables that the code is given."""
-        self.rules = rules
+    def __init__(
+        self, rules: Mapping[str, Callable], calls: Mapping[str, Callable], types: dict[str, str] | None = None
+    ):
+        """`rules` are functions that write primitives, `calls` those that write calls of functions, by name; `types` are those
+        of the variables that the code is given.
+        """
+        self.rules, self.calls = rules, calls
         self.lines: list[str] = []
+        # The texts of functions that the code calls, by name.
+        self.functions: dict[str, str] = {}
         self.types = dict(types or {})
         self._count = count()
         # Blocks that are open, each with what has been computed in it: the same text is the same number.
         self._blocks: list[dict] = [{}]
 
     # Lines.
+
+    @property
+    def source(self) -> str:
+        return "\n".join([*self.functions.values(), *self.lines])
 
     def put(self, line: str) -> None:
         self.lines.append("  " * len(self._blocks) + line)
@@ -183,6 +193,8 @@ class Writer:
         if name in self.rules and primitive.multiple_results:
             return self.rules[name](self, equation, operands)
         called = within(params)
+        if called is not None and params.get("name") in self.calls:
+            return self.calls[params["name"]](self, equation, operands)
         if called is not None:
             return self.run(called.jaxpr, called.consts, operands)
         if name in SAME:

@@ -244,7 +244,7 @@ class _WriterOfKernel:
                 for entry in writer.entries(read(variable)).ravel():
                     writer.put(f"{name}[{start}] = {writer.as_type(entry, kind)};")
                     start += 1
-        return "\n".join(writer.lines)
+        return writer.source
 
     def _rows_of(self, loop, k: int, kind: str) -> View:
         """Where the loop's rows of results with this number are written."""

@@ -75,6 +75,12 @@ def fivjax_elimination(matrix, right):
     return eliminated(matrix, right)
 
 
+def is_elimination(equation) -> bool:
+    """Whether an equation of a traced function is `fivjax_elimination` of one system, not of a batch of some."""
+    own = equation.params.get("name") == fivjax_elimination.__name__
+    return own and all(variable.aval.ndim == 2 for variable in equation.invars)
+
+
 def _in_columns(matrix, right):
     return fivjax_elimination(matrix, right.reshape(right.shape[0], -1)).reshape(right.shape)
 

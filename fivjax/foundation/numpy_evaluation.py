@@ -15,7 +15,7 @@ from jax.extend.core import Jaxpr, Literal
 from .compiling import compiled, transformed
 from .jaxprs import of_scan, solution, within
 from .kernel_text import Form
-from .linear_solve import eliminated, fivjax_elimination
+from .linear_solve import eliminated, is_elimination
 from .numpy_primitives import function_of
 
 # Calls after which it is compiled, and results that are kept in case they are asked for again.
@@ -127,7 +127,7 @@ class _Plan:
             reads, called, name = list(map(place, equation.invars)), within(equation.params), equation.primitive.name
             if name == "custom_linear_solve":
                 called, reads = solution(equation.params, reads)
-            if called is not None and name not in LOOPS and not _is_elimination(equation):
+            if called is not None and name not in LOOPS and not is_elimination(equation):
                 consts = [self._new(np.asarray(const)) for const in called.consts]
                 places.update(zip(equation.outvars, self._ends_of(called.jaxpr, [*consts, *reads]), strict=True))
                 continue
@@ -170,14 +170,8 @@ def _run(jaxpr: Jaxpr, consts, given) -> list:
     return _plan_of(jaxpr)([*map(np.asarray, consts), *given])
 
 
-def _is_elimination(equation) -> bool:
-    """Whether a linear system is solved here, and not a batch of some."""
-    own = equation.params.get("name") == fivjax_elimination.__name__
-    return own and all(variable.aval.ndim == 2 for variable in equation.invars)
-
-
 def _function_of(equation) -> Callable:
-    if _is_elimination(equation):
+    if is_elimination(equation):
         return lambda sides: (eliminated(*sides, xp=np),)
     name = equation.primitive.name
     return functools.partial(LOOPS[name], equation.params) if name in LOOPS else function_of(equation)
@@ -188,9 +182,16 @@ def _while(params, operands: list) -> list:
     asked = operands[: params["cond_nconsts"]]
     fixed = operands[len(asked) :][: params["body_nconsts"]]
     carry = operands[len(asked) + len(fixed) :]
-    while _run(condition.jaxpr, condition.consts, [*asked, *carry])[0]:
-        carry = _run(body.jaxpr, body.consts, [*fixed, *carry])
+    # In a batch each has its own condition, and stays as it is once that is not met.
+    while np.any(goes := np.asarray(_run(condition.jaxpr, condition.consts, [*asked, *carry])[0])):
+        after = _run(body.jaxpr, body.consts, [*fixed, *carry])
+        carry = after if np.all(goes) else [_where(goes, *pair) for pair in zip(after, carry, strict=True)]
     return carry
+
+
+def _where(goes: np.ndarray, after, before) -> np.ndarray:
+    after = np.asarray(after)
+    return np.where(goes.reshape(goes.shape + (1,) * (after.ndim - goes.ndim)), after, before)
 
 
 def _scan(params, operands: list) -> list:

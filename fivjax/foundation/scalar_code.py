@@ -26,4 +26,4 @@ def scalar_source(function: Callable, **lengths: int) -> tuple[str, int]:
             (found,) = code.run(closed.jaxpr, closed.consts, given)
     entries = code.entries(found).ravel()
     ends = [f"found[{place}] = (double)({text_of(entry)});" for place, entry in enumerate(entries)]
-    return "\n".join([*code.lines, *ends]), len(entries)
+    return "\n".join([code.source, *ends]), len(entries)

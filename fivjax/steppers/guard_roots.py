@@ -69,6 +69,8 @@ def _first_root(
     c = jax.lax.dynamic_slice(jnp.pad(c, (0, 3)), (sum(zero.astype(jnp.int32) for zero in zeros),), c.shape)
     k = np.arange(len(c))
     falling = jnp.maximum(-c, 0.0)
+    # Its negative coefficients alone cannot use it up.
+    lasts = c[0] > jnp.sum(falling[1:])
     bound_2, bound_3 = (jnp.sum(falling * of.astype(c.dtype)) for of in (k * (k - 1), k * (k - 1) * (k - 2)))
     huge = 1.0 / eps
     # Already used up: after a jump of the load, or if the last advance ended short of the root by rounding.
@@ -93,7 +95,8 @@ def _first_root(
         return x + step, step, count + 1
 
     none = jnp.zeros_like(size)
-    x, step, _ = jax.lax.while_loop(going, march, (none, none + 1, jnp.zeros((), jnp.int32)))
+    begin = jnp.where(lasts, 1.0, none), none + 1, jnp.zeros((), jnp.int32)
+    x, step, _ = jax.lax.while_loop(going, march, begin)
     found = spent | ((x < 1) & (step <= 2 * eps * x))
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
 

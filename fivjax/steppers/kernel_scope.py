@@ -14,7 +14,7 @@ from .base import AbstractStepper
 from .event_exact import EventExact
 
 # Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
-LARGEST, MOST_CONTACTS = 48, 3
+LARGEST, MOST_CONTACTS = 48, 4
 PACKAGE = __name__.partition(".")[0]
 
 

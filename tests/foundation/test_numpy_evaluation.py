@@ -38,6 +38,17 @@ def test_a_singular_system_has_no_finite_solution():
         assert not np.all(np.isfinite(by_numpy(solve)(np.ones((2, 2)), np.array([1.0, 2.0]))))
 
 
+def test_in_a_batch_each_leaves_its_loop_by_itself():
+    """A loop whose condition differs within a batch goes on for the others."""
+
+    def halvings(x):
+        return jax.lax.while_loop(lambda carry: carry[0] > 1, lambda carry: (carry[0] / 2, carry[1] + 1), (x, 0))
+
+    with jax.enable_x64(True):
+        left, count = by_numpy(jax.vmap(halvings))(np.array([0.5, 3.0, 40.0]))
+    assert left.tolist() == [0.5, 0.75, 0.625] and count.tolist() == [0, 2, 6]
+
+
 def test_what_is_known_is_not_changed_by_later_calls():
     """Parts that depend on nothing are computed once, and each call has its own copy."""
 

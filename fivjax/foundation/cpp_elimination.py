@@ -1,0 +1,60 @@
+"""Linear systems in C++: a function of its own for each size, because to write one out takes hundreds of lines each time."""
+
+from collections.abc import Callable
+
+from .cpp_arrays import Value
+from .cpp_numbers import WIDE
+from .cpp_writer import Writer
+from .jaxprs import within
+from .linear_solve import fivjax_elimination
+
+# Smaller systems are written out: in many of them zeros are known, and leave little.
+LEAST = 4
+
+# `linear_solve.eliminated`, in place: the right sides become the solutions.
+TEXT = """
+const auto {name} = [](double* matrix, {kind}* right) __attribute__((noinline)) {{
+  for (int k = 0; k < {n}; ++k) {{
+    int place = k;
+    for (int i = k + 1; i < {n}; ++i) if (wp::abs(matrix[i * {n} + k]) > wp::abs(matrix[place * {n} + k])) place = i;
+    const double divisor = matrix[place * {n} + k];
+    for (int j = 0; j < {n}; ++j) {{
+      const double own = matrix[place * {n} + j] / divisor;
+      matrix[place * {n} + j] = matrix[k * {n} + j];
+      matrix[k * {n} + j] = own;
+    }}
+    for (int j = 0; j < {sides}; ++j) {{
+      const {kind} own = right[place * {sides} + j] / divisor;
+      right[place * {sides} + j] = right[k * {sides} + j];
+      right[k * {sides} + j] = own;
+    }}
+    for (int i = 0; i < {n}; ++i) {{
+      if (i == k) continue;
+      const double factor = matrix[i * {n} + k];
+      for (int j = 0; j < {n}; ++j) matrix[i * {n} + j] -= factor * matrix[k * {n} + j];
+      for (int j = 0; j < {sides}; ++j) right[i * {sides} + j] -= factor * right[k * {sides} + j];
+    }}
+  }}
+}};
+"""
+
+
+def _eliminated(writer: Writer, equation, operands: list[Value]) -> list[Value]:
+    """The solutions for all right sides (columns)."""
+    matrix, right = operands
+    if matrix.ndim != 2 or matrix.shape[0] < LEAST or writer.is_wide(matrix):
+        called = within(equation.params)
+        assert called is not None
+        return writer.run(called.jaxpr, called.consts, operands)
+    n, sides = right.shape
+    kind = WIDE if writer.is_wide(right) else "double"
+    name = f"eliminated_{n}_{sides}_{kind}"
+    writer.functions[name] = TEXT.format(name=name, n=n, sides=sides, kind=kind)
+    own = [writer.new(matrix.shape, "double"), writer.new(right.shape, kind)]
+    for value, into in zip(operands, own, strict=True):
+        writer.copy(value, into.base, into.kind)
+    writer.put(f"{name}({own[0].base}, {own[1].base});")
+    return [writer.small(own[1])]
+
+
+CALLS: dict[str, Callable] = {fivjax_elimination.__name__: _eliminated}
