@@ -47,11 +47,11 @@ def with_appendages(size: int) -> fj.Structure:
 
 
 def coupled(count: int) -> fj.Structure:
-    """Copies of the paper's oscillator under different shares of the load, neighbours held together along the belt."""
+    """Copies of the paper's oscillator under different shares of the load, neighbours held together firmly along the belt."""
     structure = copies(count, shares=1 + 0.1 * np.arange(count))
     mass, damping, stiffness, load = (np.array(matrix) for matrix in structure.matrices)
     for k in range(count - 1):
-        for matrix, value in ((stiffness, 2e4), (damping, 20.0)):
+        for matrix, value in ((stiffness, 1e6), (damping, 200.0)):
             matrix[np.ix_([3 * k, 3 * k + 3], [3 * k, 3 * k + 3])] += value * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return fj.Structure(mass, damping, stiffness, load, contacts=structure.contacts)
 

@@ -165,7 +165,9 @@ class LimitCycle(eqx.Module):
                 f"  Lyapunov exponents per return: {exponents} (the first is zero on a closed curve{curve})"
             )
             return f"{head}\n  word, from a point of the section: {modes}\n{rests_on}"
-        largest = ", ".join(f"{abs(value):.6g}" for value in self.multipliers[:4])
+        # What sticking makes of a deviation is zero, up to rounding.
+        sizes = np.where(np.abs(self.multipliers) < 1e-12, 0.0, np.abs(self.multipliers))
+        largest = ", ".join(f"{size:.6g}" for size in sizes[:4])
         captures = ""
         if self.reach is not None and self.contraction is not None:
             captures = (
