@@ -34,6 +34,8 @@ Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
 # How much larger a step's relative error may be in a derivative than in the motion.
 LOOSER = 10
+# Whether a guard begins at zero is told by what it comes to in so many units of time: some rad of the fastest vibration.
+NEAR = 8.0
 # The share of a step behind a fall of the tangential velocity through zero at which it ends, if there is a rise behind it.
 FALLEN = 1e-3
 # Samples behind the fall that tell.
@@ -137,7 +139,8 @@ class EventExact(AbstractStepper):
         # Before the coefficients are scaled by it: over a longer time they may diverge, and roots be wrong.
         reach = reach * self._agreeing(mechanics, contact, series, reach)
         scaled = in_shares(guards, reach)
-        safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact)
+        near = jnp.minimum(1.0, NEAR / jax.lax.stop_gradient(reach))
+        safe, fires = march_to_roots(jax.lax.stop_gradient(scaled), in_shares(rounding, reach), exact, near)
         if at_section:
             # A fall is no event; but where there is a rise behind it, the step ends a little after it, so that the next one
             # sees the rise.

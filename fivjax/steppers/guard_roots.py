@@ -43,6 +43,7 @@ def march_to_roots(
     c: Float[Array, "k g"],
     rounding: Float[Array, "3 g"] | None = None,
     exact: Bool[Array, " g"] | None = None,
+    near: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, " g"], Bool[Array, " g"]]:
     r"""How far in [0, 1] each polynomial $\sum c_k x^k$ is known to stay positive, and whether it has its first root there.
 
@@ -51,21 +52,25 @@ def march_to_roots(
     $g' + g'' d / 2 - B_3 d^2 / 6 > 0$, which is needed at the flat start after a lift-off. On [0, 1] the negative coefficients
     alone give the bounds. So no root is skipped, a dip below zero inside the interval is found at its first crossing, and near
     a simple root the march converges quadratically. Roots at zero, where the status began, are divided out; with an `exact`
-    start, a small value there is no rounding error. A march that uses up its steps has still shown that there is no root up to
-    where it came.
+    start, a small value there is no rounding error. What is small is told on [0, `near`]: over a long time a straight motion
+    makes any value at the start small. A march that uses up its steps has still shown that there is no root up to where it
+    came.
     """
     count = c.shape[1]
     rounding = jnp.zeros((3, count), c.dtype) if rounding is None else rounding
     exact = jnp.zeros(count, bool) if exact is None else exact
     # One after the other: a march of few steps does not wait for a long one.
-    return jax.lax.map(lambda of_one: _first_root(*of_one), (c.T, rounding.T, exact))
+    return jax.lax.map(lambda of_one: _first_root(*of_one, near), (c.T, rounding.T, exact))
 
 
 def _first_root(
-    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""]
+    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], near: Float[Array, ""] | float
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     eps, size = float(jnp.finfo(c.dtype).eps), jnp.sum(jnp.abs(c))
-    zeros = zero_at_start(c, size, rounding, exact)
+    of_near = size - (1 - near) * jnp.sum(jnp.abs(c[1:]))
+    powers = [1.0, near, near * near]
+    first = [[own[k] * power for k, power in enumerate(powers)] for own in (c, rounding)]
+    zeros = zero_at_start(first[0], of_near, first[1], exact)
     c = jax.lax.dynamic_slice(jnp.pad(c, (0, 3)), (sum(zero.astype(jnp.int32) for zero in zeros),), c.shape)
     k = np.arange(len(c))
     falling = jnp.maximum(-c, 0.0)

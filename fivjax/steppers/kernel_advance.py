@@ -22,8 +22,8 @@ from .kernel_roots import roots
 from .kernel_types import Types
 from .propagation import INTERVALS
 
-# Structures with more degrees of freedom would make kernels that take long to compile.
-MOST_COORDINATES = 8
+# The matrices of structures with more degrees of freedom take megabytes for each scene, which are read in every step.
+MOST_COORDINATES = 24
 
 
 class Stepping(NamedTuple):

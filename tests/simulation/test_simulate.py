@@ -236,6 +236,23 @@ def test_a_mass_that_nothing_holds_back_does_not_grow_without_bound():
     assert run.displacement[-1] == pytest.approx([3e6 - 0.5] * 2, rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_an_undamped_mass_slides_on_after_it_has_stuck_once(seed):
+    """With equal coefficients its slip, harmonic once it has begun at the edge of the friction cone, comes back to zero once a period,
+    and only touches it: the margin at which it would stick again is a rounding error, the motion before that is straight."""
+    k, m, mu, force = np.random.default_rng(seed).uniform([0.5, 0.5, 0.1, 1.0], [4.0, 4.0, 0.6, 3.0])
+    structure = fj.Structure(
+        np.diag([m, 1.0]), np.zeros((2, 2)), np.diag([k, 2.0]), [0.0, -1.0], tangential=0, normal=1
+    )
+    scene = fj.Scene(structure, fj.Coulomb(mu), belt_speed=0.3, load=fj.ConstantLoad(force))
+    run = fj.simulate(scene, 60.0, 0.5, y0=([0.0, 0.0], [0.3, 0.0]))
+    assert run.meaning == "reached its end"
+    rate, edge = np.sqrt(k / m), mu * force / k
+    since = run.t - edge / 0.3
+    expected = np.where(since < 0, 0.3 * run.t, edge + 0.3 / rate * np.sin(rate * since))
+    np.testing.assert_allclose(run.displacement[:, 0], expected, atol=1e-7)
+
+
 def test_one_program_serves_runs_of_any_length_however_often_they_save(paper_scene, compilations):
     """Also for fixed steps of any length."""
     for method in (None, fj.WhereSwitched(diffrax.Tsit5(), dt=1e-4)):
