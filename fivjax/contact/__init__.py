@@ -53,9 +53,9 @@ from .mode_forces import ModeForces as ModeForces
 from .mode_forces import sticking_forces as sticking_forces
 from .rounding import exactly_zero as exactly_zero
 from .rounding import magnitudes as magnitudes
+from .several_contacts import affected_by as affected_by
 from .several_contacts import clearness_of_impact as clearness_of_impact
 from .several_contacts import clearness_of_modes as clearness_of_modes
-from .several_contacts import coupled_with as coupled_with
 from .transitions import on_constraint as on_constraint
 from .transitions import status_from_forces as status_from_forces
 from .transitions import stopped as stopped

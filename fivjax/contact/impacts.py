@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .coordinates import spread
 from .forces import (
@@ -19,7 +19,7 @@ from .mode import Contact, Status
 from .several_contacts import impulses_of_impact
 
 
-def impact(mechanics: Mechanics, y: State) -> State:
+def impact(mechanics: Mechanics, y: State, reached: Bool[Array, "*contacts"]) -> State:
     """The state after the gap has closed: Newton's restitution for the normal velocity, the scene's impact law for the rest.
 
     - "coulomb" (default): the tangential impulse obeys Coulomb's law: it ends the slip if it then lies in the friction cone
@@ -27,7 +27,8 @@ def impact(mechanics: Mechanics, y: State) -> State:
     - "frictionless": no tangential impulse; the normal one moves whatever the mass matrix couples to it.
     - "reset": only the normal velocity is changed, as in codes that reset this one number. Not consistent with momentum.
 
-    With several contacts, all with a closed gap take part: an impulse on one may lift or stop another, or reverse its slip.
+    With several contacts, all with a closed gap take part that the impact has `reached`, by the mass matrix: an impulse on one
+    may lift or stop another, or reverse its slip.
 
     Newton's restitution above zero together with friction can create energy where the normal impulse reverses the slip (Kane's
     paradox); that takes a strong coupling of the two coordinates in the mass matrix. Restitution 0 never creates energy.
@@ -39,13 +40,13 @@ def impact(mechanics: Mechanics, y: State) -> State:
     if mechanics.impact_law == "reset":
         jump = -(1.0 + mechanics.restitution) * approach
         if mechanics.several:
-            jump = jnp.where((gap(mechanics, y) <= 0) & (approach < 0), jump, 0.0)
+            jump = jnp.where((gap(mechanics, y) <= 0) & (approach < 0) & reached, jump, 0.0)
         return y.at[n + mechanics.normal].add(jump)
     if mechanics.several:
-        y, struck, ends_slip = impulses_of_impact(mechanics, y)
+        y, struck, ends_slip = impulses_of_impact(mechanics, y, reached)
         # A contact on the belt that got no impulse: a gap rate that is negative by rounding only is set to zero.
         own = gap_rate(mechanics, y)
-        own = jnp.where(gap(mechanics, y) <= 0, jnp.maximum(own, 0.0), own)
+        own = jnp.where((gap(mechanics, y) <= 0) & reached, jnp.maximum(own, 0.0), own)
         rate = jnp.where(struck, -mechanics.restitution * approach, own)
     else:
         y, ends_slip = _one(mechanics, y)

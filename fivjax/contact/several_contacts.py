@@ -36,14 +36,17 @@ def modes_from_forces(
     return Contact(status.astype(jnp.int32), jnp.where(found == BACKWARD, -1.0, 1.0).astype(y.dtype))
 
 
-def impulses_of_impact(mechanics: Mechanics, y: State) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
+def impulses_of_impact(
+    mechanics: Mechanics, y: State, reached: Bool[Array, " c"]
+) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
     """The state after gaps have closed, by Newton's and Coulomb's laws for all contacts on the belt at once; which of them got
     an impulse; and whose slip it ended.
 
-    Every contact on the belt takes part: an impulse on one may lift or stop another, or reverse its slip.
+    Every contact on the belt takes part that the impact has `reached` (`affected_by`): an impulse on one may lift or stop
+    another, or reverse its slip.
     """
     n, frictionless = degrees_of_freedom(y), mechanics.impact_law == "frictionless"
-    problem = _impact_problem(mechanics, y)
+    problem = _impact_problem(mechanics, y, reached)
     away = problem.away
     guess = jnp.where(away, OPEN, FORWARD if frictionless else STICK)
     found = settled_states(problem, guess.astype(jnp.int32))
@@ -76,10 +79,10 @@ def _mode_problem(
     )
 
 
-def _impact_problem(mechanics: Mechanics, y: State) -> ContactProblem:
+def _impact_problem(mechanics: Mechanics, y: State, reached: Bool[Array, " c"]) -> ContactProblem:
     """The problem of the impulses in a state whose gaps have closed."""
     approach, slip = gap_rate(mechanics, y), relative_velocity(mechanics, y)
-    away = gap(mechanics, y) > 0
+    away = (gap(mechanics, y) > 0) | ~reached
     demanded = (1.0 + mechanics.restitution) * approach
     mu = mechanics.friction(jnp.abs(slip))
     frictionless = mechanics.impact_law == "frictionless"
@@ -107,9 +110,9 @@ def clearness_of_modes(mechanics: Mechanics, load: Float[Array, ""], y: State, c
     return jnp.abs(jnp.minimum(*margins(_mode_problem(mechanics, load, y), state_of(contact))))
 
 
-def clearness_of_impact(mechanics: Mechanics, y: State) -> Float[Array, " c"]:
+def clearness_of_impact(mechanics: Mechanics, y: State, reached: Bool[Array, " c"]) -> Float[Array, " c"]:
     """The same for the impulses where gaps have closed."""
-    problem = _impact_problem(mechanics, y)
+    problem = _impact_problem(mechanics, y, reached)
     found = settled_states(problem, jnp.where(problem.away, OPEN, STICK).astype(jnp.int32))
     return jnp.abs(jnp.minimum(*margins(problem, found)))
 
@@ -121,17 +124,16 @@ def state_of(contact: Contact) -> Int[Array, " c"]:
     return jnp.where(contact.status == Status.STICK, STICK, by).astype(jnp.int32)
 
 
-def coupled_with(mechanics: Mechanics, which: Int[Array, ""]) -> Bool[Array, " c"]:
-    """Which contacts an event at one of them affects at once, itself included: those that the mass matrix couples with it."""
+def affected_by(mechanics: Mechanics, ended: Bool[Array, " c"]) -> Bool[Array, " c"]:
+    """Which contacts events at some of them affect at once, these included: those that the mass matrix couples with one."""
     g_tt, g_tn, g_nn = map(jnp.abs, mechanics.compliance)
     size = jnp.sqrt(jnp.diagonal(g_tt) * jnp.diagonal(g_nn))
     # Relative to the contacts' own compliances.
     coupling = g_tt + g_tn + g_tn.T + g_nn
     scale = jnp.diagonal(g_tt) + jnp.diagonal(g_nn) + size
     coupling = coupling / jnp.sqrt(scale[:, None] * scale)
-    mine = jnp.arange(len(size)) == which
-    row = jnp.sum(jnp.where(mine[:, None], coupling, 0.0), axis=0)
-    return mine | (row > 64 * jnp.finfo(row.dtype).eps)
+    largest = jnp.max(jnp.where(ended[:, None], coupling, 0.0), axis=0)
+    return ended | (largest > 64 * jnp.finfo(largest.dtype).eps)
 
 
 def _allowed(away: Bool[Array, " c"], slips: Bool[Array, " c"], forward: Bool[Array, " c"]) -> Bool[Array, "c 4"]:

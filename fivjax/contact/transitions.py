@@ -23,7 +23,7 @@ from .impacts import after_brief_flight, also_moved, impact
 from .mechanics import Mechanics
 from .mode import Contact, Status
 from .mode_forces import ModeForces, sticking_forces
-from .several_contacts import modes_from_forces, state_of
+from .several_contacts import affected_by, modes_from_forces, state_of
 
 
 def on_constraint(mechanics: Mechanics, contact: Contact, y: State) -> State:
@@ -101,7 +101,8 @@ def _following(
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck():
-        return _resting(mechanics, contact, load, impact(impacting, y_stopped), touched, resolution)
+        reached = affected_by(mechanics, touched) if mechanics.several else touched
+        return _resting(mechanics, contact, load, impact(impacting, y_stopped, reached), touched, resolution)
 
     impacting, inelastic = mechanics, mechanics.restitution == 0
     # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
@@ -114,7 +115,10 @@ def _following(
         own = ended[..., 0] | ended[..., 1]
         over = (own & (contact.status == Status.STICK)) | lifted
         following = modes_from_forces(mechanics, load, y_next, contact, jnp.where(over, state_of(contact), NONE))
-        status = following.status
+        # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
+        reached = affected_by(mechanics, own)
+        status = jnp.where(reached, following.status, contact.status)
+        following = Contact(status, jnp.where(reached, following.direction, contact.direction))
     else:
         y_next = jnp.where(touched, struck(), y_stopped)
         following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)

@@ -132,7 +132,11 @@ def derivatives(
     if y0 is not None:
         given = begin if inner is scene else checked_start(scene.structure.size, y0)
     value, by_name, moved = _differentiated(functional, scene, names, float(t1), float(dt_save), given, mode, method)
-    moved = {what: np.stack([np.atleast_1d(found[name]) for name in names]) for what, found in moved.items()}
+    # A parameter may have several numbers: one for each contact.
+    moved = {
+        what: np.concatenate([np.reshape(found[name], (-1, np.size(scene.parameters[name]))).T for name in names])
+        for what, found in moved.items()
+    }
     slips_move = np.any(moved["belt_speed"] != 0, axis=0) & (y0 is not None)
     calls = closest_call(inner, method, begin, float(t1), slips_move)
     calls = _missing(scene, float(t1), moved, calls) or calls

@@ -171,7 +171,7 @@ class _Seen:
         self.coupled = np.ones((1, 1), bool)
         if self.several:
             self.coupled = np.asarray(
-                jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(count, dtype=jnp.int32))
+                jax.vmap(lambda one: physics.affected_by(mechanics, one))(jnp.eye(count, dtype=bool))
             )
         # The largest size of each guard, by contact, status and number.
         self.largest: dict[tuple[int, int, int], float] = {}
@@ -367,11 +367,12 @@ def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: 
 def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -> Float[Array, "3"]:
     """The same for several contacts: margins by which the states of the contacts affected by the event are admissible."""
     own = jnp.any(after.ended, axis=-1)
-    rows = jax.vmap(lambda i: physics.coupled_with(mechanics, i))(jnp.arange(len(own), dtype=jnp.int32))
-    feels = jnp.any(rows & own[:, None], axis=0)
+    feels = physics.affected_by(mechanics, own)
     touched = (contact.status == Status.DETACH) & after.ended[:, 0]
-    struck = jnp.any(rows & touched[:, None], axis=0) & (mechanics.impact_law == "coulomb")
-    at_impact = physics.clearness_of_impact(mechanics, physics.stopped(mechanics, contact, after.end, after.ended))
+    reached = jnp.any(touched) & physics.affected_by(mechanics, touched)
+    struck = reached & (mechanics.impact_law == "coulomb")
+    stopped = physics.stopped(mechanics, contact, after.end, after.ended)
+    at_impact = physics.clearness_of_impact(mechanics, stopped, reached)
     following = after.contact
     at_rest = physics.clearness_of_modes(mechanics, load, after.y, following)
     # A mode that follows sticking, or sliding that lost its normal force, begins with zero margin.

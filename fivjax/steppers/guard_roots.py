@@ -27,7 +27,8 @@ def together(
     """
     count = 2 * len(mechanics.places)
     chosen = jax.lax.argmax(fires, 0, jnp.int32)
-    among = physics.coupled_with(mechanics, jnp.minimum(chosen, count - 1) // 2)
+    contact = jnp.minimum(chosen, count - 1) // 2
+    among = physics.affected_by(mechanics, jnp.arange(count // 2) == contact)
     own = jnp.arange(count) // 2 == chosen // 2
     own_guards = jax.lax.stop_gradient(scaled[:, :count])
     values, slopes = value_and_slope(own_guards, first)
@@ -60,11 +61,11 @@ def march_to_roots(
     rounding = jnp.zeros((3, count), c.dtype) if rounding is None else rounding
     exact = jnp.zeros(count, bool) if exact is None else exact
     # One after the other: a march of few steps does not wait for a long one.
-    return jax.lax.map(lambda of_one: _first_root(*of_one, near), (c.T, rounding.T, exact))
+    return jax.lax.map(lambda of_one: _first_root(*of_one, near=near), (c.T, rounding.T, exact))
 
 
 def _first_root(
-    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], near: Float[Array, ""] | float
+    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], *, near: Float[Array, ""] | float
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     eps, size = float(jnp.finfo(c.dtype).eps), jnp.sum(jnp.abs(c))
     of_near = size - (1 - near) * jnp.sum(jnp.abs(c[1:]))

@@ -346,6 +346,36 @@ def test_derivatives_through_events_of_two_contacts_that_fall_together(second):
     assert worst < 1e-7
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_equal_contacts_that_move_in_step_have_events_of_their_own(seed):
+    """Bit for bit the same motion: where one lands, sticks or reverses its slip, the other does so by its own event, whose instant
+    moves with its own friction."""
+    rng, pair = np.random.default_rng(seed), np.ones(2)
+    along, across, between, *masses = rng.uniform(0.5, 4.0, 5)
+    tilt = 0.3 * np.sqrt(along * across) * rng.choice([-1, 1])
+    stiffness = np.kron([[along, tilt], [tilt, across]], np.eye(2))
+    stiffness[:2, :2] += 0.5 * between * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    mu, force = rng.uniform(0.2, 0.5), rng.uniform(1.0, 3.0)
+    start = tuple(np.concatenate([rng.normal() * 0.3 * pair, other * pair]) for other in (0.4, -0.2))
+    contacts = [fj.ContactPoint(0, 2), fj.ContactPoint(1, 3)]
+    load = [0.0, 0.0, -1.0, -1.0]
+    structure = fj.Structure(np.diag(np.repeat(masses, 2)), 0.02 * stiffness, stiffness, load, contacts=contacts)
+    laws = [fj.Coulomb(mu, 1.1 * mu)] * 2
+    scene = fj.Scene(structure, laws, belt_speed=0.3 * pair, load=fj.ConstantLoad(force))
+
+    def last(run):
+        return run.velocity[-1, 0] + 2 * run.displacement[-1, 1]
+
+    def value(**changes):
+        return float(last(fj.simulate(scene.replace(**changes), 4.0, 2.0, y0=start)))
+
+    found = fj.derivatives(last, scene, ["mu_0", "mu_1", "belt_speed"], t1=4.0, dt_save=2.0, y0=start, progress=False)
+    assert found.events >= 4 and np.shape(found["belt_speed"]) == (2,)
+    for name in ("mu_0", "mu_1"):
+        expected = (value(**{name: mu + 2e-6}) - value(**{name: mu - 2e-6})) / 4e-6
+        assert float(found[name]) == pytest.approx(expected, abs=1e-8)
+
+
 @pytest.mark.slow
 def test_simultaneous_events_that_strike_one_another_have_no_derivative():
     """Coupled in the mass matrix, the two feel each other's events at once: which of them is first matters, and differences in
