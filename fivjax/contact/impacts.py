@@ -19,7 +19,7 @@ from .mode import Contact, Status
 from .several_contacts import impulses_of_impact
 
 
-def impact(mechanics: Mechanics, y: State, reached: Bool[Array, "*contacts"]) -> State:
+def impact(mechanics: Mechanics, y: State, reached: Bool[Array, " c"] | bool = True) -> State:
     """The state after the gap has closed: Newton's restitution for the normal velocity, the scene's impact law for the rest.
 
     - "coulomb" (default): the tangential impulse obeys Coulomb's law: it ends the slip if it then lies in the friction cone

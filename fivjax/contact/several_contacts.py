@@ -37,7 +37,7 @@ def modes_from_forces(
 
 
 def impulses_of_impact(
-    mechanics: Mechanics, y: State, reached: Bool[Array, " c"]
+    mechanics: Mechanics, y: State, reached: Bool[Array, " c"] | bool = True
 ) -> tuple[State, Bool[Array, " c"], Bool[Array, " c"]]:
     """The state after gaps have closed, by Newton's and Coulomb's laws for all contacts on the belt at once; which of them got
     an impulse; and whose slip it ended.
@@ -79,10 +79,10 @@ def _mode_problem(
     )
 
 
-def _impact_problem(mechanics: Mechanics, y: State, reached: Bool[Array, " c"]) -> ContactProblem:
+def _impact_problem(mechanics: Mechanics, y: State, reached: Bool[Array, " c"] | bool) -> ContactProblem:
     """The problem of the impulses in a state whose gaps have closed."""
     approach, slip = gap_rate(mechanics, y), relative_velocity(mechanics, y)
-    away = (gap(mechanics, y) > 0) | ~reached
+    away = (gap(mechanics, y) > 0) | jnp.logical_not(reached)
     demanded = (1.0 + mechanics.restitution) * approach
     mu = mechanics.friction(jnp.abs(slip))
     frictionless = mechanics.impact_law == "frictionless"
@@ -110,7 +110,7 @@ def clearness_of_modes(mechanics: Mechanics, load: Float[Array, ""], y: State, c
     return jnp.abs(jnp.minimum(*margins(_mode_problem(mechanics, load, y), state_of(contact))))
 
 
-def clearness_of_impact(mechanics: Mechanics, y: State, reached: Bool[Array, " c"]) -> Float[Array, " c"]:
+def clearness_of_impact(mechanics: Mechanics, y: State, reached: Bool[Array, " c"] | bool = True) -> Float[Array, " c"]:
     """The same for the impulses where gaps have closed."""
     problem = _impact_problem(mechanics, y, reached)
     found = settled_states(problem, jnp.where(problem.away, OPEN, STICK).astype(jnp.int32))

@@ -101,7 +101,7 @@ def _following(
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck():
-        reached = affected_by(mechanics, touched) if mechanics.several else touched
+        reached = affected_by(mechanics, touched) if mechanics.several else True
         return _resting(mechanics, contact, load, impact(impacting, y_stopped, reached), touched, resolution)
 
     impacting, inelastic = mechanics, mechanics.restitution == 0

@@ -68,7 +68,7 @@ def of_program(function, *arguments):
 
 def test_a_batch_of_trajectories_has_no_lapack():
     scene, names = chain(12, 1), ("mu",)
-    method = groups.in_bulk(EventExact(), scene)
+    method = EventExact()
     own = np.full((2, 1), 0.3)
     prepare = lambda rows: groups._prepare.__wrapped__(scene, method, names, rows)  # noqa: E731
     of_preparing, (mechanics, prepared, linear, *rest) = of_program(prepare, own)
