@@ -10,8 +10,8 @@ impulses. Each contact is in one of four states; every state demands something, 
 | BACKWARD | $T = -μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≥ 0$ |
 | OPEN | $T = N = 0$ | $a_n ≥ 0$ |
 
-If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to four contacts
-combinations are tried at once (`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to
+If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to four contacts combinations
+are tried one after the other (`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to
 sticking. At an event some condition is zero up to rounding, so the state that has just `ended` must be admissible by a clear
 margin, or it would be chosen again.
 """
@@ -89,14 +89,18 @@ def margins(problem: ContactProblem, state: Int[Array, " c"]) -> tuple[Float[Arr
     return force_margin, change_margin
 
 
+def are_allowed(problem: ContactProblem, state: Int[Array, " c"]) -> Bool[Array, " c"]:
+    """Which contacts may be in these states, by their velocities."""
+    return jnp.any(problem.allowed & (state[:, None] == np.arange(4)), axis=-1)
+
+
 def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " c"]:
     """How far each contact's state is from admissible, relative to the terms in its conditions; zero if it is admissible."""
     force_margin, change_margin = margins(problem, state)
     tie = TIE[problem.normal.dtype.name]
     need = jnp.where(state == problem.ended, tie, -tie)
     violation = jnp.maximum(jnp.maximum(need - force_margin, need - change_margin), 0.0)
-    forbidden = ~jnp.any(problem.allowed & (state[:, None] == np.arange(4)), axis=-1)
-    return jnp.where(forbidden | jnp.isnan(violation), jnp.inf, violation)
+    return jnp.where(~are_allowed(problem, state) | jnp.isnan(violation), jnp.inf, violation)
 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
@@ -114,7 +118,7 @@ def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, "
 
     def violation(state):
         # Most combinations are not allowed, and then their forces need not be worked out.
-        allowed = jnp.all(jnp.any(problem.allowed & (state[:, None] == np.arange(4)), axis=-1))
+        allowed = jnp.all(are_allowed(problem, state))
         return jax.lax.cond(allowed, lambda: jnp.max(_judged(problem, state)), lambda: infinite)
 
     def going(carry):

@@ -5,7 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .contact_problem import BACKWARD, FORWARD, NONE, OPEN, STICK, ContactProblem, forces_of, margins, settled_states
+from .contact_problem import (
+    BACKWARD,
+    FORWARD,
+    NONE,
+    OPEN,
+    STICK,
+    ContactProblem,
+    are_allowed,
+    forces_of,
+    margins,
+    settled_states,
+)
 from .coordinates import spread
 from .forces import State, degrees_of_freedom, free_acceleration, gap, gap_rate, relative_velocity
 from .mechanics import Mechanics
@@ -29,8 +40,7 @@ def modes_from_forces(
     guess = jnp.where(away, OPEN, jnp.where(slips, jnp.where(slip < 0, FORWARD, BACKWARD), STICK))
     if before is not None:
         going_on = state_of(before)
-        may_go_on = jnp.any(problem.allowed & (going_on[:, None] == np.arange(4)), axis=-1)
-        guess = jnp.where(may_go_on, going_on, guess)
+        guess = jnp.where(are_allowed(problem, going_on), going_on, guess)
     found = settled_states(problem, guess.astype(jnp.int32))
     status = jnp.where(found == STICK, Status.STICK, jnp.where(found == OPEN, Status.DETACH, Status.SLIDE))
     return Contact(status.astype(jnp.int32), jnp.where(found == BACKWARD, -1.0, 1.0).astype(y.dtype))

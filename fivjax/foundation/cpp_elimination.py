@@ -6,7 +6,7 @@ from .cpp_arrays import Value
 from .cpp_numbers import WIDE
 from .cpp_writer import Writer
 from .jaxprs import within
-from .linear_solve import fivjax_elimination
+from .linear_solve import fivjax_elimination, is_elimination
 
 # Smaller systems are written out: in many of them zeros are known, and leave little.
 LEAST = 4
@@ -42,7 +42,7 @@ const auto {name} = [](double* matrix, {kind}* right) __attribute__((noinline)) 
 def _eliminated(writer: Writer, equation, operands: list[Value]) -> list[Value]:
     """The solutions for all right sides (columns)."""
     matrix, right = operands
-    if matrix.ndim != 2 or matrix.shape[0] < LEAST or writer.is_wide(matrix):
+    if not is_elimination(equation) or matrix.shape[0] < LEAST or writer.is_wide(matrix):
         called = within(equation.params)
         assert called is not None
         return writer.run(called.jaxpr, called.consts, operands)

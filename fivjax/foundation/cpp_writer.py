@@ -193,10 +193,9 @@ class Writer:
         if name in self.rules and primitive.multiple_results:
             return self.rules[name](self, equation, operands)
         called = within(params)
-        if called is not None and params.get("name") in self.calls:
-            return self.calls[params["name"]](self, equation, operands)
         if called is not None:
-            return self.run(called.jaxpr, called.consts, operands)
+            own = self.calls.get(params.get("name"))
+            return self.run(called.jaxpr, called.consts, operands) if own is None else own(self, equation, operands)
         if name in SAME:
             return operands
         if name in MOVING:

@@ -106,24 +106,17 @@ def read_recording(
         base = float(rate)
     else:
         raise ValueError(f"File `{path}` has no column `t` or `time`; name it with `time`, or give `rate` in Hz.")
-    if rate is not None:
-        _must_agree(path, base, float(rate))
     try:
-        return Recording(base, signals, regime, **about)
+        recording = Recording(base, signals, regime, **about)
     except ValueError as error:
         raise ValueError(f"File `{path}`: {error}") from None
-
-
-def _must_agree(path: Path, base: float | np.ndarray, rate: float) -> None:
-    """The sampling rate of a file with that which is given; they may differ by rounding of what is written in files."""
-    own = base
-    if isinstance(base, np.ndarray):
-        own = (len(base) - 1) / (base[-1] - base[0]) if len(base) > 1 else rate
-    if not np.isclose(own, rate, rtol=1e-2):
+    # They may differ by rounding of what is written in files.
+    if rate is not None and not np.isclose(recording.rate, rate, rtol=1e-2):
         raise ValueError(
-            f"File `{path}` has a time base of its own, of {own:g} Hz, but `rate` is {rate:g} Hz. Leave out `rate`; if the "
-            f"file's times are wrong, correct them there."
+            f"File `{path}` has a time base of its own, of {recording.rate:g} Hz, but `rate` is {rate:g} Hz. Leave out `rate`; "
+            f"if the file's times are wrong, correct them there."
         )
+    return recording
 
 
 def _csv(path: Path):

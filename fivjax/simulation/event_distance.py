@@ -369,7 +369,7 @@ def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -
     own = jnp.any(after.ended, axis=-1)
     feels = physics.affected_by(mechanics, own)
     touched = (contact.status == Status.DETACH) & after.ended[:, 0]
-    reached = jnp.any(touched) & physics.affected_by(mechanics, touched)
+    reached = physics.affected_by(mechanics, touched)
     struck = reached & (mechanics.impact_law == "coulomb")
     stopped = physics.stopped(mechanics, contact, after.end, after.ended)
     at_impact = physics.clearness_of_impact(mechanics, stopped, reached)

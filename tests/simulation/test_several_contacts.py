@@ -108,7 +108,7 @@ def test_two_coupled_contacts_are_those_of_an_independent_solver(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "seed"), [(2, 2), (2, 3), (2, 6), (3, 0), (3, 2), (4, 1), (5, 0), (5, 2)])
 def test_more_coupled_contacts_are_those_of_an_independent_solver(count, seed):
-    """With a coordinate beside each contact: two and three contacts by enumeration, five by pivoting."""
+    """With a coordinate beside each contact: two to four contacts by enumeration, five by pivoting."""
     agrees_with_reference(count, seed)
 
 
