@@ -48,6 +48,8 @@ from ..contact import same_mode
 MARGIN = 1e-6
 # The largest radius tried, relative to the cycle's size.
 LARGEST = 0.5
+# The return map is checked on so many shells of an ellipsoid, each of half the size of the one outside it.
+SHELLS = 4
 
 
 class Neighbourhood(NamedTuple):
@@ -116,7 +118,7 @@ class Trial(NamedTuple):
     status: int | Int[np.ndarray, "..."]
     direction: float | Float[np.ndarray, "..."]
     norm: Float[np.ndarray, "*c state state"]
-    steps: Float[np.ndarray, "*c m state"]  # deviations of the points to be checked, for a radius of one
+    steps: Float[np.ndarray, "*c m state"]  # deviations of the points to be checked on a shell, for a radius of one
     sizes: Float[np.ndarray, "*c m"]  # their norms
     allowed: float | Float[np.ndarray, " c"]  # the contraction κ that is required
     largest: float | Float[np.ndarray, " c"]  # the first radius to try
@@ -143,16 +145,15 @@ def trial(
     if found is None or size == 0:
         return None
     root, rate = found
-    # On ellipsoids of these sizes, relative to the radius, the return map is checked.
-    shells = np.concatenate([share * directions(basis.shape[1], len(weights)) for share in (1.0, 0.5, 0.25, 0.125)])
+    outwards = directions(basis.shape[1], len(weights))
     return Trial(
         centre,
         status,
         direction,
         (basis @ root @ basis.T + np.eye(len(weights)) - basis @ basis.T) * weights,
-        # Points of the unit ball in the norm, as deviations of the state.
-        np.linalg.solve(root, shells.T).T @ basis.T / weights,
-        np.linalg.norm(shells, axis=1),
+        # Points of the unit sphere in the norm, as deviations of the state.
+        np.linalg.solve(root, outwards.T).T @ basis.T / weights,
+        np.linalg.norm(outwards, axis=1),
         0.5 * (1 + rate),
         LARGEST * size,
         1e-8 * size,
@@ -168,42 +169,51 @@ def neighbourhoods(trials: list[Trial], returned: ReturnMap) -> list[Neighbourho
     if not trials:
         return found
     every = side_by_side(trials)
-    radius, open_ = np.array(every.largest), np.arange(len(trials))
+    events = returned(np.arange(len(trials)), every.centre[:, None]).events
+    # An ellipsoid's shells but the last are the outer ones of the next smaller one, so each is checked once.
+    shell, passed, open_ = np.array(every.largest), np.zeros(len(trials), int), np.arange(len(trials))
+    contraction = np.zeros((len(trials), SHELLS))
     while len(open_):
-        passed = open_
+        going = open_
         # A few of the points are tried first.
         for one_in in (32, 8, 1):
-            ratios = _contraction(every, passed, one_in, radius[passed], returned)
+            ratios = _contraction(every, going, one_in, shell[going], events[going], returned)
             # NaN is not below anything, so it fails.
-            passes = ratios <= every.allowed[passed]
-            passed, ratios = passed[passes], ratios[passes]
-        for k, ratio in zip(passed.tolist(), ratios.tolist(), strict=True):
-            one, own = trials[k], float(radius[k])
-            found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, own, ratio, len(one.sizes))
-        open_ = open_[~np.isin(open_, passed)]
-        radius[open_] *= 0.5
-        open_ = open_[radius[open_] >= every.smallest[open_]]
+            going, ratios = (part[ratios <= every.allowed[going]] for part in (going, ratios))
+        contraction[going, passed[going]] = ratios
+        passed[open_] = np.where(np.isin(open_, going), passed[open_] + 1, 0)
+        for k in open_[passed[open_] == SHELLS].tolist():
+            one, outermost = trials[k], float(shell[k]) * 2 ** (SHELLS - 1)
+            largest, points = float(np.max(contraction[k])), SHELLS * len(one.sizes)
+            found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, outermost, largest, points)
+        open_ = open_[passed[open_] < SHELLS]
+        shell[open_] *= 0.5
+        outermost = shell[open_] * 2.0 ** passed[open_]
+        open_ = open_[outermost >= every.smallest[open_]]
     return found
 
 
 def _contraction(
-    trials: Trial, chosen: Int[np.ndarray, " c"], one_in: int, radius: Float[np.ndarray, " c"], returned: ReturnMap
+    trials: Trial,
+    chosen: Int[np.ndarray, " c"],
+    one_in: int,
+    radius: Float[np.ndarray, " c"],
+    events: Int[np.ndarray, "c 1"],
+    returned: ReturnMap,
 ) -> Float[np.ndarray, " c"]:
-    """The largest ratio of norms after and before one period, of one in so many points that are checked of each of the chosen
-    cycles; NaN unless all come back in the cycle's contact mode after as many events as the cycle has.
+    """The largest ratio of norms after and before one period, of one in so many points on a shell of each of the chosen cycles;
+    NaN unless all come back in the cycle's contact mode after as many events as the cycle has.
     """
     if not len(chosen):
         return radius
     own = Trial(*(np.asarray(part)[chosen] for part in trials))
     centre, sizes = own.centre[:, None], own.sizes[:, ::one_in]
-    # The cycle itself comes first, for comparison.
-    steps = np.concatenate([np.zeros_like(centre), own.steps[:, ::one_in]], axis=1)
-    images = returned(chosen, centre + radius[:, None, None] * steps)
-    away = (images.y[:, 1:] - centre) @ np.swapaxes(own.norm, 1, 2)
+    images = returned(chosen, centre + radius[:, None, None] * own.steps[:, ::one_in])
+    away = (images.y - centre) @ np.swapaxes(own.norm, 1, 2)
     ratios = np.max(np.linalg.norm(away, axis=2) / (radius[:, None] * sizes), axis=1)
     mode = np.expand_dims(own.status, 1), np.expand_dims(own.direction, 1)
     alike = _same_mode(images.y, images.status, images.direction, *mode)
-    return np.where(np.all(alike & (images.events == images.events[:, :1]), axis=1), ratios, np.nan)
+    return np.where(np.all(alike & (images.events == events), axis=1), ratios, np.nan)
 
 
 def side_by_side(several: list):
