@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from ..section.return_maps import ReturnMaps, Section, section_at
 from .catalogue import Attractors, Catalogue
-from .cycles import CROSSINGS, Recurrence
+from .cycles import AT_FIRST, CROSSINGS, MORE_CROSSINGS, Recurrence
 from .motions import Motions, far_apart
 
 # Groups whose motions are followed at once: the paths of those that may be on tori take memory, some 0.2 MB each.
@@ -96,20 +96,24 @@ def _follow_lasting(maps: ReturnMaps, motions: Motions, returns: int) -> Motions
 
 def _continue_from_seeds(catalogue: Catalogue, seeds: dict[int, int]) -> None:
     """Adds the attractors of these groups to which motions come that begin on those of the group that seeds each."""
-    on_cycles, on_tori = [], []
+    few, many, on_tori = [], [], []
     for g, seed in seeds.items():
         for cycle in catalogue.of_group[seed].cycles:
-            # Those of many crossings lie on tori.
-            (on_cycles if len(cycle.points) <= CROSSINGS else on_tori).append((g, cycle.points[0]))
+            (few if len(cycle.points) <= CROSSINGS else many).append((g, cycle.points[0]))
         on_tori += [(g, torus.tube.states[-1] / catalogue.maps.weights) for torus in catalogue.of_group[seed].tori]
     own = catalogue.only(seeds)
     catalogue.report(0)
     # Returns after which a motion from a cycle, or from a torus, nearby has come near to the one of its own group.
-    motions = _follow_from(catalogue.maps, on_cycles, 32)
-    motions = motions.rows(~own.add_cycles(motions))
-    further = _follow_from(catalogue.maps, on_tori, 256)
-    group = np.concatenate([motions.group, further.group])
-    at = Section(*(np.concatenate(parts) for parts in zip(motions.at, further.at, strict=True)))
+    near_cycle, near_torus = 32, 256
+    left = []
+    for starts, recurrence in ((few, AT_FIRST), (many, Recurrence(MORE_CROSSINGS))):
+        motions = _follow_from(catalogue.maps, starts, near_cycle)
+        left.append(motions.rows(~own.add_cycles(motions, recurrence)))
+    # Cycles of many crossings lie on tori.
+    left[-1] = left[-1]._replace(at=catalogue.maps.returns(*left[-1], near_torus - near_cycle).at)
+    left.append(_follow_from(catalogue.maps, on_tori, near_torus))
+    group = np.concatenate([motions.group for motions in left])
+    at = Section(*(np.concatenate(parts) for parts in zip(*(motions.at for motions in left), strict=True)))
     motions, usable = Motions(group, at), np.all(np.isfinite(at.y), axis=1)
     usable[list(own.captures(motions, usable))] = False
     own.add_tori_by_turns(motions, usable)

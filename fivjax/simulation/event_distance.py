@@ -93,8 +93,10 @@ def closest_call(
             # A mode that begins with an event there has begun at the edge of that event.
             begins = False
             t = end if arrives else t + float(look.h)
+            # At the end of a chain of impacts a contact comes to rest without another event.
+            moved = happened or look.h > 0 or np.any(look.contact.status != contact.status)
             y, contact = look.y, look.contact
-            if not np.all(np.isfinite(look.y)) or (look.h <= 0 and not happened):
+            if not np.all(np.isfinite(look.y)) or not moved:
                 return ClosestCall(seen.events, 0.0, t, "the motion stopping to be finite")
     return seen.closest()
 

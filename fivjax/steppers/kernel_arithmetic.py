@@ -11,6 +11,34 @@ from .propagation import INTERVALS, ORDER
 ROOT_STEPS = (5, 5, ORDER)
 
 
+# Numbers side by side: a vector of a processor, or what is computed like one by a GPU.
+VECTOR = f"""
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+        struct block_ {{
+            wp::float64 of[{BLOCK}];
+            CUDA_CALLABLE wp::float64& operator[](int r) {{ return of[r]; }}
+            CUDA_CALLABLE block_ operator*(wp::float64 factor) const {{
+                block_ found;
+                for (int r = 0; r < {BLOCK}; ++r) found.of[r] = of[r] * factor;
+                return found;
+            }}
+            CUDA_CALLABLE void operator+=(const block_& other) {{
+                for (int r = 0; r < {BLOCK}; ++r) of[r] += other.of[r];
+            }}
+        }};
+        auto all_above = [](const block_& numbers, const block_& limits) {{
+            bool found = true;
+            for (int r = 0; r < {BLOCK}; ++r) found = found && numbers.of[r] > limits.of[r];
+            return found;
+        }};
+#else
+        typedef double block_ __attribute__((ext_vector_type({BLOCK}), aligned(8)));
+        auto all_above = [](block_ numbers, block_ limits) {{ return __builtin_reduce_and(numbers > limits) != 0; }};
+#endif
+        auto rows_at = [](const wp::float64* column) {{ return *(const block_*)column; }};
+"""
+
+
 class Arithmetic(NamedTuple):
     """Warp functions for structures of one size.
 
@@ -46,15 +74,13 @@ def arithmetic(n: int, tangential: int, normal: int, t: Types) -> Arithmetic:
 
     def product(size, kept=None, of="here[{}]"):
         # Every fourth matrix is that of detachment; in contact the last two columns are zero.
-        return f"""
+        return f"""{VECTOR}
             wp::vec_t<{kept or size}, wp::float64> found;
             const wp::float64* column = m.data + {BLOCK * columns} * ({blocks_of(n).total} * matrix + first);
             const int columns = matrix % 4 == 3 ? {columns} : {columns - 2};
             for (int b = 0; b < {size}; b += {BLOCK}) {{
-                wp::float64 sums[{BLOCK}];
-                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * {of.format(0)};
-                for (int k = 1; k < columns; ++k)
-                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * {of.format("k")};
+                block_ sums = rows_at(column) * {of.format(0)};
+                for (int k = 1; k < columns; ++k) sums += rows_at(column + {BLOCK} * k) * {of.format("k")};
                 for (int r = 0; r < {BLOCK} && b + r < {kept or size}; ++r) found[b + r] = sums[r];
                 column += {BLOCK * columns};
             }}
@@ -63,20 +89,16 @@ def arithmetic(n: int, tangential: int, normal: int, t: Types) -> Arithmetic:
     def scan_of(used):
         return f"""
             for (; i < whole; ++i) {{
-                wp::float64 sums[{BLOCK}];
-                for (int r = 0; r < {BLOCK}; ++r) sums[r] = column[r] * here[0];
-                for (int k = 1; k < {used}; ++k)
-                    for (int r = 0; r < {BLOCK}; ++r) sums[r] += column[{BLOCK} * k + r] * here[k];
-                int clear = 0;
-                for (int r = 0; r < {BLOCK}; ++r) clear += sums[r] > limits[r];
-                if ((i >= proved && clear < {BLOCK}) || (speed < 0.0 && sums[6] >= 0.0)) break;
+                block_ sums = rows_at(column) * here[0];
+                for (int k = 1; k < {used}; ++k) sums += rows_at(column + {BLOCK} * k) * here[k];
+                if ((i >= proved && !all_above(sums, limits)) || (speed < 0.0 && sums[6] >= 0.0)) break;
                 speed = sums[6];
                 column += {BLOCK * columns};
             }}"""
 
     # Numbers of columns that compilers know make this loop, in which trajectories spend most of their time, faster.
-    scan_source = f"""
-        wp::float64 limits[{BLOCK}];
+    scan_source = f"""{VECTOR}
+        block_ limits;
         for (int r = 0; r < {BLOCK}; ++r) limits[r] = r < 6 ? sizes[6 + r % 2] : -INFINITY;
         const wp::float64* column = m.data + {BLOCK * columns * blocks_of(n).total} * matrix;
         wp::float64 speed = here[{speed_at}];
