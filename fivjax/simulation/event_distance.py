@@ -208,7 +208,8 @@ class _Seen:
             )
             # After a jump of the load a guard may be far below zero.
             passed = abs(float(look.guards[0, i, which])) if look.h == 0 else 0.0
-            depth = float(look.slope[i, which] ** 2 / (2 * max(abs(look.bend[i, which]), 1e-300)))
+            slope, bend = float(look.slope[i, which]), abs(float(look.bend[i, which]))
+            depth = slope**2 / (2 * bend) if bend > 0 else float("inf")
             self.calls.append(((*key, which), max(depth, passed), at))
             # The other guards at that instant: if one of them is zero as well, either may be the first. A guard of another
             # contact that rises was zero when its status began, an event that has been counted already.

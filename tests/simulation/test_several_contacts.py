@@ -4,14 +4,17 @@ Fast tests share two kernels, for lists of Coulomb laws and a pulse: two contact
 ledger, whose kernel takes longer to compile by the square of its length, of four.
 """
 
+import dataclasses
 import inspect
 from unittest.mock import Mock
 
+import jax
 import numpy as np
 import pytest
 
 import fivjax as fj
 from fivjax.notebook.panels import drawing_panels
+from fivjax.simulation import event_distance
 from fivjax.steppers.section import section_weights
 from tests.helpers import several_contacts_reference as reference
 from tests.helpers.several_contacts import EACH, copies, scene_of
@@ -406,6 +409,27 @@ def turned(k1=100e3) -> fj.Structure:
 def on_both(make):
     """Of the scene with the contact at coordinates, and of that with it along vectors."""
     return [make(fj.Scene(one, fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.2))) for one in (SINGLE, turned())]
+
+
+@pytest.mark.slow
+def test_a_contact_that_comes_to_rest_without_an_event_does_not_end_the_search_for_close_calls(monkeypatch):
+    """As at the end of a chain of impacts; an advance in which nothing changes does."""
+    scene, looks_until = scene_of(copies(2), p=1.3), event_distance._looks_until
+    y0 = np.concatenate([fj.sliding_equilibrium(scene), np.zeros(2 * EACH)])
+
+    def closest(status):
+        def looks(*args):
+            first, *others = looks_until(*args)
+            rest = dataclasses.replace(first.contact, status=np.array(status, np.int32))
+            standing = {"y": y0, "contact": rest, "h": np.zeros(()), "ended": np.zeros(2, bool)}
+            yield dataclasses.replace(first, **standing, left=np.ones(()))
+            yield from (first, *others)
+
+        monkeypatch.setattr(event_distance, "_looks_until", looks)
+        with jax.enable_x64(True):
+            return event_distance.closest_call(scene, fj.EventExact(), y0, 0.05)
+
+    assert "finite" in closest([1, 1]).event and "finite" not in closest([1, 0]).event
 
 
 def test_one_contact_along_vectors_is_the_one_at_coordinates():
