@@ -32,6 +32,11 @@ def seen(family: Family, curve: Curve, place: Place, special: Special | None = N
 
 
 def is_real(family: Family, place: Place) -> bool:
-    """Whether the real motion has the contact modes with which a cycle was computed."""
+    """Whether the real motion has the contact modes with which a cycle was computed, and its events where that has them."""
     real = real_motion(family.at(place.parameter), family.stepper, place.phases)
-    return real is not None and real.has_the_modes_of(place.phases)
+    return real is not None and real.has_the_modes_of(place.phases) and not risen_to_zero(place)
+
+
+def risen_to_zero(place: Place) -> list[int]:
+    """The phases at whose computed end the guard rises: it has passed zero before, where the real motion has its event."""
+    return np.flatnonzero(~(place.images.guard_h < 0)).tolist()

@@ -8,6 +8,7 @@ continues along the curve for the sequence of modes that the real motion has bey
 
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -37,7 +38,7 @@ from .meeting_sliding import sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
 from .pseudo_arclength import Curve, Family
 from .special_derivatives import derivatives_of_special_points
-from .special_points import MEETS_SLIDING
+from .special_points import MEETS_SLIDING, SMOOTH
 from .verification import crossings_of, on_section
 
 if TYPE_CHECKING:
@@ -151,10 +152,12 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
 
     **Arguments:** `branch`, from `continue_cycle`; `i`, the index of the point.
 
-    **Returns:** a `LimitCycle`.
+    **Returns:** a `LimitCycle`. Where contact modes change, the return map has no derivative, and the multipliers are those of
+    the branch, on one side of that point.
 
     **Raises:** `TypeError` or `ValueError` for an object that is no branch, or an `i` that is not among its points;
-    `NoLimitCycle` if the motion does not cross the section, which happens at nearly zero amplitude.
+    `NoLimitCycle` if the motion does not come back to the section: at nearly zero amplitude, and at some grazings, where
+    rounding tells what it does.
 
     **Example:**
 
@@ -183,8 +186,14 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
     maps = ReturnMaps.of(scene)
     crossings = crossings_of(maps, point)
     if crossings is None:
-        raise NoLimitCycle(f"At point {i} of the branch the motion does not come back to the section.")
+        raise NoLimitCycle(
+            f"At point {i} of the branch the motion does not come back to the section. Take a point beside it."
+        )
     cycle = limit_cycle_of(maps, scene, closed_at(maps, point, crossings))
+    if str(row["special"].values) not in SMOOTH:
+        values = np.append(np.asarray(row["multipliers"]), 1.0)
+        values = values[np.argsort(-np.abs(values), kind="stable")]
+        cycle = eqx.tree_at(lambda c: (c.multipliers, c.stable), cycle, (values, bool(row["stable"])))
     return cycle_in_own_coordinates(given, cycle)
 
 
@@ -204,7 +213,7 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
         scene = family.at(point.place.parameter)
         slides.append(bool(sliding_rates(scene)[0].real < 0))
         rest = np.asarray(_equilibrium(scene))
-        at = None if point.real is None else on_section(scene, point.real)
+        at = None if point.real is None else on_section(scene, family.stepper, point.place.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
         status.append(-1 if at is None else int(at.contact.status))
         direction.append(np.nan if at is None else float(at.contact.direction))

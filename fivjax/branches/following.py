@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..foundation.progress import stage
-from .branch_points import Point, seen
+from .branch_points import Point, risen_to_zero, seen
 from .meeting_sliding import where_sliding_is_met
 from .mode_changes import change_of_modes
 from .multiple_shooting import AT_SECTION
@@ -44,7 +44,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))
         following, turned, step = ahead
         last = seen(family, curve, following)
-        if last.real is None or not last.real.has_the_modes_of(following.phases):
+        if last.real is None or not last.real.has_the_modes_of(following.phases) or risen_to_zero(following):
             changed = change_of_modes(family, here, tangent, step)
             if changed is None:
                 if step > 100 * SHORTEST:
@@ -55,7 +55,9 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             if not bounds[0] <= special.place.parameter <= bounds[1]:
                 return Followed(points, _at(family, here, "the bound is reached"))
             if special.curve is curve:
-                points += _specials(family, curve, here.place, tangent, special.place)
+                # The parameter may turn back just there.
+                passed = _specials(family, curve, here.place, tangent, special.place)
+                points += [one for one in passed if np.linalg.norm(one.place.u - special.place.u) > 1e-6]
             points.append(seen(family, special.curve, special.place, special))
             if onward is None:
                 return Followed(points, _at(family, points[-1], f"{special.name}: no cycle goes on beyond"))

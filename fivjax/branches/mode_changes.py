@@ -3,14 +3,18 @@
 import numpy as np
 from jaxtyping import Float
 
-from .branch_points import Point, is_real, seen
+from ..contact import Status
+from .branch_points import Point, is_real, risen_to_zero, seen
+from .grazing import NAMES
 from .multiple_shooting import AT_SECTION, Phases
 from .pseudo_arclength import Curve, Family, Place
-from .special_points import Special, change_between, grazing_of, name_of, vanishing, without
+from .special_points import Special, change_between, grazing_of, name_of, root, vanishing, without
 from .verification import on_section, real_motion
 
 # Halvings that bracket a change of modes before it is computed.
 HALVINGS = 14
+# The most phases of a cycle that is followed: its equations are a matrix of so many states. Ever shorter impacts have more.
+MOST_PHASES = 256
 # Distances beyond a change of modes at which the next modes are determined, as shares of the step.
 BEYOND = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
@@ -35,9 +39,39 @@ def change_of_modes(family: Family, here: Point, tangent: Float[np.ndarray, " m"
     gone = [k for k in range(len(ahead.phases.h)) if ahead.phases.h[k] <= 0]
     if gone:
         return _removed(family, curve, valid, tangent, gone[0], step)
-    return _inserted(family, curve, valid, ahead, tangent, step) or _removed(
-        family, curve, valid, tangent, int(np.argmin(valid.phases.h)), step
+    if turned_back := _missed(curve, here, tangent, low, high, ahead):
+        return turned_back, None
+    return (
+        _inserted(family, curve, valid, ahead, tangent, step)
+        or _removed(family, curve, valid, tangent, int(np.argmin(valid.phases.h)), step)
+        or _grazes(curve, ahead, step)
     )
+
+
+def _missed(curve: Curve, here: Point, tangent, low: float, high: float, ahead: Place) -> Special | None:
+    """The cycle on which a guard only just falls to zero at the end of a phase, between two distances along the tangent.
+    Beyond, it rises there, so the event came before; and the parameter has turned back.
+    """
+    for k in risen_to_zero(ahead):
+        if curve.modes[k].ending == AT_SECTION:
+            continue
+
+        def rise(place: Place, k=k) -> float:
+            return float(place.images.guard_h[k])
+
+        _, place = root(lambda s: curve.along(here.place, tangent, s), rise, low, high)
+        if place is not None:
+            mode = curve.modes[k]
+            return Special(NAMES[Status(mode.status), mode.ending], curve, place, turns=True)
+    return None
+
+
+def _grazes(curve: Curve, ahead: Place, step: float):
+    """A change beyond which no cycle is found, though it is known which guard touches zero."""
+    grazing = grazing_of(curve, ahead)
+    if grazing is None or not _near(curve, grazing.place, ahead, step):
+        return None
+    return Special(name_of(grazing, None, removed=False), curve, grazing.place, grazing.row, grazing), None
 
 
 def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent, step: float):
@@ -47,7 +81,7 @@ def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent,
         if place is None:
             continue
         real = real_motion(family.at(place.parameter), family.stepper, place.phases)
-        if real is None or real.phases is None or len(real.phases.modes) <= len(curve.modes):
+        if real is None or real.phases is None or not len(curve.modes) < len(real.phases.modes) <= MOST_PHASES:
             continue
         change = change_between(real.phases.modes, curve.modes)
         longer = Curve(family, real.phases)
@@ -114,7 +148,7 @@ def _shorter(family: Family, valid: Place, phase: int):
         kept = (after._replace(ending=AT_SECTION),)
         change = change_between(modes, kept)
         real = real_motion(family.at(valid.parameter), family.stepper, phases)
-        point = None if real is None else on_section(family.at(valid.parameter), real)
+        point = None if real is None else on_section(family.at(valid.parameter), family.stepper, phases, real)
         if change is None or point is None:
             return None
         return Phases(kept, np.asarray(point.y)[None], np.array([phases.period])), change

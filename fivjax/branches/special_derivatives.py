@@ -2,9 +2,9 @@ r"""Derivatives of special points of a branch in all parameters of the scene, by
 
 A special point is a root of the cycle's equations $F(u, λ; θ) = 0$ together with one more equation. At a grazing it says that
 the minimum of a guard is zero, at the vanishing of a phase that its duration is zero: one linear system gives the derivatives.
-At a fold there is a vector $l$ with $l^T ∂F/∂u = 0$, so $dλ/dθ = - l^T F_θ / l^T F_λ$. Where a multiplier $m$ passes the unit
-circle, $|m|(λ, θ) = 1$, and the derivatives of $|m|$ along the family of cycles are differences of values that are exact to
-rounding.
+Where the parameter turns back there is a vector $l$ with $l^T ∂F/∂u = 0$, so $dλ/dθ = - l^T F_θ / l^T F_λ$. Where a
+multiplier $m$ passes the unit circle, $|m|(λ, θ) = 1$, and the derivatives of $|m|$ along the family of cycles are differences
+of values that are exact to rounding.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from .grazing import looked_at, row_of
 from .meeting_sliding import sliding_rates
 from .multiple_shooting import images, moved_along, parameter_direction
 from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
-from .special_points import FOLD, MEETS_SLIDING, Special, critical_multiplier
+from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
 # Relative change of a parameter for differences of multipliers.
 APART = 1e-6
@@ -44,7 +44,7 @@ def _derivative(family: Family, special: Special, name: str) -> float:
     _, rows = assembled(found, place.phases)
     _, own = assembled(place.images, place.phases)
     slope, own = rows[:, -1], own * curve.scales
-    if special.name == FOLD:
+    if special.turns:
         left, _, _ = np.linalg.svd(own[:, :-1] / np.max(np.abs(own), axis=1, keepdims=True))
         null = left[:, -1] / np.max(np.abs(own), axis=1)
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])

@@ -13,6 +13,8 @@ from .pseudo_arclength import Curve, Place, multipliers_of
 
 FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
 MEETS_SLIDING = "amplitude meets the sliding equilibrium"
+# Points at which the return map has a derivative.
+SMOOTH = ("", FOLD, DOUBLING, TORUS, MEETS_SLIDING)
 # Multipliers this close to the real axis count as real.
 REAL = 1e-9
 # How far from the unit circle a multiplier may be found where it passes it.
@@ -27,10 +29,11 @@ class Special(NamedTuple):
     name: str
     curve: Curve
     place: Place
-    # The linearised equation that it adds to those of the cycle; None for a fold, which adds none.
+    # The linearised equation that it adds to those of the cycle; None where it adds none.
     row: Float[np.ndarray, " m"] | None = None
     grazing: Grazing | None = None
     multiplier: complex | None = None
+    turns: bool = False  # whether the parameter turns back there, as at a fold
 
 
 class Change(NamedTuple):
@@ -50,7 +53,7 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
     found: list[tuple[float, Special]] = []
 
     def place(s: float) -> Place | None:
-        return a if s == 0 else curve.along(a, tangent, s)
+        return {0.0: a, length: b}.get(s) or curve.along(a, tangent, s)
 
     end = curve.tangent(b, tangent)
     if tangent[-1] * end[-1] < 0 and max(abs(tangent[-1]), abs(end[-1])) > LEVEL:
@@ -58,14 +61,14 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
         def turning(at: Place) -> float:
             return float(curve.tangent(at, tangent)[-1])
 
-        s, at = _root(place, turning, length, turning(a), turning(b))
+        s, at = root(place, turning, 0.0, length)
         if at is not None:
-            found.append((s, Special(FOLD, curve, at)))
+            found.append((s, Special(FOLD, curve, at, turns=True)))
     before, after = multipliers_of(a.images), multipliers_of(b.images)
     for name, test in ((DOUBLING, doubling), (TORUS, pairing)):
         values = test(before), test(after)
         if np.all(np.isfinite(values)) and values[0] * values[1] < 0:
-            s, at = _root(place, lambda at, test=test: test(multipliers_of(at.images)), length, *values)
+            s, at = root(place, lambda at, test=test: test(multipliers_of(at.images)), 0.0, length)
             if at is not None:
                 which = critical_multiplier(multipliers_of(at.images), name)
                 # Two real multipliers may have the product one, too.
@@ -98,16 +101,16 @@ def critical_multiplier(values: Complex[np.ndarray, " m"], name: str) -> complex
     return complex(upper[np.argmin(np.abs(np.abs(upper) - 1))]) if len(upper) else None
 
 
-def _root(place: Callable[[float], Place | None], test: Callable[[Place], float], length: float, low, high):
-    """The distance along a step at which a test function vanishes, and the cycle there."""
+def root(place: Callable[[float], Place | None], test: Callable[[Place], float], low: float, high: float):
+    """The distance along a step at which a test function vanishes, between two others, and the cycle there; None if there is no
+    such cycle.
+    """
     from scipy.optimize import brentq
 
     class Lost(Exception):
         pass
 
     def value(s: float) -> float:
-        if s in (0.0, length):
-            return low if s == 0 else high
         at = place(s)
         found = np.nan if at is None else test(at)
         if not np.isfinite(found):
@@ -115,9 +118,9 @@ def _root(place: Callable[[float], Place | None], test: Callable[[Place], float]
         return found
 
     try:
-        s = float(brentq(value, 0.0, length, xtol=1e-13, rtol=1e-13))
-    except Lost:
-        return 0.0, None
+        s = float(brentq(value, low, high, xtol=1e-13, rtol=1e-13))
+    except (Lost, ValueError):  # of one sign at both ends
+        return low, None
     return s, place(s)
 
 

@@ -1,8 +1,10 @@
 """The real motion that starts on a computed cycle: its modes, its peak and its point on the section."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..contact import Contact, Status
 from ..cycles.around import Seen, seen_around
@@ -10,7 +12,7 @@ from ..model.scene import Scene
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import AT_SECTION, LOOKS, Phases, inside, phases_around, same_modes
+from .multiple_shooting import AT_SECTION, LOOKS, Mode, Phases, inside, phases_around, same_modes
 
 # The most crossings of the section in one period.
 MOST_CROSSINGS = 24
@@ -37,20 +39,40 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | Non
         return None
     # Started in the middle of a phase, far from events, so that none is met twice or missed.
     longest = int(np.argmax(np.where([mode.status == Status.STICK for mode in phases.modes], 0.0, phases.h)))
-    status, direction, ending = phases.modes[longest]
-    states = phases.y if ending == AT_SECTION else inside(scene, stepper, phases).states[:, LOOKS // 2]
-    contact = Contact(np.asarray(status, np.int32), np.asarray(direction if direction else 1.0, np.float64))
-    start = Point(np.asarray(states[longest]), contact)
+    whole = phases.modes[longest].ending == AT_SECTION
+    start = (
+        _point(phases.modes[longest], phases.y[longest])
+        if whole
+        else _states(scene, stepper, phases, [LOOKS // 2])[longest]
+    )
     seen = seen_around(scene, stepper, start, phases.period)
     return Real(start, seen, phases_around(seen.segments))
 
 
-def on_section(scene: Scene, real: Real) -> Point | None:
-    """The first crossing of the section; None if there is none."""
+def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: Real) -> Point | None:
+    """The first crossing of the section on a computed cycle; None if there is none."""
     if float(real.start.y[scene.structure.size + scene.structure.tangential]) == 0.0:
         return real.start
-    found = ReturnMaps.of(scene).returns(np.zeros(1, int), Section.of(real.start), 1).at
-    return found.point(0) if np.all(np.isfinite(found.y)) else None
+    # On a cycle that grazes, rounding tells what follows the touch: from elsewhere the section may come before it.
+    maps = ReturnMaps.of(scene)
+    for looks in ([], range(1, LOOKS)):
+        starts = [real.start, *(_states(scene, stepper, phases, looks) if looks else [])]
+        found = maps.returns(np.zeros(len(starts), int), Section.of(*starts), 1).at
+        reached = np.flatnonzero(np.all(np.isfinite(found.y), axis=1))
+        if len(reached):
+            return found.point(int(reached[0]))
+    return None
+
+
+def _states(scene: Scene, stepper: EventExact, phases: Phases, looks: Iterable[int]) -> list[Point]:
+    """The states at these instants, of `LOOKS`, of all phases."""
+    states = inside(scene, stepper, phases).states
+    return [_point(mode, y) for look in looks for mode, y in zip(phases.modes, states[:, look], strict=True)]
+
+
+def _point(mode: Mode, y: Float[np.ndarray, " state"]) -> Point:
+    direction = mode.direction if mode.direction else 1.0
+    return Point(np.asarray(y), Contact(np.asarray(mode.status, np.int32), np.asarray(direction, np.float64)))
 
 
 def crossings_of(maps: ReturnMaps, point: Point) -> int | None:

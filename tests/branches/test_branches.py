@@ -81,6 +81,14 @@ def test_cycle_at_gives_the_cycle_back(branch):
         fj.cycle_at(branch, 10**6)
 
 
+def test_where_modes_change_a_cycle_has_the_branch_s_multipliers(branch):
+    """The return map has no derivative there: what rounding makes of one said "stable" beside multipliers of 18."""
+    for i in np.flatnonzero(branch.special.str.contains("removed").values):
+        cycle = fj.cycle_at(branch, i)
+        apart = np.abs(cycle.multipliers[:, None] - branch.multipliers.values[i])
+        assert np.max(np.min(apart, axis=0)) == 0 and cycle.stable == bool(branch.stable[i])
+
+
 @pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
 def test_no_cycle_is_born_below_the_fold(branch):
     """An independent solver started on the fold's cycle: 1e-4 above it goes on for ever, 1e-4 below it fades."""
@@ -190,6 +198,39 @@ def test_a_branch_over_restitution_begins_without_any():
     assert specials(branch).count("impact inserted") >= 10
     scene = {**reference.of_scene(paper(1.0, 0.227)), "p": 3.0, "restitution": 0.2}
     assert float(branch.amplitude[-1]) == pytest.approx(reference.fate([scene]).amplitude[0], rel=1e-6)
+
+
+def with_static_friction(belt_speed: float) -> fj.Scene:
+    return fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, mu_static=0.26), belt_speed, fj.ConstantLoad(100.0))
+
+
+@pytest.mark.slow
+def test_a_branch_ends_where_its_event_would_be_missed():
+    """The slip only just comes to zero, and with static friction above kinetic nothing goes on from there. The place is that of
+    a family of cycles by matrix exponentials; beyond, solutions of the cycle's equations are no motions.
+    """
+    branch = fj.continue_cycle(with_static_friction(1.0), "mu", (0.05, 0.255))
+    assert branch.begins == "At mu = 0.228218444915 grazing of slip: no cycle goes on beyond."
+    assert branch.special.values[0] == "grazing of slip"
+    assert float(branch.parameter[0]) == pytest.approx(0.228218444915, abs=2e-12)
+    for i in range(1, 8):
+        cycle = fj.cycle_at(branch, i)
+        assert cycle.residual < 1e-12 and cycle.period == pytest.approx(float(branch.period[i]), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_branch_with_ever_shorter_impacts_ends():
+    """Beyond a change of modes the motion had 16,384 phases, and their equations would have been a matrix of 98 GiB."""
+    branch = fj.continue_cycle(with_static_friction(1.0), "mu_static", (0.21, 0.6))
+    assert branch.ends == "At mu_static = 0.55396671036 stick removed: no cycle goes on beyond."
+
+
+@pytest.mark.slow
+def test_a_grazing_has_a_state_on_the_section_whatever_rounding_makes_of_the_touch():
+    branch = fj.continue_cycle(paper(2.0, 0.227), "theta", (0.0065, 0.0105))
+    at = int(np.argmax(branch.special.values == "grazing of N: impact inserted"))
+    assert np.all(np.isfinite(branch.state.values[at]))
+    np.testing.assert_allclose(branch.state.values[at], branch.state.values[at - 1], atol=0.3)
 
 
 @pytest.mark.slow
