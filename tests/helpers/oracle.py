@@ -916,7 +916,8 @@ class _Returns:
         """The verdict on an orbit that closes after k returns, or (k = 0) on one that stays on a torus."""
         if k == 0:
             d, rate, regime = self.distances[1], math.nan, "quasi-periodic"
-            period = (self.times[-1] - self.times[-301]) / 300
+            returns = min(300, len(self.times) - 1)
+            period = (self.times[-1] - self.times[-1 - returns]) / returns
         else:
             d, regime = self.distances[k], "periodic"
             back = min(len(d) // 2, 50 * k)
