@@ -63,6 +63,13 @@ def matrix(path: Path) -> dict[str, FileMatrix | str]:
     if np.any((places < 1) | (places > rows)):
         wrong = places[(places < 1) | (places > rows)][0]
         raise ValueError(f"{place} has an entry in row {wrong} of {rows}. Write it again.")
+    column = np.repeat(np.arange(columns), np.diff(starts))
+    order = np.lexsort((places, column))
+    double = order[1:][(np.diff(places[order]) == 0) & (np.diff(column[order]) == 0)]
+    if len(double):
+        raise ValueError(
+            f"{place} gives row {places[double[0]]} of column {column[double[0]] + 1} twice. Write each entry once."
+        )
     found = sparse.csc_array((values, places - 1, starts), shape=header.shape).tocoo()
     i, j, data = found.row, found.col, found.data
     if header.kind[1] == "S":

@@ -32,6 +32,8 @@ def dmig(path: Path) -> dict[str, FileMatrix | str]:
         if not name:
             raise ValueError(f"{here}: a DMIG entry must name its matrix. Mend the line.")
         if fields[1] == "0":
+            if name in headers:
+                raise ValueError(f"{here}: matrix `{name}` has a second header. Give each matrix once.")
             headers[name] = _form(here, name, fields)
             entries[name] = []
         elif name not in headers:

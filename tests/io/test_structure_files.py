@@ -429,6 +429,7 @@ DAMAGED = {
         r"must list its 2 nodes",
     ),
     "a column without header": ("a.pch", DMIG.split("\n", 2)[2], r"line 1: matrix `KAAX` has no header"),
+    "a second header": ("a.pch", DMIG + DMIG.split("\n")[1] + "\n", r"matrix `KAAX` has a second header"),
     "a cut DMIG entry": (
         "a.pch",
         DMIG.replace("4       2   -5.+1", "4       2"),
@@ -457,6 +458,11 @@ DAMAGED = {
         "a.hb",
         HARWELL_BOEING.replace("   1   3   2", "   1   9   2"),
         r"in row 9 of 4",
+    ),
+    "a Harwell-Boeing row twice": (
+        "a.hb",
+        HARWELL_BOEING.replace("   1   3   2   4", "   1   3   4   4"),
+        r"gives row 4 of column 2 twice",
     ),
     "row zero": ("a.mtx", COORDINATE.replace("1 1 300.", "0 1 300."), r"line 1: rows and columns are numbered from 1"),
     "triangles that differ": (
