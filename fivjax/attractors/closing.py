@@ -124,6 +124,9 @@ def _newton(maps: ReturnMaps, group, guess: Section, crossings: Int[np.ndarray, 
         step[running[other_mode]] = np.nan
         moved = running[~other_mode]
         zero = zero_on_section(size // 2, maps.tangential, maps.normal, at.status[moved])
+        # Where an impact leads to the section, it makes zero what it stops, and not the velocity.
+        ends = image.y[~other_mode]
+        zero = np.where(maps.jumped(ends)[:, None], ends == 0, zero)
         here.put(moved, at.rows(moved)._replace(y=np.where(zero, 0.0, at.y[moved] + step[moved])))
         here.put(running[other_mode], image.rows(other_mode))
         running = running[~done]

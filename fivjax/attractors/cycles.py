@@ -169,7 +169,7 @@ def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndar
 
 def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> Trial | None:
     y, status, direction = closed.at.rows(row)
-    found = trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status))
+    found = trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status, y))
     if found is None or closed.crossings[row] <= CROSSINGS:
         return found
     # A cycle of many crossings that captures only what is nearer than this lies on a torus that is locked weakly.

@@ -26,7 +26,7 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import ByMethod, Point, motion_to_section
-from ..section.free_directions import zero_on_section
+from ..section.free_directions import jumped_to, section_row, zero_on_section
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from .cycle import LimitCycle, point_of, under_final_load
@@ -227,7 +227,10 @@ def _closed(scene: Scene, guess, contact: Contact, crossings) -> _Root:
     image = _image(scene, contact, crossings)
     weights = jnp.asarray(scene.structure.weights)
     units = jnp.eye(len(guess), dtype=guess.dtype)
-    zero_there = zero_on_section(scene.structure.size, *contact_coordinates(scene.structure), contact.status)
+    places = contact_coordinates(scene.structure)
+    section = section_row(scene.structure.size, places[0])
+    jumped = jumped_to(guess, weights, section, places[0])
+    zero_there = jnp.where(jumped, guess == 0, zero_on_section(scene.structure.size, *places, contact.status))
 
     def going(carry):
         count, root, _, halved = carry

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..contact import Status
+from ..steppers.section import section_weights
 
 
 def zero_on_section(
@@ -23,6 +24,22 @@ def zero_on_section(
     if np.ndim(tangential) == 0:
         return (closed[..., None] & (entries % size == normal)) | (entries == size + tangential)
     return (closed[..., None] & (entries % size == np.reshape(normal, (-1, 1)))).any(-2)
+
+
+def section_row(size: int, tangential: int | Int[np.ndarray, " c"]) -> Float[np.ndarray, " n"]:
+    """The weights of the velocities whose sum is zero on the section, in a structure of `size` coordinates."""
+    row, places = np.zeros(size), np.atleast_1d(tangential)
+    row[places] = section_weights(len(places))
+    return row
+
+
+def jumped_to(y, weights: Float[np.ndarray, " state"], section: Float[np.ndarray, " n"], tangential):
+    """Which states of the section (`(..., 2n)`) are those just after an impact that made the velocity jump over zero: there the
+    section does not hold it. Elsewhere it is zero, but for rounding.
+    """
+    n, rounding = len(section), 1e-9
+    speed = weights[n + np.atleast_1d(tangential)].max() * abs(y[..., n:] @ section)
+    return speed > rounding * ((weights * y) ** 2).sum(-1) ** 0.5
 
 
 def free_coordinates(size: int, tangential: int, normal: int, status: int) -> Int[np.ndarray, " f"]:

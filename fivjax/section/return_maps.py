@@ -24,11 +24,11 @@ from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.event_exact import EventExact, for_derivatives
-from ..steppers.section import FADED, section_weights
+from ..steppers.section import FADED
 from .about_sliding import longest_return, mechanics_about_sliding
 from .by_kernel import SectionKernels, section_kernels
 from .crossings import Point, to_crossing
-from .free_directions import directions_of_several, free_coordinates
+from .free_directions import directions_of_several, free_coordinates, jumped_to, section_row
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -158,16 +158,31 @@ class ReturnMaps:
     @property
     def section(self) -> Float[np.ndarray, " n"]:
         """The weights of the velocities whose sum is zero on the section."""
-        row = np.zeros(self.structure.size)
-        row[np.atleast_1d(self.tangential)] = section_weights(len(self.structure.contacts))
-        return row
+        return section_row(self.structure.size, self.tangential)
 
-    def free_directions(self, status: int | Int[np.ndarray, " c"]) -> Float[np.ndarray, "2n f"]:
-        """The weighted directions that the section and a contact mode leave free, as columns."""
+    def jumped(self, y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
+        """Which states of the section are those just after an impact that made the velocity jump over zero."""
+        return jumped_to(y, self.weights, self.section, self.tangential)
+
+    def free_directions(
+        self, status: int | Int[np.ndarray, " c"], y: Float[np.ndarray, " 2n"]
+    ) -> Float[np.ndarray, "2n f"]:
+        """The weighted directions that the section and a contact mode leave free at a state of the section, as columns."""
         if np.ndim(status):
             places = np.asarray(self.tangential), np.asarray(self.normal)
-            return directions_of_several(self.weights, self.section, *places, status)
-        return np.eye(len(self.weights))[:, self.free[int(status)]]
+            section = np.zeros_like(self.section) if self.jumped(y[None])[0] else self.section
+            return directions_of_several(self.weights, section, *places, status)
+        return np.eye(len(self.weights))[:, self._free(np.atleast_1d(status), y[None])[0]]
+
+    def _free(self, status: Int[np.ndarray, " m"], y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, "m 2n"]:
+        """With one contact: which coordinates are free at states of the section. An impact leaves the gap at zero, and its rate
+        where it does not rebound, but any velocity.
+        """
+        free, jumped, n = self.free[status], self.jumped(y), self.structure.size
+        free[jumped, n + self.tangential] = True
+        for place in (self.normal, n + self.normal):
+            free[:, place] &= ~jumped | (y[:, place] != 0)
+        return free
 
     @cached_property
     def free(self) -> Bool[np.ndarray, "modes 2n"]:
@@ -260,7 +275,7 @@ class ReturnMaps:
         """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
         count, size = at.y.shape
         lengths = np.linalg.norm(self.weights * at.y, axis=1)
-        row, place = np.nonzero(self.free[at.status])
+        row, place = np.nonzero(self._free(at.status, at.y))
         base = self.returns(group, at, crossings)
         derivatives = np.zeros((count, size, size))
         for step in STEPS:

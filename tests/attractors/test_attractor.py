@@ -2,13 +2,14 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
 import fivjax as fj
 from fivjax.attractors import tube
 from fivjax.attractors.catalogue import Catalogue
-from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new
+from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new, stable_cycles
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.returning import captured_by_tubes
 from fivjax.attractors.tori import (
@@ -25,8 +26,9 @@ from fivjax.attractors.tori import (
     smooth_mean,
 )
 from fivjax.attractors.tube import Tube
+from fivjax.contact import Status
 from fivjax.maps.capture import Capture
-from fivjax.section.return_maps import Images, Section
+from fivjax.section.return_maps import Images, ReturnMaps, Section
 from tests.helpers import reference
 
 STATES = 256
@@ -463,7 +465,10 @@ class Locked:
     def moves(self, group, y):
         return np.ones(len(group), bool)
 
-    def free_directions(self, status):
+    def jumped(self, y):
+        return np.zeros(len(y), bool)
+
+    def free_directions(self, status, y):
         return np.eye(6)[:, [0, 1, 4]]
 
     def peaks(self, group, at, crossings):
@@ -495,3 +500,34 @@ def test_a_cycle_is_known_if_one_of_its_points_is_met_to_a_millionth_of_its_size
         moved = points[1:] + np.array([[0.0, away * length]])
         assert is_new(maps, one._replace(points=moved), [one]) is new  # type: ignore[arg-type]
     assert is_new(maps, one, [])  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
+def test_a_cycle_meets_the_section_by_an_impact(paper_scene):
+    """There the tangential velocity jumps over zero and is free. It was held at zero, so no such cycle closed, and whole columns of
+    a map were undecided.
+    """
+    scene = paper_scene.replace(mu=0.209064, belt_speed=1.7)
+    maps, one = ReturnMaps.of(scene), np.zeros(1, int)
+    released = maps.in_contact(one, np.append(fj.sliding_equilibrium(scene), np.zeros(3))[None])
+    motions = Motions(one, maps.returns(one, released, 3000).at)
+    assert maps.jumped(motions.at.y) and motions.at.status == Status.DETACH
+    ((_, _, cycle),) = stable_cycles(maps, motions, {})
+    assert len(cycle.points) == 1 and cycle.points[0, 3] > 0 and cycle.reach > 0
+    run = reference.fate([{**reference.of_scene(scene), "p": 3.0}], t_max=120.0)
+    assert run.fate == ["sustained"] and run.amplitude[0] == pytest.approx(cycle.amplitude, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_cycle_that_meets_the_section_by_an_impact_is_followed_to_neighbours(paper_scene):
+    """Its period's derivative, against differences of cycles that are searched for."""
+    scene = paper_scene.replace(mu=0.209064, belt_speed=1.7)
+    cycle, apart = fj.limit_cycle(scene), 1e-5
+
+    def period(mu):
+        return fj.nearby_cycle(scene.replace(mu=mu), cycle).period
+
+    with jax.enable_x64(True):
+        slope = float(jax.grad(period)(0.209064))
+    ahead, behind = (fj.limit_cycle(scene.replace(mu=0.209064 + by), cycle).period for by in (apart, -apart))
+    assert slope == pytest.approx((ahead - behind) / (2 * apart), rel=1e-6)

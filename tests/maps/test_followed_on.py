@@ -68,7 +68,10 @@ class Line:
     def peaks(self, group, at, crossings):
         return self.returns(group, at, crossings).at.y[:, 0]
 
-    def free_directions(self, status):
+    def jumped(self, y):
+        return np.zeros(len(y), bool)
+
+    def free_directions(self, status, y):
         return np.eye(4)[:, :1]
 
 
