@@ -110,7 +110,8 @@ def _continue_from_seeds(catalogue: Catalogue, seeds: dict[int, int]) -> None:
         motions = _follow_from(catalogue.maps, starts, near_cycle)
         left.append(motions.rows(~own.add_cycles(motions, recurrence)))
     # Cycles of many crossings lie on tori.
-    left[-1] = left[-1]._replace(at=catalogue.maps.returns(*left[-1], near_torus - near_cycle).at)
+    group, at = left[-1]
+    left[-1] = Motions(group, catalogue.maps.returns(group, at, near_torus - near_cycle).at)
     left.append(_follow_from(catalogue.maps, on_tori, near_torus))
     group = np.concatenate([motions.group for motions in left])
     at = Section(*(np.concatenate(parts) for parts in zip(*(motions.at for motions in left), strict=True)))

@@ -63,7 +63,12 @@ class Reproduce:
         if not self.overwrite:
             refuse_existing(report)
         begin = time.perf_counter()
-        made = fj.reproduce(self.figure, self.out)
+        try:
+            made = fj.reproduce(self.figure, self.out)
+        except OSError as error:
+            raise ValueError(
+                f"Folder `{self.out}` cannot be written into: {error.strerror}. Give another by `--out`."
+            ) from error
         say(report)
         what = number(len(made), "figure or table", "figures and tables")
         print(f"  {what}, each as .png and .nc, in {time.perf_counter() - begin:.0f} s")

@@ -60,6 +60,10 @@ def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
     return dataset
 
 
+# Suffixes of what `save` does not write.
+OTHERS = (".csv", ".txt", ".zarr", ".npz", ".npy", ".mat", ".xlsx", ".json", ".parquet", ".png", ".pdf", ".svg")
+
+
 def save(result, path: str | Path) -> Path:
     """Write a result as NetCDF; the file appears under its name only when it is whole.
 
@@ -67,8 +71,8 @@ def save(result, path: str | Path) -> Path:
         fj.save(fj.bistability_map(scene, mu=…, p=…), "map.nc")
 
     **Arguments:** `result`, an xarray dataset or an object that turns into one: a `Trajectory`, a `Calibration`, sensitivities;
-    `path`, the file. One that exists is replaced and keeps its permissions; where the path is a symbolic link, the file that it
-    leads to is written.
+    `path`, the file, not with the suffix of another format. One that exists is replaced and keeps its permissions; where the
+    path is a symbolic link, the file that it leads to is written.
 
     **Returns:** the path.
 
@@ -81,6 +85,11 @@ def save(result, path: str | Path) -> Path:
     """
     dataset = _as_dataset(result)
     path = check_writable(path)
+    if path.suffix.lower() in OTHERS:
+        raise ValueError(
+            f"Argument `path` must name a NetCDF file, such as `{path.with_suffix('.nc').name}`, but is `{path}`. Other "
+            f"formats are written by xarray: `fj.open(…).to_zarr(…)`, `.to_dataframe().to_csv(…)`."
+        )
     # Made in memory first: on a full disk HDF5 crashes the whole process.
     content = BytesIO()
     dataset.to_netcdf(content, engine="h5netcdf")

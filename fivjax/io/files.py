@@ -93,5 +93,9 @@ def replace_whole(path: Path, content: bytes) -> Path:
     leads is written, and a file that is replaced keeps its permissions.
     """
     place = _place(path)
-    write_whole(place, content, like=_status(place))
+    try:
+        write_whole(place, content, like=_status(place))
+    except OSError as error:
+        sentence = f"File `{path}` cannot be written: {error.strerror}. Make room there, or give another path"
+        raise OSError(error.errno, sentence) from error
     return path

@@ -44,10 +44,15 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
 
     **Raises:** `ValueError`, with the number of bytes, for more than a map may have, or than this machine has memory for.
     """
-    counts = {name: (_count(values) - 1) * 2**halvings + 1 for name, values in axes.items()}
-    total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
     # The most trajectories of a map: 5 GB of results, which are in memory more than once, and days of work.
     most_trajectories = 10**8
+    if 2 ** min(halvings, 64) > most_trajectories:
+        raise ValueError(
+            f"Argument `refine` is {halvings}: each interval of an axis would become more than {most_trajectories:,}, the "
+            f"most trajectories of a map. Give a smaller one."
+        )
+    counts = {name: (_count(values) - 1) * 2**halvings + 1 for name, values in axes.items()}
+    total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
     if total <= most_trajectories and total * each <= _memory():
         return
     listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())

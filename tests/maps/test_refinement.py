@@ -109,3 +109,9 @@ def test_refinements_that_make_no_sense_are_refused():
         fj.bistability_map(scene, p=[1.0, 2.0], refine=-1)
     with pytest.raises(ValueError, match="`audit` must be at most 1"):
         fj.bistability_map(scene, p=[1.0, 2.0], refine=1, audit=2.0)
+
+
+def test_more_halvings_than_a_map_has_trajectories_are_refused(paper_scene):
+    for refine in (27, 20_000):
+        with pytest.raises(ValueError, match=f"Argument `refine` is {refine}: each interval"):
+            fj.bistability_map(paper_scene, mu=[0.1, 0.2], p=[1.0, 2.0], refine=refine)

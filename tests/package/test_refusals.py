@@ -486,6 +486,8 @@ def test_a_picture_of_unknown_kind_leaves_nothing(tmp_path):
     """An unknown kind of picture is refused before a file is opened: no empty picture stays behind."""
     with untouched(tmp_path), pytest.raises(ValueError, match="'xyz' is not supported"):
         fj.save_figure(Figure(), tmp_path / "result.xyz")
+    with pytest.raises(ValueError, match=r"must name a NetCDF file, such as `result.nc`"):
+        fj.save(DATASET, tmp_path / "result.csv")
 
 
 def test_results_are_whole_and_alone(tmp_path):
