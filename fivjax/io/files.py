@@ -96,6 +96,6 @@ def replace_whole(path: Path, content: bytes) -> Path:
     try:
         write_whole(place, content, like=_status(place))
     except OSError as error:
-        sentence = f"File `{path}` cannot be written: {error.strerror}. Make room there, or give another path"
-        raise OSError(error.errno, sentence) from error
+        # The file that could not be written, not the temporary one.
+        raise OSError(error.errno, error.strerror, str(path)) from error
     return path

@@ -358,7 +358,12 @@ def test_a_step_that_leads_where_there_is_no_return_is_halved(patient):
         return at._replace(y=y), np.ones(len(x)), jacobian
 
     maps = SimpleNamespace(
-        weights=np.ones(2), structure=SimpleNamespace(contacts=[None]), derived=derived, tangential=0, normal=0
+        jumped=lambda y: np.zeros(len(y), bool),
+        weights=np.ones(2),
+        structure=SimpleNamespace(contacts=[None]),
+        derived=derived,
+        tangential=0,
+        normal=0,
     )
     starts = np.array([[2.5, 0.0], [0.5, 0.0]])
     guess = Section(starts, np.full(2, fj.Status.DETACH, np.int32), np.ones(2))
