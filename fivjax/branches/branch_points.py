@@ -20,6 +20,13 @@ class Point(NamedTuple):
     special: Special | None = None
 
     @property
+    def is_real(self) -> bool:
+        """Whether the real motion has the contact modes with which the cycle was computed, and its events where that has
+        them.
+        """
+        return _is_real(self.real, self.place)
+
+    @property
     def name(self) -> str:
         """The kind of special point; empty for all others."""
         return "" if self.special is None else self.special.name
@@ -32,8 +39,11 @@ def seen(family: Family, curve: Curve, place: Place, special: Special | None = N
 
 
 def is_real(family: Family, place: Place) -> bool:
-    """Whether the real motion has the contact modes with which a cycle was computed, and its events where that has them."""
-    real = real_motion(family.at(place.parameter), family.stepper, place.phases)
+    """The same of a computed cycle."""
+    return _is_real(real_motion(family.at(place.parameter), family.stepper, place.phases), place)
+
+
+def _is_real(real: Real | None, place: Place) -> bool:
     return real is not None and real.has_the_modes_of(place.phases) and not risen_to_zero(place)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..foundation.progress import stage
-from .branch_points import Point, risen_to_zero, seen
+from .branch_points import Point, seen
 from .meeting_sliding import where_sliding_is_met
 from .mode_changes import change_of_modes
 from .multiple_shooting import AT_SECTION
@@ -44,7 +44,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))
         following, turned, step = ahead
         last = seen(family, curve, following)
-        if last.real is None or not last.real.has_the_modes_of(following.phases) or risen_to_zero(following):
+        if not last.is_real:
             changed = change_of_modes(family, here, tangent, step)
             if changed is None:
                 if step > 100 * SHORTEST:

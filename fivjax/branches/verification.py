@@ -55,13 +55,14 @@ def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: Real) ->
         return real.start
     # On a cycle that grazes, rounding tells what follows the touch: from elsewhere the section may come before it.
     maps = ReturnMaps.of(scene)
-    for looks in ([], range(1, LOOKS)):
-        starts = [real.start, *(_states(scene, stepper, phases, looks) if looks else [])]
-        found = maps.returns(np.zeros(len(starts), int), Section.of(*starts), 1).at
-        reached = np.flatnonzero(np.all(np.isfinite(found.y), axis=1))
-        if len(reached):
-            return found.point(int(reached[0]))
-    return None
+    return _reached(maps, [real.start]) or _reached(maps, _states(scene, stepper, phases, range(1, LOOKS)))
+
+
+def _reached(maps: ReturnMaps, starts: list[Point]) -> Point | None:
+    """The next crossing of the section from the first of these states from which there is one."""
+    found = maps.returns(np.zeros(len(starts), int), Section.of(*starts), 1).at
+    reached = np.flatnonzero(np.all(np.isfinite(found.y), axis=1))
+    return found.point(int(reached[0])) if len(reached) else None
 
 
 def _states(scene: Scene, stepper: EventExact, phases: Phases, looks: Iterable[int]) -> list[Point]:
