@@ -52,7 +52,7 @@ def determinant(matrix: Inexact[Array, "n n"]) -> Inexact[Array, ""]:
     return _repeated(n, further, (jnp.ones((), matrix.dtype), matrix))[0]
 
 
-def eliminated(matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"], xp=jnp):
+def eliminated(matrix: Inexact[Array | np.ndarray, "n n"], right: Inexact[Array | np.ndarray, "n k"], xp=jnp):
     """`solve` without its derivative; by NumPy, if that is `xp`."""
     n = matrix.shape[0]
     index = np.arange(n)

@@ -243,7 +243,7 @@ def test_starts_of_the_wrong_kind_are_refused(start, fragment):
 def test_derivatives_are_those_of_differences(cycle, multipliers):
     """In every kind of parameter, period, peak, state and multipliers move as two neighbouring cycles say."""
     steps = {"mu": 1e-5, "belt_speed": 1e-4, "k1": 1.0, "theta": 1e-6, "c1": 1e-3}
-    slopes = fj.cycle_derivatives(cycle, steps, multipliers=multipliers)
+    slopes = fj.cycle_derivatives(cycle, list(steps), multipliers=multipliers)
     for name, step in steps.items():
         value = float(cycle.scene.parameters[name])
         above, below = (fj.limit_cycle(cycle.scene.replace(**{name: value + s * step}), start=cycle) for s in (1, -1))
