@@ -150,7 +150,8 @@ class CycleMisfit(AbstractMisfit):
 
     def _touched(self, changes, landings, cycle: Cycle) -> Bool[Array, "B k"]:
         reach = BESIDE * self.apart * cycle.period
-        accelerations, velocities = self.sampled.jumping(self.channels)
+        # The mean over neighbouring phases is not the waveform's value at their middle if it jumps or bends between them.
+        accelerations, velocities = self.sampled.jumping(self.channels, slopes=True)
         near = [jnp.any(part < reach, axis=0)[:, None] for part in (changes, landings)]
         return (near[0] & accelerations) | (near[1] & velocities)
 

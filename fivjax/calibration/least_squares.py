@@ -51,11 +51,12 @@ def minimise(
     about: Any,
     tolerance: float,
     most_evaluations: int,
+    allowed: Callable[[np.ndarray], bool] = lambda _: True,
 ) -> Minimum:
     """The minimum reached from `x0`, at which identifiable combinations are within about `tolerance` standard deviations.
 
     `evaluate` takes a point, and the `about` of the best point before it (at first the argument `about`). Unknowns should be of
-    order one.
+    order one. Steps to points that are not `allowed` are refused, as those that are too long: a shorter one is tried.
     """
     from scipy.optimize import least_squares
 
@@ -67,7 +68,7 @@ def minimise(
 
     def residual(moved):
         nonlocal tried, last
-        if np.any(np.abs(moved - stayed) > LONGEST_STEP):
+        if np.any(np.abs(moved - stayed) > LONGEST_STEP) or not allowed(x0 + moved):
             return np.full_like(best.residual, np.inf)
         if not np.array_equal(moved, last):
             tried, last = evaluate(x0 + moved, best.about), np.array(moved)

@@ -73,6 +73,15 @@ class Problem(eqx.Module):
         """The scene with these parameters."""
         return self.parameters.scene(self.scene, u)
 
+    def is_scene(self, x: np.ndarray) -> bool:
+        """Whether there is a scene with these parameters: a law may refuse some together, such as a kinetic coefficient above
+        the static one."""
+        try:
+            self.at(jnp.asarray(x[: self.size]))
+        except ValueError:
+            return False
+        return True
+
     @property
     def cycles(self) -> list[CycleMisfit]:
         """The recordings of limit cycles."""

@@ -60,9 +60,10 @@ class Sampled(eqx.Module):
         response = self.response.reshape(-1, *[1] * (predicted.ndim - 1))
         return jnp.mean(jnp.fft.irfft(spectrum * response, self.count, axis=0)[self.picked], axis=1)
 
-    def jumping(self, channels: tuple[Channel, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Which channels' samples jump where an event moves past them: those with accelerations, and those with velocities."""
-        derivatives = np.array([channel.derivative for channel in channels]) - self.averages
+    def jumping(self, channels: tuple[Channel, ...], slopes: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Which channels' samples, or `slopes` of them, jump where an event moves past them: where accelerations jump, and where
+        velocities do."""
+        derivatives = np.array([channel.derivative for channel in channels]) - self.averages + slopes
         return (derivatives >= 2) & (not self.filtered), (derivatives >= 1) & (not self.filtered)
 
 

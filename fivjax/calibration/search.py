@@ -32,6 +32,8 @@ KEPT = 4
 MOST_IN_TURN, FREQUENCY_STEPS = 16, 2
 # Guesses this close in every parameter (relative) count as the same.
 ALIKE, ALIKE_CYCLES = 0.01, 0.05
+# A guess that no scene takes is moved half the way to the scene's own parameters, so many times at most.
+MOST_HALVINGS = 8
 WINDOWS = (0.15, 0.4, 1.0)
 # Distances from the minimum at which a fit stops, in standard deviations of identifiable combinations. Rounding of nearly
 # parallel modes leaves a thousandth.
@@ -56,7 +58,8 @@ class Search:
     best: Minimum
 
     def __init__(self, problem: Problem, guesses: np.ndarray, recordings: tuple[Recording, ...]):
-        self.problem, self.guesses, self.recordings = problem, guesses, recordings
+        self.problem, self.recordings = problem, recordings
+        self.guesses = [self._within(guess, guesses[0]) for guess in guesses]
         self.cycles_only = len(problem.cycles) == len(problem.misfits)
         self.count = 2 if self.cycles_only else len(WINDOWS) + 3
         self.evaluations = 0
@@ -78,6 +81,14 @@ class Search:
         yield "whole periods"
         self._other_periods()
 
+    def _within(self, guess: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """The guess, or what lies half, a quarter, … as far from the scene's own parameters, until there is such a scene."""
+        for _ in range(MOST_HALVINGS):
+            if self.problem.is_scene(guess):
+                return guess
+            guess = 0.5 * (guess + own)
+        return own
+
     def _at_measured_frequency(self) -> list[Candidate]:
         """The guesses closest to the measured limit cycles, brought to their frequency by the smallest change of parameters.
 
@@ -87,6 +98,8 @@ class Search:
         for guess in map(self.problem.first, self.guesses):
             x, about = guess, None
             for _ in range(1 + FREQUENCY_STEPS):
+                if not self.problem.is_scene(x):
+                    break
                 at = self.problem.compared(x, guess, WINDOWS[0], about)
                 self.evaluations += 1
                 if not np.isfinite(at.cost):
@@ -118,7 +131,12 @@ class Search:
         for guess in self.guesses:
             found.append(
                 minimise(
-                    lambda u, _, u0=guess: self.problem.coarse(u, u0), guess, None, EARLY_TOLERANCE, MOST_EVALUATIONS
+                    lambda u, _, u0=guess: self.problem.coarse(u, u0),
+                    guess,
+                    None,
+                    EARLY_TOLERANCE,
+                    MOST_EVALUATIONS,
+                    self.problem.is_scene,
                 )
             )
             self.evaluations += found[-1].evaluations
@@ -183,6 +201,7 @@ class Search:
                 found.at.about,
                 tolerance,
                 MOST_EVALUATIONS,
+                problem.is_scene,
             )
             self.evaluations += found.evaluations
             now = found.at.about.touched

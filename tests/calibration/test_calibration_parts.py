@@ -1,9 +1,12 @@
 """The parts of a calibration, each against something that is known: folding, noise, residual tests, least squares, covariance."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
+import fivjax as fj
 from fivjax.calibration.covariance import combinations, covariance_of
 from fivjax.calibration.cycle_misfit import BEATS
 from fivjax.calibration.folding import folded
@@ -11,6 +14,8 @@ from fivjax.calibration.goodness_of_fit import exceeds_noise, what_is_left
 from fivjax.calibration.least_squares import Evaluated, minimise
 from fivjax.calibration.noise import estimated_noise
 from fivjax.calibration.parameters import FreeParameters
+from fivjax.calibration.problem import Problem
+from fivjax.calibration.search import Search
 from tests.helpers.recordings import paper
 
 FREQUENCY = 67.456
@@ -133,6 +138,32 @@ def test_minimum_of_a_valley(start):
 def test_a_start_from_which_nothing_can_be_evaluated_does_not_arrive():
     found = minimise(rosenbrock, np.array([20.0, 1.0]), None, 1e-6, 100)
     assert not found.arrived and found.at.cost == np.inf
+
+
+def test_where_there_is_no_scene_nothing_is_evaluated():
+    """The valley's minimum lies beyond; the fit stays on this side, goes as far as 0.6, and does not claim to have arrived."""
+    seen = []
+
+    def evaluate(x, about):
+        seen.append(x[0])
+        at = rosenbrock(x, about)
+        steeper = np.array([1.0, 10.0, 1.0])  # the place along the valley is told, too
+        return Evaluated(steeper * at.residual, steeper[:, None] * at.jacobian)
+
+    found = minimise(evaluate, np.array([-1.2, 1.0]), None, 1e-6, 200, lambda x: x[0] < 0.7)
+    assert 0.6 < found.x[0] < 0.7 and max(seen) < 0.7
+    assert not found.arrived
+
+
+def test_guesses_that_a_law_refuses_are_drawn_towards_the_scene():
+    """A kinetic coefficient above the static one is halved towards the scene's own, together with the other."""
+    scene = dataclasses.replace(paper(), friction=fj.ExponentialDecay(0.3, 0.2, 0.5))
+    problem = Problem(scene, FreeParameters(scene, ["mu_static", "mu_dynamic"]), ())
+    values = [(0.3, 0.2), (0.2, 0.25), (0.4, 0.1)]
+    guesses = np.array([problem.parameters.unbounded(pair) for pair in values])
+    found = [np.asarray(problem.parameters.values(guess)) for guess in Search(problem, guesses, ()).guesses]
+    np.testing.assert_allclose(found[1], [np.sqrt(0.3 * 0.2), np.sqrt(0.2 * 0.25)])
+    np.testing.assert_allclose([found[0], found[2]], [values[0], values[2]])
 
 
 def test_every_point_is_evaluated_once():
