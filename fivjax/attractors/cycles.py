@@ -70,7 +70,7 @@ class StableCycle(NamedTuple):
 
 def stable_cycles(
     maps: ReturnMaps, motions: Motions, known: dict[int, list[StableCycle]], recurrence: Recurrence = AT_FIRST
-) -> list[tuple[int, Int, StableCycle]]:
+) -> list[tuple[int, Int[np.ndarray, " r"], StableCycle]]:
     """The stable cycles that motions are near to: of each the group, the rows that led to it, and it. Those of a group that are
     `known` are not computed anew.
     """

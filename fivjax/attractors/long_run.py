@@ -111,7 +111,8 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
     quiet[rows] = maps.returns(*run.motions.rows(rows), HOME).events == 0
-    rows = np.flatnonzero(left & further & ~quiet)
+    # Where neighbours closed in and yet there is no cycle, the motion was only regular for a time.
+    rows = np.flatnonzero(left & (further | followed.closing_in) & ~quiet)
     if len(rows):
         chaotic[rows] = long_divergence(maps, run.motions.rows(rows)).chaotic
     return Fates(chaotic, attractor, quiet, now, time, events)

@@ -179,7 +179,7 @@ from fivjax.foundation.precision import in_double_precision
 from fivjax.steppers.event_exact import EventExact
 from tests.helpers.chains import chain
 scene = chain(24, 1)
-run = in_double_precision(groups._prepared)
+run = in_double_precision(groups._prepare)
 print(np.isfinite(run(scene, EventExact(), ("mu",), np.linspace(0.1, 0.5, 64)[:, None])[-1]).all())
 """
 MAP = """
@@ -191,7 +191,7 @@ scene = chain(n, contacts)
 common = dict(t_max=0.02, progress=False)
 print(fj.bistability_map(scene, mu=[0.2, 0.3], p=np.linspace(2, 40, 3), **common).sizes)
 if contacts == 1:
-    print(fj.basins(scene, x2=[0.0, 1e-4], dx2=[0.0, 0.1], **common).sizes)
+    print(fj.basins(scene, q0=[0.0, 1e-4], dq0=[0.0, 0.1], **common).sizes)
 """
 
 
