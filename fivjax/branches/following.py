@@ -53,7 +53,10 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
                 return Followed(points, _at(family, here, "the contact modes change in a way that is not understood"))
             special, onward = changed
             if not bounds[0] <= special.place.parameter <= bounds[1]:
-                return Followed(points, _at(family, here, "the bound is reached"))
+                bound = bounds[0] if special.place.parameter < bounds[0] else bounds[1]
+                along = tangent * (bound - here.place.parameter) / (tangent[-1] * family.scale)
+                points += _at_bound(family, curve, here.place.u + along, bound)
+                return Followed(points, f"The bound {family.name} = {bound:.10g} is reached.")
             if special.curve is curve:
                 # The parameter may turn back just there.
                 passed = _specials(family, curve, here.place, tangent, special.place)
@@ -68,7 +71,8 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
         points += [point for point in passed if bounds[0] <= point.place.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
             bound = bounds[0] if following.parameter < bounds[0] else bounds[1]
-            points += _at_bound(family, curve, here.place, following, bound)
+            share = (bound - here.place.parameter) / (following.parameter - here.place.parameter)
+            points += _at_bound(family, curve, here.place.u + share * (following.u - here.place.u), bound)
             return Followed(points, f"The bound {family.name} = {bound:.10g} is reached.")
         points.append(last)
         if _smallness(curve, following) < SMALL:
@@ -107,11 +111,11 @@ def _ahead(
         step *= 0.5
 
 
-def _at_bound(family: Family, curve: Curve, here: Place, beyond: Place, bound: float) -> list[Point]:
-    """The cycle at the bound of the parameter, between two others; none if it is not found."""
-    share = (bound - here.parameter) / (beyond.parameter - here.parameter)
-    at = curve.at_parameter(here.u + share * (beyond.u - here.u), bound)
-    return [] if at is None else [seen(family, curve, at)]
+def _at_bound(family: Family, curve: Curve, guess: Float[np.ndarray, " m"], bound: float) -> list[Point]:
+    """The cycle at the bound of the parameter, near a guess; none if it is not found."""
+    at = curve.at_parameter(guess, bound)
+    found = [] if at is None else [seen(family, curve, at)]
+    return [point for point in found if point.is_real]
 
 
 def _at(family: Family, point: Point, why: str) -> str:

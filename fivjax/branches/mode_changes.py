@@ -129,7 +129,7 @@ def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, st
         found = None if change.merges else vanishing(curve, valid, phase)
         special = Special("", curve, valid) if found is None else found
         special = special._replace(name=name_of(None, change, removed=True))
-        away = _outward(family, fewer, first, away, None)
+        away = _outward(family, fewer, first, away, special.place)
     begin = special.place if special.curve is fewer else first
     for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
         onward = fewer.along(begin, away, length)
