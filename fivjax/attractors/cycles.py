@@ -74,7 +74,7 @@ def stable_cycles(
     """The stable cycles that motions are near to: of each the group, the rows that led to it, and it. Those of a group that are
     `known` are not computed anew.
     """
-    near, closed = _close_recurring(maps, motions, recurrence)
+    near, closed = close_recurring(maps, motions, recurrence)
     group, lag = motions.group, closed.crossings
     # Sliding closes upon itself as well.
     periodic = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
@@ -119,8 +119,8 @@ def stable_cycles(
     return found
 
 
-def _close_recurring(
-    maps: ReturnMaps, motions: Motions, recurrence: Recurrence
+def close_recurring(
+    maps: ReturnMaps, motions: Motions, recurrence: Recurrence = AT_FIRST
 ) -> tuple[Int[np.ndarray, " r"], Closed]:
     """The rows of motions that nearly repeat, and what Newton's method makes of each."""
     group = motions.group
@@ -144,7 +144,7 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
     found = np.zeros(len(group), bool)
     if len(maps.structure.contacts) == 1:
         return found
-    near, closed = _close_recurring(maps, motions, AT_FIRST)
+    near, closed = close_recurring(maps, motions, AT_FIRST)
     rows = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
     multipliers = np.linalg.eigvals(closed.jacobian[rows])
     found[near[rows]] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)

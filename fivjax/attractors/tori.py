@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, section_at
 from . import tube
-from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, stable_cycles
+from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, close_recurring, stable_cycles
 from .divergence import growth_rates
 from .motions import NOMINATED, Motions
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
@@ -87,6 +87,8 @@ def tori_from(
             if not tried:
                 continue
             new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
+            for row in _with_cycles_amid(maps, group, traced, new):
+                del new[row]
             found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
@@ -284,6 +286,46 @@ def _attracting_tubes(
     with np.errstate(invalid="ignore"):
         kept = np.flatnonzero((growth < CHAOTIC_FROM) & lasting & ~np.isin(np.arange(len(back)), locked))
     return dict(tubes[back[k]] for k in kept), cycles
+
+
+def _with_cycles_amid(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], tubes: dict[int, Tube]
+) -> list[int]:
+    """The rows of tubes that hold a stable cycle amid the closed curves which their motions trace: that from which a torus has
+    come, where it is stable again, or still. No start on a tube's edge need come to it.
+    """
+    rows = list(tubes)
+    if not rows:
+        return []
+    middles = [(row, one) for row in rows for one in _middles(traced[row].states)]
+    rows, own = [row for row, _ in middles], np.array([group[row] for row, _ in middles])
+    states = np.array([one for _, one in middles]) / maps.weights
+    near, closed = close_recurring(maps, Motions(own, section_at(states, maps.normal, maps.sliding[own])))
+    stable = closed.found & maps.moves(own[near], closed.at.y)
+    stable[stable] = np.max(np.abs(np.linalg.eigvals(closed.jacobian[stable])), axis=1) < 1
+    near, at, crossings = near[stable], closed.at.rows(stable), closed.crossings[stable]
+    if not len(near):
+        return []
+    _, paths = maps.path(own[near], at, int(np.max(crossings)))
+    inside = [
+        np.all(tubes[rows[k]].holds(maps.weights * path[:count]))
+        for k, path, count in zip(near, paths, crossings, strict=True)
+    ]
+    return sorted({rows[k] for k, held in zip(near, inside, strict=True) if held})
+
+
+def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]]:
+    """Middles of the closed curves about which states in order go by turns: of one curve for each number of them at which they
+    are smaller than at all lower numbers. Near a resonance a curve is made of several, smaller ones.
+    """
+    found, smallest = [], np.inf
+    for count in range(1, CROSSINGS + 1):
+        turns = states[: len(states) // count * count].reshape(-1, count, states.shape[-1])
+        spread = np.sqrt(np.mean(extent(turns) ** 2))
+        if spread < 0.9 * smallest:
+            found.append(smooth_mean(turns[:, 0]))
+            smallest = spread
+    return found
 
 
 def holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:

@@ -361,6 +361,32 @@ def test_two_tori_beside_each_other_capture_each_trajectory_alone_too(paper_scen
 
 
 @pytest.mark.slow
+def test_a_tube_with_a_stable_cycle_amid_it_is_no_proof_of_a_torus():
+    """Next to a resonance of three, motions go about a cycle that is stable once more: all from the edge of a tube came back, and
+    two thirds of these kicks, captured by it, go on to the cycle. Which attractor a kick leads to is chaos, and rounding decides.
+    """
+    scene = fj.Scene(
+        fj.belt_oscillator(
+            m1=0.38583554625745825,
+            m2=0.04242122959924401,
+            c1=0.8536239538847278,
+            c2=1.0797076696211896,
+            k1=91496.1366972192,
+            k2=99388.83108292583,
+            theta=0.04670848106657122,
+        ),
+        fj.ExponentialDecay(0.3797838746864759, 0.3016092956218166, 0.40072507451468864),
+        4.4468832562808664,
+        fj.Pulse(50.0, 3.67),
+    )
+    m = fj.bistability_map(scene, p=np.linspace(1.5, 4.0, 40), progress=False)
+    stable = fj.limit_cycle(scene)
+    assert stable.kind == "periodic"
+    assert m["attractor_kind"].values.tolist().count("torus") == 0
+    assert np.sum(np.abs(m["amplitude"].values / stable.amplitude - 1) < 1e-9) > 15
+
+
+@pytest.mark.slow
 def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_not():
     """Neighbours part by one per cent per crossing in the one and by nothing in the other; neither is a limit cycle."""
     chaos = fj.bistability_map(paper(0.6393391935903446, 9.602345607398314, **RARE), p=[0.5, 1.5], progress=False)
