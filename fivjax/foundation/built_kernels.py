@@ -113,7 +113,7 @@ class Kernel:
 
     def _launch_on_gpus(self, devices: list[str], given: list, found: tuple) -> None:
         wp = warp()
-        load(self.kernel.module, devices)
+        load(self.kernel.module, devices, own=True)
         ends = np.linspace(0, len(found[0]), len(devices) + 1).astype(int).tolist()
         launched = []
         for device, part in zip(devices, map(slice, ends, ends[1:]), strict=True):
@@ -208,5 +208,5 @@ wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else
     module = wp.get_module(f"fivjax.kernel_{name}")
     module.options.update(max_unroll=1, cpu_compiler_flags=compiler_flags(), enable_backward=False)
     kernel = wp.kernel(space["followed"], enable_backward=False, module=module)
-    load(module, ["cpu"])
+    load(module, ["cpu"], own=True)
     return kernel

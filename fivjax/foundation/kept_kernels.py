@@ -14,11 +14,16 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .kept_folder import NO_HOME, cannot_keep, folder_to_keep_in, read_own, tell
+from .standard_error import silent
 from .whole_files import own_folder
+
+# What gives headers by name, or None where there are none.
+Headers = Callable[[], dict[str, str] | None]
 
 # The folder inside Warp's, and the file with the digests of a kernel's other files.
 FOLDER, DIGESTS = "fivjax", "digests.json"
@@ -28,15 +33,15 @@ TEXTS = "texts"
 ROOM = 2**26
 
 
-def load(wp, module, names: list[str]) -> None:
-    """Load a Warp module on these devices.
+def load(wp, module, names: list[str], headers: Headers | None = None) -> None:
+    """Load a Warp module on these devices. On a CPU it is compiled with these `headers` in place of Warp's, if given.
 
     **Raises:** `OSError` where it has to be built and no temporary folder has room.
     """
     folder = _folder(Path(wp.config.kernel_cache_dir))
     missing = [name for name in names if folder is None or not _loaded(wp, module, name, folder)]
     if missing:
-        _build_and_load(wp, module, missing, folder)
+        _build_and_load(wp, module, missing, folder, headers)
 
 
 def folder_of_texts(wp) -> Path | None:
@@ -54,35 +59,54 @@ def _folder(of_warp: Path) -> Path | None:
 
 def _loaded(wp, module, name: str, folder: Path) -> bool:
     """Whether it was among what is kept."""
-    for headers_first in (True, False):
-        with _as_built(wp, module, name, headers_first):
-            place = folder / _key(wp, module, name)
-            if not _is_whole(place):
-                continue
-            try:
-                wp.load_aot_module(module, device=name, module_dir=place)
-            except Exception:  # whatever Warp raises for what it cannot load
-                continue
-            return True
-    return False
+    with _as_built(wp, module, name):
+        place = folder / _key(wp, module, name)
+        if not _is_whole(place):
+            return False
+        try:
+            wp.load_aot_module(module, device=name, module_dir=place)
+        except Exception:  # whatever Warp raises for what it cannot load
+            return False
+    return True
 
 
-def _build_and_load(wp, module, names: list[str], folder: Path | None) -> None:
+def _build_and_load(wp, module, names: list[str], folder: Path | None, headers: Headers | None) -> None:
     failures = []
     for parent in _with_room(failures, folder):
         try:
-            with own_folder(parent) as build:
-                for name in names:
-                    # Warp compiles headers first in the temporary folder, whichever the kernel is built in.
-                    with _as_built(wp, module, name, str(parent) == tempfile.gettempdir()):
-                        (binary,) = wp.compile_aot_module(module, device=name, module_dir=build / "kernel")
-                        if folder is not None:
-                            _keep(folder, _key(wp, module, name), [binary, *binary.parent.glob("*.meta")])
-                        wp.load_aot_module(module, device=name, module_dir=build / "kernel")
+            for name in names:
+                own = headers() if headers is not None and name == "cpu" else None
+                if own is None or not _built(wp, module, name, parent, folder, own):
+                    _built(wp, module, name, parent, folder)
             return
         except OSError as error:
             failures.append(f"{parent}: {error.strerror or error}")
     raise OSError(f"Kernels cannot be built, because no folder has room for that ({'; '.join(failures)})")
+
+
+def _built(wp, module, name: str, parent: Path, folder: Path | None, headers: dict[str, str] | None = None) -> bool:
+    """Build a kernel for a device, keep it and load it. False where it could not be compiled with these headers."""
+    with own_folder(parent) as build, _as_built(wp, module, name):
+        place = build / "kernel"
+        if headers is not None:
+            # Here Warp writes a kernel's code.
+            beside = build / f"kernel_p{os.getpid()}_t{threading.get_ident()}"
+            beside.mkdir()
+            for header, text in headers.items():
+                (beside / header).write_text(text, encoding="utf-8")
+        try:
+            with silent() if headers is not None else contextlib.nullcontext():
+                (binary,) = wp.compile_aot_module(module, device=name, module_dir=place)
+        except OSError:
+            raise
+        except Exception:  # whatever Warp raises for what does not compile
+            if headers is None:
+                raise
+            return False
+        if folder is not None:
+            _keep(folder, _key(wp, module, name), [binary, *binary.parent.glob("*.meta")])
+        wp.load_aot_module(module, device=name, module_dir=place)
+    return True
 
 
 def _with_room(failures: list[str], kept: Path | None) -> Iterator[Path]:
@@ -150,12 +174,12 @@ def _key(wp, module, name: str) -> str:
 
 
 @contextlib.contextmanager
-def _as_built(wp, module, name: str, headers_first: bool) -> Iterator[None]:
-    """A kernel on a CPU is compiled for blocks of one thread, and that is how it is launched there. With Warp's headers
-    compiled first, further kernels of a process are built in a third of the time.
+def _as_built(wp, module, name: str) -> Iterator[None]:
+    """A kernel on a CPU is compiled for blocks of one thread, and that is how it is launched there. To compile Warp's headers
+    first would repay from the third kernel of a process that needs them; most have headers of their own.
     """
     of_module, of_warp = module.options["block_dim"], wp.config.use_precompiled_headers
-    wp.config.use_precompiled_headers = headers_first
+    wp.config.use_precompiled_headers = False
     if name == "cpu":
         module.options["block_dim"] = 1
     # What names a kernel depends on the setting.

@@ -8,7 +8,6 @@ import ctypes.util
 import functools
 import importlib.util
 import os
-import sys
 import tempfile
 import threading
 from pathlib import Path
@@ -17,6 +16,8 @@ from typing import Any
 import jax
 
 from . import kept_kernels
+from .kernel_headers import own_headers
+from .standard_error import silent
 
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()
@@ -49,7 +50,9 @@ def _initialised():
             "This run's trajectories are followed by kernels of Warp, which is not installed here. Install it with "
             "`pip install warp-lang` on all machines of the run, or on none."
         ) from None
-    with _quietly(wp), _without_stderr():
+    # Where there is no CUDA driver, Warp's library says so on the process' standard error, whatever its settings.
+    without_driver = ctypes.util.find_library("cuda") is None
+    with _quietly(wp), silent() if without_driver else contextlib.nullcontext():
         if not _has_place(wp):
             # What Warp would take is a folder named ~ in the present one.
             wp.config.kernel_cache_dir = os.path.join("~", ".cache", "warp", wp.config.version)
@@ -103,31 +106,16 @@ def gpus_for(trajectories: int) -> list[str]:
     return gpus() if trajectories >= LEAST_ON_GPUS else []
 
 
-def load(module, names: list[str]) -> None:
-    """Compile a Warp module for these devices, or find it among the kernels that are kept."""
+def load(module, names: list[str], own: bool = False) -> None:
+    """Compile a Warp module for these devices, or find it among the kernels that are kept. The code may be all our `own`, with
+    numbers and addresses for arguments: then it needs few of Warp's headers.
+    """
     wp = warp()
     with ONE_AT_A_TIME, _quietly(wp):
         missing = [name for name in names if (module, name) not in _LOADED]
         if missing:
-            kept_kernels.load(wp, module, missing)
+            kept_kernels.load(wp, module, missing, functools.partial(own_headers, wp) if own else None)
             _LOADED.update((module, name) for name in missing)
-
-
-@contextlib.contextmanager
-def _without_stderr():
-    """Where there is no CUDA driver, Warp's library says so on the process' standard error, whatever its settings."""
-    if ctypes.util.find_library("cuda") is not None:
-        yield
-        return
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 @contextlib.contextmanager
