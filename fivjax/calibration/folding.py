@@ -25,6 +25,8 @@ MOST_HARMONICS = 8
 NEIGHBOURS = 9
 # The residuals of harmonics alone find the frequency roughly, those of neighbours exactly.
 BY_HARMONICS, BY_NEIGHBOURS = 3, 3
+# The widest that neighbours may lie, in turns, whose differences tell a beat: over more, a waveform bends.
+WIDEST = 1 / 16
 # Scatters of the noise's power that sidebands exceed.
 ABOVE_SCATTER = 5.0
 
@@ -119,14 +121,17 @@ def _correction(scaled, t, frequency: float, count: int, by_neighbours: bool) ->
 
 def _from_neighbours(samples, phases):
     """The samples less the median of their neighbours in phase, which keeps to one side of a jump."""
-    width = NEIGHBOURS + 2 * (len(samples) // 2000)
-    width = min(width, 2 * ((len(samples) - 1) // 4) + 1)
+    width = _neighbours(samples)
     order, half = np.argsort(phases, kind="stable"), width // 2
     around = np.concatenate([order[-half:], order, order[:half]])
     windows = np.lib.stride_tricks.sliding_window_view(samples[around], width, axis=0)
     left = np.empty_like(samples)
     left[order] = samples[order] - np.median(windows, axis=-1)
     return left
+
+
+def _neighbours(samples) -> int:
+    return min(NEIGHBOURS + 2 * (len(samples) // 2000), 2 * ((len(samples) - 1) // 4) + 1)
 
 
 def _between_neighbours(ordered):
@@ -142,7 +147,9 @@ def _robust(left):
 
 def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
     """How much a vibration beats: what neighbours in phase differ by, below one and a half times its frequency and above its
-    noise, relative to its fundamental."""
+    noise, relative to its fundamental. Few samples do not tell."""
+    if _neighbours(scaled) > WIDEST * len(scaled):
+        return 0.0
     left = _from_neighbours(scaled, np.mod(frequency * t, 1.0))
     spread = np.maximum(_robust(left), 1e-12)
     weight = taper(len(left))

@@ -97,7 +97,7 @@ def raise_critical_perturbation(
         print(raised)
 
     Each step computes p_crit (the first crossing in the range) and its derivatives; the result is bracketed again without
-    derivatives. The search is local: it finds the smallest change near the scene.
+    derivatives. The search is local: it finds the smallest change near the scene, or one beside it where p_crit has a kink.
 
     **Arguments:**
 
@@ -145,11 +145,18 @@ def raise_critical_perturbation(
         aim, end = apart(target, p_range[1])
         raise ValueError(f"Argument `p_range` must hold the target {aim}, but ends at {end}. Raise its upper end.")
     aim, taken, why = target * (1 + 0.5 * MET), 1, ""
+    before, beside_kink = np.inf, False
     while taken < steps:
         ahead = smallest_change(here.slopes, aim - here.p + here.slopes @ here.r, low, high) - here.r
         met = target <= here.p <= target * (1 + MET)
         length = np.linalg.norm(ahead)
-        if met and length <= SETTLED * np.linalg.norm(here.r):
+        # Where two crossings take turns as the first, slopes jump, and steps go to and fro: then straight to the target.
+        beside_kink |= bool(length > 0.9 * before and abs(aim - here.p) <= NEAR * by * first.p)
+        before = length
+        if beside_kink:
+            ahead = np.clip(here.r + (aim - here.p) * here.slopes / (here.slopes @ here.slopes), low, high) - here.r
+            length = np.linalg.norm(ahead)
+        if met and (beside_kink or length <= SETTLED * np.linalg.norm(here.r)):
             break
         promised, missing = here.slopes @ ahead, abs(aim - here.p)
         if length <= 1e-9 or (not met and abs(promised) < PROMISING * missing):

@@ -136,7 +136,8 @@ def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     names = tuple(value) if listed else ()
     if not listed or not all(isinstance(one, str) for one in names):
         raise TypeError(f'Argument `{name}` must be a list of names, such as ["{example}"], but is {describe(value)}.')
-    return names
+    # Those of an array are NumPy's own, which JAX takes for arrays.
+    return tuple(map(str, names))
 
 
 def bounds_by_name(name: str, value, example: str) -> dict:

@@ -119,7 +119,7 @@ def open(path: str | Path) -> "xr.Dataset":
 
     path = arguments.path("path", path)
     if not path.is_file():
-        raise ValueError(f"File `{path}` does not exist.")
+        raise ValueError(f"File `{path}` {'is a folder' if path.is_dir() else 'does not exist'}.")
     accessor.register()
     attributes, variables = read_netcdf(path)
     # Of damaged or hostile names, sizes and attributes, xarray makes errors of many kinds.

@@ -100,8 +100,9 @@ def description_in(dataset) -> dict:
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
         found = None
     if not isinstance(found, Mapping) or not isinstance(found.get("parameters"), Mapping):
+        has = "that of this one cannot be read" if "scene" in getattr(dataset, "attrs", ()) else "this one has none"
         raise ValueError(
-            "Argument `dataset` must carry a scene in its attributes, as what fivjax computed does; this one has none. "
+            f"Argument `dataset` must carry a scene in its attributes, as what fivjax computed does; {has}. "
             "Results of arithmetic lose them: `xarray.set_options(keep_attrs=True)` keeps them."
         )
     return dict(found)

@@ -166,6 +166,13 @@ def test_guesses_that_a_law_refuses_are_drawn_towards_the_scene():
     np.testing.assert_allclose([found[0], found[2]], [values[0], values[2]])
 
 
+def test_few_samples_do_not_tell_a_beat():
+    """Of 75 samples, neighbours in phase lie so far apart that a waveform bends between them: a steady one was said to beat."""
+    t = np.arange(75) / 600.0
+    steady = saw(FREQUENCY * t)[:, None] + 0.02 * np.random.default_rng(0).normal(size=(len(t), 2))
+    assert folded(steady, 600.0, 40.0, 110.0).sidebands == 0.0
+
+
 def test_every_point_is_evaluated_once():
     """Residual and Jacobian come from one evaluation, and each is told what belongs to the best point before it."""
     seen = []

@@ -70,3 +70,13 @@ def test_a_kick_that_no_belt_speed_raises_further_is_said():
     raised = fj.design.raise_critical_perturbation(SCENE, 0.2, ["belt_speed"], p_range=(1.0, 1.4))
     assert not raised.reached and "Widen `bounds`" in str(raised)
     assert raised.after == pytest.approx(1.190283, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_a_kink_of_the_critical_kick_is_no_end_of_the_search():
+    """Two crossings take turns as the first one, so slopes jump: steps to the smallest change went to and fro until they were used
+    up, a hundred-thousandth below the target.
+    """
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.2))
+    raised = fj.design.raise_critical_perturbation(scene, by=0.02, free=["c1", "c2"], p_range=(1.0, 1.3))
+    assert raised.reached and raised.target <= raised.after <= raised.target * (1 + 2e-6)
