@@ -4,6 +4,7 @@ import gc
 import os
 import shutil
 import tempfile
+from importlib import metadata
 
 import pytest
 
@@ -16,10 +17,10 @@ FLAGS = "XLA_FLAGS"
 # optimisations, and without parts that are compiled side by side, it takes less than half of the time. At this level LLVM would
 # choose instructions by a quick way, too (`fast-isel`), which makes wrong programs (`COMPILED_QUICKLY` in `compiling`): by the
 # thorough one the results are right. For a run as users compile, set `XLA_FLAGS`, which may be empty.
-COMPILED_FOR_TESTS = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_backend_extra_options=-fast-isel=false "
-    "--xla_cpu_parallel_codegen_split_count=1"
-)
+COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_options=-fast-isel=false --xla_cpu_parallel_codegen_split_count=1"
+# Later versions have one way only; what XLA does not know ends the process.
+if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
+    COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.

@@ -178,11 +178,12 @@ def _as_built(wp, module, name: str) -> Iterator[None]:
     """A kernel on a CPU is compiled for blocks of one thread, and that is how it is launched there. To compile Warp's headers
     first would repay from the third kernel of a process that needs them; most have headers of their own.
     """
+    if name != "cpu":
+        yield
+        return
     of_module, of_warp = module.options["block_dim"], wp.config.use_precompiled_headers
-    wp.config.use_precompiled_headers = False
-    if name == "cpu":
-        module.options["block_dim"] = 1
-    # What names a kernel depends on the setting.
+    wp.config.use_precompiled_headers, module.options["block_dim"] = False, 1
+    # What names a kernel depends on both. Until it is modified again, the module remembers the names of loaded ones.
     module.mark_modified()
     try:
         yield

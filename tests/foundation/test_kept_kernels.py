@@ -116,6 +116,22 @@ def test_kernels_of_others_and_the_settings_of_warp_stay_as_they_are(doubling, t
     assert [path.name for path in (tmp_path / "warp").iterdir()] == ["fivjax"]
 
 
+def test_a_launch_compiles_nothing_after_a_gpu_has_loaded_the_kernel(doubling, monkeypatch):
+    """Of a module that is modified Warp forgets by which settings it was built, and builds it once more."""
+    wp = warp_library.warp()
+    assert doubling.in_a_new_process() == [2.0, 5.0]
+    with kept_kernels._as_built(wp, doubling.kernel.module, "cuda:0"):
+        pass
+
+    def anew(*_, **__):
+        raise AssertionError("compiled once more")
+
+    monkeypatch.setattr(wp._src.build, "build_cpu", anew)
+    x = np.array([1.5])
+    wp.launch(doubling.kernel, dim=1, inputs=[wp.array(x, device="cpu", copy=False)], device="cpu")
+    assert x.tolist() == [3.0]
+
+
 def test_a_folder_of_others_or_a_full_disk_costs_time_only(doubling, tmp_path, monkeypatch):
     (tmp_path / "warp" / "fivjax").mkdir(parents=True)
     (tmp_path / "warp" / "fivjax").chmod(0o777)
