@@ -76,18 +76,12 @@ def stable_cycles(
     """
     near, closed = close_recurring(maps, motions, recurrence)
     group, lag = motions.group, closed.crossings
-    # Sliding closes upon itself as well.
-    periodic = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
-    if not len(periodic):
-        return []
-    _, points = maps.path(group[near[periodic]], closed.at.rows(periodic), int(np.max(lag[periodic])))
-    points = np.concatenate([closed.at.y[periodic][:, None], points], axis=1)
-    points_of = {row: points[k, : lag[row]] for k, row in enumerate(periodic)}
+    points_of = points_on(maps, group[near], closed)
     # Of those that are the same, at whichever of its crossings, the first stands for all.
     kept: list[int] = []
     rows_of: list[list[int]] = []
     alike: dict[tuple[int, int], list[int]] = {}
-    for row in periodic:
+    for row in range(len(near)):
         kind = int(group[near[row]]), int(lag[row])
         for k in alike.setdefault(kind, []):
             if _passes(maps, closed.at.y[row], points_of[kept[k]]):
@@ -122,7 +116,7 @@ def stable_cycles(
 def close_recurring(
     maps: ReturnMaps, motions: Motions, recurrence: Recurrence = AT_FIRST
 ) -> tuple[Int[np.ndarray, " r"], Closed]:
-    """The rows of motions that nearly repeat, and what Newton's method makes of each."""
+    """The rows of motions that nearly repeat and that Newton's method makes a cycle of, and the cycles."""
     group = motions.group
     last, states = maps.path(*motions, recurrence.crossings + 1)
     path = maps.weights * states  # [row, crossing, coordinate]
@@ -133,7 +127,20 @@ def close_recurring(
         lag = 1 + np.argmax(back <= np.maximum(1.5 * nearest, 1e-9)[:, None], axis=1)
         repeats = recurrence.is_met(nearest, lag)
     near = np.flatnonzero(np.isfinite(size) & maps.moves(group, states[:, -1]) & repeats)
-    return near, close(maps, group[near], last.rows(near), lag[near])
+    closed = close(maps, group[near], last.rows(near), lag[near])
+    # Sliding closes upon itself as well.
+    kept = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
+    at, *others = closed
+    return near[kept], Closed(at.rows(kept), *(part[kept] for part in others))
+
+
+def points_on(maps: ReturnMaps, group: Int[np.ndarray, " m"], closed: Closed) -> list[Float[np.ndarray, "_ 2n"]]:
+    """The states of each of these cycles on the section, in order."""
+    if not len(group):
+        return []
+    _, later = maps.path(group, closed.at, int(np.max(closed.crossings)))
+    whole = np.concatenate([closed.at.y[:, None], later], axis=1)
+    return [points[:count] for points, count in zip(whole, closed.crossings, strict=True)]
 
 
 def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
@@ -144,10 +151,9 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
     found = np.zeros(len(group), bool)
     if len(maps.structure.contacts) == 1:
         return found
-    near, closed = close_recurring(maps, motions, AT_FIRST)
-    rows = np.flatnonzero(closed.found & maps.moves(group[near], closed.at.y))
-    multipliers = np.linalg.eigvals(closed.jacobian[rows])
-    found[near[rows]] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)
+    near, closed = close_recurring(maps, motions)
+    multipliers = np.linalg.eigvals(closed.jacobian)
+    found[near] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)
     return found
 
 

@@ -14,7 +14,16 @@ from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, section_at
 from . import tube
-from .cycles import CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS, Recurrence, StableCycle, close_recurring, stable_cycles
+from .cycles import (
+    CROSSINGS,
+    MORE_CROSSINGS,
+    MOST_CROSSINGS,
+    Recurrence,
+    StableCycle,
+    close_recurring,
+    points_on,
+    stable_cycles,
+)
 from .divergence import growth_rates
 from .motions import NOMINATED, Motions
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
@@ -301,17 +310,9 @@ def _with_cycles_amid(
     rows, own = [row for row, _ in middles], np.array([group[row] for row, _ in middles])
     states = np.array([one for _, one in middles]) / maps.weights
     near, closed = close_recurring(maps, Motions(own, section_at(states, maps.normal, maps.sliding[own])))
-    stable = closed.found & maps.moves(own[near], closed.at.y)
-    stable[stable] = np.max(np.abs(np.linalg.eigvals(closed.jacobian[stable])), axis=1) < 1
-    near, at, crossings = near[stable], closed.at.rows(stable), closed.crossings[stable]
-    if not len(near):
-        return []
-    _, paths = maps.path(own[near], at, int(np.max(crossings)))
-    inside = [
-        np.all(tubes[rows[k]].holds(maps.weights * path[:count]))
-        for k, path, count in zip(near, paths, crossings, strict=True)
-    ]
-    return sorted({rows[k] for k, held in zip(near, inside, strict=True) if held})
+    stable = np.max(np.abs(np.linalg.eigvals(closed.jacobian)), axis=1) < 1
+    found = zip((rows[k] for k in near), stable, points_on(maps, own[near], closed), strict=True)
+    return sorted({row for row, attracts, y in found if attracts and np.all(tubes[row].holds(maps.weights * y))})
 
 
 def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]]:

@@ -53,10 +53,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
                 return Followed(points, _at(family, here, "the contact modes change in a way that is not understood"))
             special, onward = changed
             if not bounds[0] <= special.place.parameter <= bounds[1]:
-                bound = bounds[0] if special.place.parameter < bounds[0] else bounds[1]
-                along = tangent * (bound - here.place.parameter) / (tangent[-1] * family.scale)
-                points += _at_bound(family, curve, here.place.u + along, bound)
-                return Followed(points, f"The bound {family.name} = {bound:.10g} is reached.")
+                return _to_bound(family, points, here, tangent, special.place, bounds)
             if special.curve is curve:
                 # The parameter may turn back just there.
                 passed = _specials(family, curve, here.place, tangent, special.place)
@@ -70,10 +67,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
         passed = _specials(family, curve, here.place, tangent, following)
         points += [point for point in passed if bounds[0] <= point.place.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
-            bound = bounds[0] if following.parameter < bounds[0] else bounds[1]
-            share = (bound - here.place.parameter) / (following.parameter - here.place.parameter)
-            points += _at_bound(family, curve, here.place.u + share * (following.u - here.place.u), bound)
-            return Followed(points, f"The bound {family.name} = {bound:.10g} is reached.")
+            return _to_bound(family, points, here, following.u - here.place.u, following, bounds)
         points.append(last)
         if _smallness(curve, following) < SMALL:
             end = where_sliding_is_met(family, last)
@@ -111,11 +105,24 @@ def _ahead(
         step *= 0.5
 
 
-def _at_bound(family: Family, curve: Curve, guess: Float[np.ndarray, " m"], bound: float) -> list[Point]:
-    """The cycle at the bound of the parameter, near a guess; none if it is not found."""
-    at = curve.at_parameter(guess, bound)
-    found = [] if at is None else [seen(family, curve, at)]
-    return [point for point in found if point.is_real]
+def _to_bound(
+    family: Family,
+    points: list[Point],
+    here: Point,
+    along: Float[np.ndarray, " m"],
+    beyond: Place,
+    bounds: tuple[float, float],
+) -> Followed:
+    """The points up to a bound of the parameter, which lies between a point and what is `beyond` it in the direction `along`:
+    with the cycle at the bound, if it is found.
+    """
+    bound = bounds[0] if beyond.parameter < bounds[0] else bounds[1]
+    share = (bound - here.place.parameter) / (along[-1] * family.scale)
+    at = here.curve.at_parameter(here.place.u + share * along, bound)
+    last = [] if at is None else [seen(family, here.curve, at)]
+    return Followed(
+        points + [point for point in last if point.is_real], f"The bound {family.name} = {bound:.10g} is reached."
+    )
 
 
 def _at(family: Family, point: Point, why: str) -> str:

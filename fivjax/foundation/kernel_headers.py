@@ -10,24 +10,8 @@ from pathlib import Path
 BEGIN = "static constexpr int LAUNCH_MAX_DIMS"
 END = "template <int N> inline CUDA_CALLABLE_DEVICE void tid(int& i, int& j, size_t index"
 # Functions that Warp calls as C does, of one number and of two.
-OF_ONE = (
-    "sqrt",
-    "cbrt",
-    "exp",
-    "log",
-    "erf",
-    "erfc",
-    "sin",
-    "cos",
-    "tan",
-    "asin",
-    "acos",
-    "atan",
-    "sinh",
-    "cosh",
-    "tanh",
-)
-OF_ONE += ("floor", "ceil", "round", "rint")
+ANGLES = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
+OF_ONE = (*ANGLES, "sqrt", "cbrt", "exp", "log", "erf", "erfc", "floor", "ceil", "round", "rint")
 OF_TWO = ("pow", "atan2")
 
 

@@ -1,11 +1,13 @@
 """Kernels are compiled with a few headers of fivjax's own, and with Warp's where those do not serve."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fivjax.foundation import kept_kernels, kernel_headers, warp_library
+from fivjax.foundation import cpp_numbers, kept_kernels, kernel_headers, warp_library
 from fivjax.foundation.kernel_functions import KernelFunction
 
 wp = pytest.importorskip("warp")
@@ -47,6 +49,14 @@ def test_where_they_do_not_serve_warps_own_do_without_a_word(compiled_with, monk
     np.testing.assert_allclose(sines(factor), np.sin([0.5 * factor, 2 * factor]), rtol=1e-15)
     assert compiled_with == ([["builtin.h"], None] if headers else [None])
     assert capfd.readouterr().err == ""
+
+
+def test_all_functions_that_code_may_call_are_in_them():
+    """A name that is missing would not fail: each kernel with it would be compiled with Warp's headers, slowly."""
+    called = set(re.findall(r"wp::(\w+)\(", " ".join(cpp_numbers.BY_NUMBER.values())))
+    assert len(called) > 15
+    text = kernel_headers.own_headers(warp_library.warp())["builtin.h"]
+    assert called <= set(re.findall(r"inline double (\w+)\(", text))
 
 
 def test_a_warp_that_looks_otherwise_keeps_its_own(monkeypatch, tmp_path):
