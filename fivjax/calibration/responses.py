@@ -2,22 +2,27 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from ..contact import Mechanics, State
+from ..contact import Contact, Mechanics, State, status_from_forces
+from ..foundation.carried import depending_on
+from ..foundation.kernel_functions import KernelFunction
 from ..foundation.matrix_factors import exponential
-from ..io.recordings import Channel
+from ..foundation.polynomial import value_and_rate
+from ..io.recordings import QUANTITIES, Channel
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import free_in_sliding
-from ..simulation.jump_instants import begun_at, load_before, moment
-from ..simulation.rows import begun
-from ..steppers.base import AbstractStepper
-from ..steppers.core import Segment, follow
+from ..simulation.jump_instants import begun_at, load_from, next_jump
+from ..steppers.base import MOST_ADVANCES, AbstractStepper
+from ..steppers.core import next_part
 from ..steppers.event_exact import for_derivatives
-from .inside import channels_inside, jumps
+from ..steppers.kernel_scope import has_kernel
+from .inside import advance_with_channels, jumps, terms_of
 from .samples import Sampled
 
 
@@ -39,84 +44,135 @@ def through_events(
     channels: tuple[Channel, ...],
 ) -> Response:
     """The response from `y0` at time 0, or else from steady sliding, for blocks that begin at `begin` (s)."""
-    mechanics, edges = Mechanics(scene), sampled.edges(begin)
-    method = for_derivatives(method)
-    blocks, points, width = sampled.count, sampled.per_block, sampled.width
-    start = jax.lax.stop_gradient(jnp.minimum(edges[0], 0.0))
-    if y0 is not None:
-        start = jnp.zeros(())
+    edges = sampled.edges(begin)
+    places, points, first_half = _rows_of_a_block(sampled)
+    instants = jnp.append(0.0, (jnp.arange(sampled.count)[:, None] + places).ravel()) * sampled.width
+    how = ResponseAsked(for_derivatives(method), channels, sampled.averages)
+    _, (values, *events) = _sampling((scene, y0, edges[0], how), instants, by_kernel=has_kernel(scene, method))
+    if sampled.averages:
+        # A mean over a block is a difference between its ends.
+        means = jnp.diff(values[:: len(places)], axis=0) / sampled.width
     else:
+        means = jnp.mean(values[1:].reshape(sampled.count, len(places), -1)[:, points], axis=1)
+    # The first row is the beginning of the first block.
+    contacts, landings = (_near(own[1:].reshape(sampled.count, -1), first_half) for own in events)
+    return Response(means, contacts, landings, _near_jumps(scene, edges))
+
+
+def _rows_of_a_block(sampled: Sampled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where in a block (in shares of its length) its rows are, which of them are samples, and which end in its first half."""
+    samples = [] if sampled.averages else [(k + 0.5) / sampled.per_block for k in range(sampled.per_block)]
+    places = np.array(sorted({*samples, 0.5, 1.0}))
+    return places, np.flatnonzero(np.isin(places, samples)), places <= 0.5
+
+
+def _near(events: Bool[Array, "b r"], first_half: np.ndarray) -> Bool[Array, " b"]:
+    """Blocks with an event, and those with one in the nearer half of a neighbour, where it may lie for another guess."""
+    begin, end = jnp.any(events[:, first_half], axis=1), jnp.any(events[:, ~first_half], axis=1)
+    none = jnp.zeros(1, bool)
+    return begin | end | jnp.concatenate([none, end[:-1]]) | jnp.concatenate([begin[1:], none])
+
+
+class ResponseAsked(eqx.Module):
+    """How a response is followed and what of it is kept, fixed when it is traced."""
+
+    method: AbstractStepper = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    averages: bool = eqx.field(static=True)
+
+    @property
+    def along(self) -> tuple[Channel, ...]:
+        """What is followed: for averages, that whose changes they are; of a displacement, its integral."""
+        if not self.averages:
+            return self.channels
+        return tuple(Channel(QUANTITIES[max(one.derivative - 1, 0)], one.coordinate) for one in self.channels)
+
+
+class _Step(NamedTuple):
+    """One step of a motion: the series of what is followed, and its end."""
+
+    t: Float[Array, ""]  # s
+    terms: Float[Array, "c k"]
+    unit: Float[Array, ""]  # of their time, s
+    contact: Contact
+    end: Float[Array, ""]  # s
+    y_end: State
+    contact_end: Contact
+    sums: Float[Array, " k"]  # integrals up to its end
+    # Since the last row.
+    taken: Int[Array, ""]
+    changed: Bool[Array, ""]
+    landed: Bool[Array, ""]
+
+
+def _sample(args, instants: Float[Array, " q"]):
+    """What is followed at instants (s) that rise, after the beginning of the first block; and whether a contact has changed its
+    mode since the instant before, and whether one has landed.
+    """
+    scene, y0, edge, how = args
+    method, mechanics = how.method, Mechanics(scene)
+    summed = np.array([how.averages and one.derivative == 0 for one in how.channels])
+    at_rest = y0 is None
+    start = jax.lax.stop_gradient(jnp.minimum(edge, 0.0)) if at_rest else jnp.zeros_like(edge)
+    if at_rest:
         q, _ = steady_sliding(scene, scene.load.force)
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
-    # Stretches end at the blocks' edges and at the load's jumps; one outside has no effect, not even on a derivative.
-    inside = (scene.load.jumps >= start) & (scene.load.jumps <= edges[-1])
-    ends = jnp.where(inside, scene.load.jumps, jax.lax.stop_gradient(jnp.clip(scene.load.jumps, start, edges[-1])))
-    ends = jnp.sort(jnp.concatenate([edges, ends]))
-    # Not `maximum`, which halves the derivative of one exactly at the start.
-    ends = jnp.where(ends < start, start, ends)
-    nothing_yet = jnp.zeros(len(channels)), jnp.zeros((2, 3), bool)
+    contact = status_from_forces(mechanics, load_from(scene, start), y0)
+    first = begun_at(scene, mechanics, contact, y0, start)
 
-    def adding(t, block):
-        """Adds a segment of the stretch that begins at `t` (s), in this block."""
-        samples = edges[block] + width * (jnp.arange(points) + 0.5) / points
-        # Rounding must not put a sample at the start before it.
-        samples = jnp.where(jnp.abs(samples - start) < 1e-6 * width, start, samples) - t
+    def step(now: _Step, instant) -> _Step:
+        t, until = now.end, next_jump(scene, now.end)
+        if not method.chooses_its_steps:
+            until = jnp.minimum(until, instant)
+        part, is_last = next_part(until - t, method.dt)
+        load = load_from(scene, t)
+        after, terms, unit = advance_with_channels(method, mechanics, now.contact_end, load, now.y_end, part, how.along)
+        if how.averages:
+            integral = jnp.concatenate([now.sums[None], terms * (unit / jnp.arange(1, len(terms) + 1))[:, None]])
+            terms = jnp.where(summed, integral, jnp.pad(terms, ((0, 1), (0, 0))))
+        sums = value_and_rate(terms, unit, after.h)[0]
+        end = jnp.where(is_last & (after.h >= until - t), until, t + after.h)
+        changed, landed = jumps(now.contact, now.contact_end)
+        changed, landed = now.changed | changed, now.landed | landed
+        return _Step(t, terms, unit, now.contact_end, end, after.y, after.contact, sums, now.taken + 1, changed, landed)
 
-        def add(total, segment: Segment):
-            sums, near = total
-            if sampled.averages:
-                gained = _integrals(method, mechanics, segment, channels) / width
-            else:
-                here = (samples >= segment.t) & (samples < segment.t + segment.after.h)
-                times = jnp.where(here, samples - segment.t, 0.0)
-                found = channels_inside(method, mechanics, segment, times, channels)
-                gained = jnp.sum(jnp.where(here[:, None], found, 0.0), axis=0) / points
-            # An event near the edge of a block may lie in its neighbour for another guess.
-            place = (t + segment.t + segment.after.h - edges[block]) / width
-            sides = jnp.array([place < 0.5, True, place >= 0.5])
-            return sums + gained, near | (jnp.stack(jumps(segment))[:, None] & sides)
+    def row(carry, instant):
+        now, begun = carry
+        instant = edge + instant
 
-        return add
+        def going(carry):
+            now, begun = carry
+            # A sample at a jump of the load is the one just after it; an average ends before it.
+            before = now.end < instant if how.averages or not method.chooses_its_steps else now.end <= instant
+            return (before | ~begun) & (now.taken < MOST_ADVANCES)
 
-    def to_next(carry, stretch):
-        y, contact = carry
-        t, end, block = stretch
-        load, add = scene.load(0.5 * (t + end)), adding(t, block)
-        after = follow(method, mechanics, contact, load, y, end - t, total=nothing_yet, observe=add, kind="lax")
-        y = jnp.where(after.enough, after.y, jnp.nan)
+        now, begun = jax.lax.while_loop(going, lambda carry: (step(carry[0], instant), carry[1] | True), (now, begun))
+        value, _ = value_and_rate(now.terms, now.unit, instant - now.t)
+        reached = now.end >= instant
+        seen = jnp.where(reached, value, jnp.nan), now.changed, now.landed
+        none = jnp.zeros((), bool)
+        # A motion that has failed goes no further.
+        now = now._replace(taken=jnp.where(reached, 0, now.taken), changed=none, landed=none)
+        return (now, begun), seen
 
-        def at_once():
-            still = moment(mechanics, contact, load_before(scene, end), after.y, end - t)
-            return still.after.y, add(nothing_yet, still)
-
-        y, total = jax.lax.cond(end > t, lambda: (y, after.total), at_once)
-        return (y, after.contact), total
-
-    contact, _ = begun(scene, y0, jnp.stack([start, edges[-1]]), None)
-    block = jnp.searchsorted(edges, 0.5 * (jnp.append(start, ends[:-1]) + ends), side="right") - 1
-    first = begun_at(scene, mechanics, contact, y0, start, nothing_yet, adding(start, block[0]))
-    stretches = jnp.append(first.t, ends[:-1]), ends, block
-    _, (sums, near) = jax.lax.scan(to_next, (first.y, contact), stretches)
-    sums = sums.at[0].add(first.total[0])
-    within = (block >= 0) & (block < blocks)
-    place = jnp.where(within, block, blocks)
-    means = jnp.zeros((blocks + 1, len(channels))).at[place].add(sums)[:blocks]
-    # One more at each side, for what is near the first and the last block.
-    beside = jnp.zeros((blocks + 2, 2), bool)
-    for side in (0, 1, 2):
-        beside = beside.at[jnp.where(within, block + side, blocks + 1)].max(near[:, :, side] & within[:, None])
-    near = beside[1:-1]
-    return Response(means, near[:, 0], near[:, 1], _near_jumps(scene, edges))
+    none, terms = jnp.zeros((), bool), jnp.zeros((terms_of(method) + how.averages, len(how.channels)))
+    begin = _Step(
+        t=first.t,
+        terms=terms,
+        unit=jnp.ones_like(first.t),
+        contact=contact,
+        end=first.t,
+        y_end=first.y,
+        contact_end=contact,
+        sums=jnp.zeros(len(how.channels)),
+        taken=jnp.zeros((), jnp.int32),
+        changed=none,
+        landed=none,
+    )
+    return (), jax.lax.scan(row, (depending_on((scene, y0, edge), begin), none), instants)[1]
 
 
-def _integrals(method, mechanics, segment: Segment, channels: tuple[Channel, ...]) -> Float[Array, " k"]:
-    """Integrals of the channels over a segment and the impulse at its end."""
-    n = segment.y.shape[0] // 2
-    change = segment.after.y - segment.y
-    within = method.within(mechanics, segment.contact, segment.load, segment.y, segment.after.h)
-    area = within.weights @ within.states[:, :n]
-    found = [area[i] if q == "displacement" else change[i + n * (q == "acceleration")] for q, i in channels]
-    return jnp.stack(found)
+_sampling = KernelFunction(_sample)
 
 
 def sliding_throughout(

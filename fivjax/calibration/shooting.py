@@ -32,10 +32,10 @@ from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from ..steppers.base import MOST_ADVANCES, AbstractStepper, Within
-from ..steppers.core import Segment, advanced, follow
+from ..steppers.core import Segment, follow, left_after, next_part
 from ..steppers.event_exact import for_derivatives
 from ..steppers.kernel_scope import has_kernel
-from .inside import channel_series, jumps, terms_of
+from .inside import advance_with_channels, jumps, terms_of
 
 # A motion is followed for so many periods before it counts as nearly periodic.
 SETTLING_PERIODS = 80
@@ -174,7 +174,7 @@ def _once_around(args, _):
         end = segment.t + segment.after.h
         turns = 2 * jnp.pi * jnp.arange(1, count + 1) * (end / cycle.period)
         impulses = impulses + jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)[..., None] * jump
-        changed, landed = jumps(segment)
+        changed, landed = jumps(segment.contact, segment.after.contact)
         end, here = jax.lax.stop_gradient(end), (jnp.arange(MOST_EVENTS) == seen) & changed
         changes, landings = jnp.where(here, end, changes), jnp.where(here & landed, end, landings)
         lines = lines + _integrals(within, segment.t, cycle.period, count)
@@ -224,10 +224,10 @@ def _channels_along(args, instants: Float[Array, " q"]):
     mechanics, load, period = Mechanics(scene), scene.load.final, jax.lax.stop_gradient(cycle.period)
 
     def step(now: _Step) -> _Step:
-        after, left = advanced(how.method, mechanics, now.contact, load, now.y, now.left)
-        segment = Segment(period - now.left, load, now.contact, now.y, after)
-        terms, unit = channel_series(how.method, mechanics, segment, how.channels)
-        return _Step(segment.t, terms, unit, after.y, after.contact, left, now.taken + 1)
+        part, is_last = next_part(now.left, how.method.dt)
+        after, terms, unit = advance_with_channels(how.method, mechanics, now.contact, load, now.y, part, how.channels)
+        left = left_after(after, now.left, is_last)
+        return _Step(period - now.left, terms, unit, after.y, after.contact, left, now.taken + 1)
 
     def row(now: _Step, instant):
         def going(now: _Step):

@@ -29,6 +29,18 @@ class Begun(eqx.Module, Generic[Total]):
     total: Total
 
 
+def next_jump(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+    """The first jump of the load after an instant (s); infinite where there is none."""
+    jumps = scene.load.jumps
+    return jnp.min(jnp.where(jumps > t, jumps, jnp.inf), initial=jnp.inf)
+
+
+def load_from(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+    """The load (N) from an instant (s) up to its next jump."""
+    until = next_jump(scene, t)
+    return scene.load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
+
+
 def load_before(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
     """The load (N) from the last jump before an instant (s) up to it."""
     jumps = scene.load.jumps

@@ -24,7 +24,7 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
-from .jump_instants import Begun, begun_at
+from .jump_instants import Begun, begun_at, load_from, next_jump
 from .rows import grown, settled
 
 
@@ -140,7 +140,7 @@ def _followed(args, instants, method: EventExact):
 def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:
     """A step of no length at the start."""
     none, no = jnp.zeros((), y0.dtype), jnp.zeros((), jnp.int32)
-    load = _load_from(scene, none)
+    load = load_from(scene, none)
     contact = physics.status_from_forces(mechanics, load, y0)
     ledger = None if accounts_of is None else accounts.open_ledger(accounts_of, y0)
     series = jnp.zeros((method.order_ + 1, y0.shape[0]), y0.dtype).at[0].set(y0)
@@ -170,21 +170,10 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
     return depending_on((scene, method), begin)
 
 
-def _load_from(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
-    """The load from an instant up to its next jump."""
-    until = _next_jump(scene, t)
-    return scene.load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
-
-
-def _next_jump(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
-    jumps = scene.load.jumps
-    return jnp.min(jnp.where(jumps > t, jumps, jnp.inf), initial=jnp.inf)
-
-
 def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_of, now: Step) -> Step:
     t, y, contact = now.end, now.y_end, now.contact_end
-    until = _next_jump(scene, t)
-    load = _load_from(scene, t)
+    until = next_jump(scene, t)
+    load = load_from(scene, t)
     part, is_last = next_part(until - t, method.dt)
     # The ledger counts crossings of the section.
     after, states, unit = method.with_series(mechanics, contact, load, y, part, accounts_of is not None)
