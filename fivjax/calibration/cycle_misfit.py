@@ -174,7 +174,7 @@ def _referred(lines: Complex[Array, "h k"]) -> Complex[Array, "h k"]:
 
 def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene) -> CycleMisfit:
     """A recording of a limit cycle, folded into one period, ready to be compared."""
-    modes, interval = sliding_frequencies(scene, recording), 1 / recording.rate
+    modes, interval = sliding_frequencies(scene.replace(**recording.known)), 1 / recording.rate
     # Around the sliding modes, because a guess with a spring wrong by 30 % has a frequency wrong by 16 %.
     fold = folded(recording.values, recording.rate, 0.6 * modes.min(), 1.6 * modes.max(), recording.noise)
     noise = np.maximum(fold.noise, LEAST_NOISE * recording.values.std(axis=0) + 1e-300)

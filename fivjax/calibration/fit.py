@@ -15,7 +15,6 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import following, stage, tick
 from ..io.recordings import SHORTEST, Averaged, Recording, averaged
-from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, refuse_vector_contacts, sliding_equilibrium
 from ..model.sliding import contact_coordinates
 from ..simulation.start import start_state
@@ -152,8 +151,7 @@ def calibrate(
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:
     """Recording k averaged over blocks; refused if there are too few."""
-    modes = np.linalg.eigvals(np.asarray(linear_sliding(scene).matrix))
-    own = BLOCKS_PER_PERIOD * float(np.abs(modes.imag).max()) / (2 * np.pi) if rate is None else rate
+    own = BLOCKS_PER_PERIOD * float(sliding_frequencies(scene).max(initial=0.0)) if rate is None else rate
     if round(recording.rate / own) > len(recording.t):
         raise ValueError(
             f"Recording {k} is too short: not one block at {own:g} per second. Raise `rate`, or record for longer."

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact
-from ..io.recordings import Recording
+from ..foundation.numpy_evaluation import by_numpy
 from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 
@@ -82,11 +82,16 @@ class AbstractMisfit(eqx.Module):
         cycle a pair of a guess of the cycle and that."""
 
 
-def sliding_frequencies(scene: Scene, recording: Recording) -> Float[np.ndarray, " m"]:
-    """Frequencies of the sliding modes, in Hz, with the parameters known for a run."""
-    modes = np.linalg.eigvals(np.asarray(linear_sliding(scene.replace(**recording.known)).matrix))
+def sliding_frequencies(scene: Scene) -> Float[np.ndarray, " m"]:
+    """Frequencies of the sliding modes, in Hz."""
+    modes = np.linalg.eigvals(np.asarray(_sliding_matrix(scene)))
     modes = np.abs(modes.imag) / (2 * np.pi)
     return modes[modes > 0]
+
+
+@by_numpy
+def _sliding_matrix(scene: Scene):
+    return linear_sliding(scene).matrix
 
 
 def window(edges, share) -> Float[Array, " B"]:
