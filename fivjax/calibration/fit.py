@@ -23,6 +23,7 @@ from ..steppers.event_exact import EventExact
 from .conclusion import concluded, not_tried
 from .cycle_misfit import BEATS, MOST_APART, misfit_of_cycle
 from .initial_guesses import latin_hypercube, near_frequencies
+from .misfit import sliding_frequencies
 from .parameters import FreeParameters, refuse_one_for_each_contact
 from .problem import Problem
 from .result import Calibration, FitOutcome
@@ -151,12 +152,14 @@ def calibrate(
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:
     """Recording k averaged over blocks; refused if there are too few."""
-    own = BLOCKS_PER_PERIOD * float(sliding_frequencies(scene).max(initial=0.0)) if rate is None else rate
-    if round(recording.rate / own) > len(recording.t):
+    if rate is None:
+        fastest = float(sliding_frequencies(scene).max(initial=0.0))
+        rate = BLOCKS_PER_PERIOD * fastest if fastest > 0 else recording.rate
+    if round(recording.rate / rate) > len(recording.t):
         raise ValueError(
-            f"Recording {k} is too short: not one block at {own:g} per second. Raise `rate`, or record for longer."
+            f"Recording {k} is too short: not one block at {rate:g} per second. Raise `rate`, or record for longer."
         )
-    block = averaged(recording, own)
+    block = averaged(recording, rate)
     if len(block.means) < 2 * parameters + 8:
         raise ValueError(
             f"Recording {k} is too short: {len(block.means)} blocks at {1 / np.diff(block.edges[:2])[0]:g} per second for "
