@@ -108,6 +108,8 @@ def _outcome(search: Search, problem: Problem, left: WhatIsLeft, models) -> FitO
         return FitOutcome.NO_SIGNAL
     if any(np.mean(np.asarray(m.kept)) < LEAST_KEPT for m in problem.misfits):
         return FitOutcome.TOO_SLOW
+    if problem.cycles and not np.isfinite(search.best.at.cost):
+        return FitOutcome.NO_CYCLE
     if np.isfinite(search.best.at.cost) and not left.is_noise and _share_left(problem, models) > MOST_LEFT:
         return FitOutcome.DOES_NOT_FIT
     if not search.best.arrived:

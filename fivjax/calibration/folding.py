@@ -19,7 +19,7 @@ from .noise import rounding, taper
 
 # The most groups: of phases, many, so that few samples lie beside a jump; and of times. Four of these tell the frequency with
 # nearly the error of all samples: the mean square of their times is 15/16 of that of all.
-PHASES, TIMES = 512, 4
+PHASES, TIMES = 2048, 4
 MOST_HARMONICS = 8
 # Neighbours in phase whose median is the waveform; more of them where there are many samples.
 NEIGHBOURS = 9

@@ -20,6 +20,9 @@ LAGS = 16
 IMPROBABLE = 1e-6
 # What is left of a recording without noise is rounding, which is alike from block to block.
 ROUNDING = 1e-6
+# Where the noise is estimated from the recording, so little of its power may be the estimate's own: a waveform without noise
+# bends from sample to sample.
+OF_ESTIMATE = 1e-2
 
 
 class WhatIsLeft(NamedTuple):
@@ -52,7 +55,8 @@ def what_is_left(
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
-    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > ROUNDING]
+    least = ROUNDING if stated else OF_ESTIMATE
+    found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > least]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
     return WhatIsLeft(
         misfit=misfit,

@@ -27,6 +27,11 @@ class FitOutcome(enum.StrEnum):
         "and correct or free what differs from the scene"
     )
     NOT_CONVERGED = "not converged: the last fit ran out of steps; start closer, free fewer parameters or set bounds"
+    NO_CYCLE = (
+        "not fitted: from no guess of the parameters does a limit cycle close near the measured frequency; start from "
+        "parameters at which the scene vibrates as recorded (`fj.limit_cycles` finds all of a scene's cycles), or record how "
+        "the vibration starts, as a kick"
+    )
     NO_SIGNAL = "no signal: what was recorded does not stand out of the noise, so it tells nothing about the parameters"
     BEATS = (
         "not fitted: a recording of a limit cycle does not repeat, it beats or has not settled, so it has no harmonics to "

@@ -43,6 +43,8 @@ SETTLING_PERIODS = 80
 LOOKS = 48
 # The shortest and the longest period tried, relative to the expected one.
 SHORTEST, LONGEST = 0.6, 1.7
+# A motion returns to itself if it comes as close as this, relative to its size.
+CLOSED = 0.02
 # The most contact events in a period beside which samples can be told.
 MOST_EVENTS = 64
 
@@ -107,35 +109,50 @@ class PeriodAsked(eqx.Module):
 
 
 def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
-    """A guess of the limit cycle under the final load: the motion that starts with 0.9 of the belt's speed, after it has
-    settled.
+    """A guess of the limit cycle under the final load: of the motions from a few starts, after they have settled, the one that
+    returns closest to `frequency` (Hz) among those that return to themselves.
 
-    Its state where the tangential velocity rises through zero, and the time, near 1/`frequency` (Hz), after which it is closest
-    to that state again.
+    Its state where the tangential velocity rises through zero, and the time after which it is closest to that state again.
     """
-    n, tangential = scene.structure.size, first_tangential(scene.structure)
-    longest = int(LONGEST * LOOKS) + 1
-    instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 1) / LOOKS) / frequency
-    _, (states, contacts) = _settling((scene, PeriodAsked(method)), instants, by_kernel=has_kernel(scene, method))
-    speed = states[:, n + tangential]
-    rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
-    begin = jnp.argmax(rises) + 1
-    y = states[begin]
-    apart = jnp.sum((scene.structure.weights * (states - y)) ** 2, axis=1)
-    later = jnp.arange(states.shape[0]) - begin
-    tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS)
-    back = jnp.argmin(jnp.where(tried & jnp.isfinite(apart), apart, jnp.inf))
-    # A motion that has died out is no cycle.
-    moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.max(jnp.abs(scene.belt_speed)))
-    period = jnp.where(moves, (back - begin) / (LOOKS * frequency), jnp.nan)
-    return Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
+    n, tangential, longest = scene.structure.size, first_tangential(scene.structure), int(LONGEST * LOOKS) + 1
+    instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 2) / LOOKS) / frequency
+    q, _ = steady_sliding(scene, scene.load.final)
+    normal = jnp.asarray(np.isin(np.arange(n), contact_coordinates(scene.structure)[1]))
+    along = jnp.arange(n) == tangential
+    # All kicks away from the belt.
+    kicks = jnp.stack([0.9 * along, -2.0 * along, jnp.full(n, 2.0), jnp.where(normal, 2.0, -2.0)])
+    starts = jax.vmap(lambda v: jnp.concatenate([q, jnp.max(jnp.abs(scene.belt_speed)) * v]))(kicks)
+
+    def from_one(y0):
+        args = scene, y0, PeriodAsked(method)
+        _, (states, contacts) = _settling(args, instants, by_kernel=has_kernel(scene, method))
+        speed = states[:, n + tangential]
+        rises = (speed[: longest - 1] < 0) & (speed[1:longest] >= 0)
+        begin = jnp.argmax(rises) + 1
+        # The distance from the line between two looks, which are farther apart than a closed motion is from itself.
+        y, scale = states[begin], scene.structure.weights
+        gap, way = scale * (states[:-1] - y), scale * jnp.diff(states, axis=0)
+        length = jnp.sum(way**2, axis=1)
+        share = jnp.clip(-jnp.sum(gap * way, axis=1) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        distance = jnp.sqrt(jnp.sum((gap + share[:, None] * way) ** 2, axis=1))
+        later = jnp.arange(len(gap)) - begin
+        tried = (later >= SHORTEST * LOOKS) & (later <= LONGEST * LOOKS) & jnp.isfinite(distance)
+        back = jnp.argmin(jnp.where(tried, distance, jnp.inf))
+        # A motion that has died out is no cycle.
+        moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.max(jnp.abs(scene.belt_speed)))
+        period = jnp.where(moves, (back + share[back] - begin) / (LOOKS * frequency), jnp.nan)
+        returns = distance[back] < CLOSED * jnp.max(jnp.where(tried, distance, 0.0))
+        off = jnp.abs(period * frequency - 1.0) + jnp.where(returns, 0.0, LONGEST)
+        return jnp.where(moves, off, jnp.inf), Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
+
+    off, cycles = jax.vmap(from_one)(starts)
+    nearest = jnp.argmin(off)
+    return jax.tree.map(lambda leaf: leaf[nearest], cycles)
 
 
 def _settle(args, instants: Float[Array, " q"]):
-    scene, how = args
-    mechanics, load, n = Mechanics(scene), scene.load.final, scene.structure.size
-    q, _ = steady_sliding(scene, load)
-    y0 = jnp.concatenate([q, jnp.zeros(n)]).at[n + mechanics.tangential].set(0.9 * scene.belt_speed)
+    scene, y0, how = args
+    mechanics, load = Mechanics(scene), scene.load.final
 
     def to_next(carry, instant):
         t, y, contact = carry

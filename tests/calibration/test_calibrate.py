@@ -56,14 +56,8 @@ def test_decaying_response_from_thirty_per_cent_off(decay, decay_fit):
 OF_FIRST = ["mu_0", "c1", "k1"]
 
 
-@pytest.fixture
-def known_to_slide(monkeypatch):
-    """Nothing stops sliding here. To check that would compile the response through events, for ten seconds."""
-    monkeypatch.setattr("fivjax.calibration.fit.slid_throughout", lambda *_: True)
-
-
 @pytest.mark.slow
-def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit, known_to_slide):
+def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit):
     """Data of the first of two contacts give what the fit with one contact gives. Modes that the data cannot show are no
     poles of the recording: noise was taken for them, and no parameter was found."""
     fit = fj.calibrate(off(pair(0.0), OF_FIRST, 0), decay[1], OF_FIRST, starts=4, progress=False)
@@ -74,7 +68,7 @@ def test_an_uncoupled_contact_beside_it_changes_no_estimate(decay, decay_fit, kn
 
 
 @pytest.mark.slow
-def test_coupled_contacts_from_thirty_per_cent_off(known_to_slide):
+def test_coupled_contacts_from_thirty_per_cent_off():
     """The response of two coupled contacts, from eigenvalues of matrices that the library does not make."""
     scene = pair(2e3)
     data = recording(noisy(slid(scene, 0.0371, 1.0371)[:, :2], 0.02, 0), "kick")
@@ -133,6 +127,19 @@ def test_friction_that_falls_with_speed_from_two_belt_speeds():
     fit = fj.calibrate(start, data, names, starts=2, progress=False)
     assert fit.converged and all(fit.identifiable.values())
     assert max(scores(fit, scene).values()) < 4
+
+
+def test_a_kick_under_falling_friction():
+    """Samples at instants of a response that is no sum of modes, from an unknown beginning: followed step by step."""
+    truth = paper().replace(k1=103e3, belt_speed=2.0, p=1.3)
+    truth = fj.Scene(truth.structure, fj.ExponentialDecay(0.25, 0.15, 0.5), 2.0, truth.load)
+    run = fj.simulate(truth, 0.2, 1 / 4000)
+    signals = {f"velocity {k}": noisy(run.velocity[:, k : k + 1], 0.01, k)[:, 0] for k in (0, 1)}
+    data = fj.Recording(4000.0, signals, "kick", "points", offset=0.0)
+    fit = fj.calibrate(truth.replace(mu_dynamic=0.14, k1=101e3), data, ["mu_dynamic", "k1"], starts=1, progress=False)
+    assert fit.outcome is FitOutcome.CONVERGED
+    assert max(scores(fit, truth).values()) < 4
+    assert fit.uncertainty["mu_dynamic"] < 1e-3
 
 
 @pytest.mark.slow
@@ -264,6 +271,32 @@ def test_what_the_scene_cannot_explain_is_said(decay):
     signals = fj.Recording(data.t, {"a0": data.values[:, 0]}, "sliding")
     fit = fj.calibrate(scene.replace(c2=3.0), signals, ["k1"], starts=1, progress=False)
     assert fit.outcome in (FitOutcome.STRUCTURE_LEFT, FitOutcome.DOES_NOT_FIT)
+
+
+@pytest.mark.slow
+def test_one_of_three_limit_cycles_without_noise():
+    """The cycle that was recorded is not the one that a scene mostly settles on; and what differs from it is no noise at all."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2, 0.3), 0.3, fj.ConstantLoad(100.0))
+    start = np.append(fj.sliding_equilibrium(scene), [0.6, 0.6, 0.6])
+    cycle = fj.limit_cycle(scene, start)
+    assert cycle.frequency == pytest.approx(69.15, abs=0.01)
+    assert fj.limit_cycle(scene).frequency < 68
+    run = fj.simulate(scene, 3.0, 1 / 4000, y0=start)
+    signals = {f"velocity {k}": run.velocity[-4000:, k] for k in (0, 1)}
+    data = fj.Recording(4000.0, signals, "limit cycle", "points")
+    for wrong in ({"k1": 104e3}, {"force": 120.0}):
+        (name,) = wrong
+        fit = fj.calibrate(scene.replace(**wrong), data, [name], progress=False)
+        assert fit.outcome is FitOutcome.CONVERGED
+        assert fit.values[name] == pytest.approx(float(scene.parameters[name]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_scene_that_only_slides_has_no_limit_cycle_to_compare():
+    data = recording(clean(paper(mu=0.3, belt_speed=1.0), 2.0, 2.5), "limit cycle")
+    fit = fj.calibrate(paper(mu=0.05, belt_speed=1.0), data, ["mu"], bounds={"mu": (0.04, 0.06)}, progress=False)
+    assert fit.outcome is FitOutcome.NO_CYCLE and "closes" not in str(fit) and "start from" in str(fit)
+    assert np.isnan(fit.values["mu"])
 
 
 def test_a_limit_cycle_that_beats_is_not_fitted():
