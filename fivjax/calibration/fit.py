@@ -28,7 +28,6 @@ from .parameters import FreeParameters, refuse_one_for_each_contact
 from .problem import Problem
 from .result import Calibration, FitOutcome
 from .search import Search
-from .time_offsets import slid_throughout
 from .waveform_misfit import misfit_of_waveform, starts_unknown
 
 # The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
@@ -113,41 +112,30 @@ def calibrate(
         for k, recording in enumerate(recordings)
     ]
     cycles = all(r.regime == "limit cycle" for r in recordings)
-    kicked = any(r.regime == "kick" for r in recordings)
-    slides = scene.friction.constant and not any(r.y0 is not None or starts_unknown(scene, r) for r in recordings)
-    # A response to a kick is first assumed to slide all the time, which is fast to compute and checked afterwards.
-    for uneventful in (True, False) if kicked and slides else (False,):
-        misfits = tuple(
-            misfit_of_cycle(r, method, scene) if b is None else misfit_of_waveform(r, b, method, scene, uneventful)
-            for r, b in zip(recordings, blocks, strict=True)
-        )
-        problem = Problem(scene, parameters, misfits)
-        if any(np.max(cycle.apart) > MOST_APART for cycle in problem.cycles):
-            return not_tried(problem, recordings, FitOutcome.TOO_SLOW)
-        if any(cycle.beating > BEATS for cycle in problem.cycles):
-            return not_tried(problem, recordings, FitOutcome.BEATS)
-        if cycles:
-            frequencies = [float(cycle.frequency) for cycle in problem.cycles]
-            half = max(int(starts), SCREENED) // 2
-            # A limit cycle needs two modes of similar frequency, but its own frequency may be somewhat lower.
-            near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
-            around = latin_hypercube(parameters, scene, half, float(spread), seed)
-            guesses = np.concatenate([near, around[1:]])
-        else:
-            guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
-        search = Search(problem, guesses, recordings)
-        with following("calibrate", shown=progress, total=search.count, unit=" stages"):
-            for number, words in enumerate(search.run()):
-                tick(min(number, 1))
-                stage(words)
-        result = concluded(search, float(identifiable_within))
-        # If there is no signal, contact events do not explain it any better.
-        if not uneventful or result.outcome is FitOutcome.NO_SIGNAL:
-            break
-        misfitting = result.outcome in (FitOutcome.STRUCTURE_LEFT, FitOutcome.DOES_NOT_FIT)
-        if not misfitting and slid_throughout(problem, search.best):
-            break
-    return result
+    misfits = tuple(
+        misfit_of_cycle(r, method, scene) if b is None else misfit_of_waveform(r, b, method, scene)
+        for r, b in zip(recordings, blocks, strict=True)
+    )
+    problem = Problem(scene, parameters, misfits)
+    if any(np.max(cycle.apart) > MOST_APART for cycle in problem.cycles):
+        return not_tried(problem, recordings, FitOutcome.TOO_SLOW)
+    if any(cycle.beating > BEATS for cycle in problem.cycles):
+        return not_tried(problem, recordings, FitOutcome.BEATS)
+    if cycles:
+        frequencies = [float(cycle.frequency) for cycle in problem.cycles]
+        half = max(int(starts), SCREENED) // 2
+        # A limit cycle needs two modes of similar frequency, but its own frequency may be somewhat lower.
+        near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
+        around = latin_hypercube(parameters, scene, half, float(spread), seed)
+        guesses = np.concatenate([near, around[1:]])
+    else:
+        guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
+    search = Search(problem, guesses, recordings)
+    with following("calibrate", shown=progress, total=search.count, unit=" stages"):
+        for number, words in enumerate(search.run()):
+            tick(min(number, 1))
+            stage(words)
+    return concluded(search, float(identifiable_within))
 
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:

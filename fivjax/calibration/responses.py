@@ -1,4 +1,4 @@
-"""The response to a kick as a recording samples it: through every contact event, or while nothing stops sliding."""
+"""The response to a kick as a recording samples it, through every contact event."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..contact import Contact, Mechanics, State, status_from_forces
 from ..foundation.carried import depending_on
 from ..foundation.kernel_functions import KernelFunction
-from ..foundation.matrix_factors import exponential
 from ..foundation.polynomial import value_and_rate
 from ..io.recordings import QUANTITIES, Channel
-from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import free_in_sliding
 from ..simulation.jump_instants import begun_at, load_from, next_jump
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.core import next_part
@@ -35,7 +32,7 @@ class Response(NamedTuple):
     loads: Bool[Array, " b"]  # the same for jumps of the load
 
 
-def through_events(
+def response_of(
     scene: Scene,
     method: AbstractStepper,
     y0: State | None,
@@ -175,76 +172,8 @@ def _sample(args, instants: Float[Array, " q"]):
 _sampling = KernelFunction(_sample)
 
 
-def sliding_throughout(
-    scene: Scene, sampled: Sampled, begin: Float[Array, ""], channels: tuple[Channel, ...]
-) -> Response:
-    """The response from steady sliding for constant friction, if no contact ever stops sliding: exact, from one jump of the
-    load to the next."""
-    edges, width, blocks = sampled.edges(begin), sampled.width, sampled.count
-    points = sampled.per_block
-    # Displacements are not changes of anything that is known: their averages are those of points, with the next order.
-    spread = (width / points) ** 2 / 24 if sampled.averages else 0.0
-    # Displacement, velocity and acceleration of the coordinates that slide.
-    at = (jnp.arange(points) + 0.5) * width / points
-    slid = _slid(scene, edges[0], width, blocks, at)
-    at_edges = _slid(scene, edges[0], width, blocks + 1, jnp.zeros(1))[:, :, 0] if sampled.averages else slid[:, :, 0]
-    keep = free_in_sliding(scene.structure).tolist()
-    columns = []
-    for quantity, coordinate in channels:
-        derivative = Channel(quantity, coordinate).derivative
-        if coordinate not in keep:
-            columns.append(jnp.zeros(blocks))
-        elif sampled.averages and derivative > 0:
-            columns.append(jnp.diff(at_edges[derivative - 1, :, keep.index(coordinate)]) / width)
-        else:
-            own = slid[..., keep.index(coordinate)]
-            curved = spread * own[2] if sampled.averages else 0.0
-            columns.append(jnp.mean(own[derivative] + curved, axis=1))
-    never = jnp.zeros(blocks, bool)
-    return Response(jnp.stack(columns, axis=1), never, never, _near_jumps(scene, edges))
-
-
-def _slid(scene: Scene, begin, width, blocks: int, at: Float[Array, " p"]) -> Float[Array, "3 b p m"]:
-    """Displacement, velocity and acceleration of the free coordinates, `at` these times (s) after the start of each block."""
-    matrix, keep = linear_sliding(scene).matrix, free_in_sliding(scene.structure)
-    steps = powers(exponential(width * matrix), blocks)
-    step = at[1] - at[0] if len(at) > 1 else jnp.zeros(())
-    fine = powers(exponential(step * matrix), len(at)) @ exponential(at[0] * matrix)
-    instants = begin + width * jnp.arange(blocks)[:, None] + at
-
-    def equilibrium(force):
-        q, _ = steady_sliding(scene, force)
-        return jnp.concatenate([q[jnp.asarray(keep)], jnp.zeros(len(keep))])
-
-    rest = equilibrium(scene.load.force)
-    since, z = jnp.zeros(()), rest
-    states = jnp.broadcast_to(rest, (blocks, len(at), len(rest)))
-    pushes = jnp.zeros_like(states)
-    jump_times = scene.load.jumps
-    for k in range(jump_times.shape[0]):
-        z = rest + exponential((jump_times[k] - since) * matrix) @ (z - rest)
-        since = jump_times[k]
-        until = jump_times[k + 1] if k + 1 < jump_times.shape[0] else jnp.inf
-        rest = equilibrium(scene.load(since + jnp.minimum(0.5 * (until - since), 1.0)))
-        first = steps @ (exponential((begin - since) * matrix) @ (z - rest))
-        away = jnp.einsum("pij,bj->bpi", fine, first)
-        later = (instants >= since)[..., None]
-        states, pushes = jnp.where(later, away + rest, states), jnp.where(later, away @ matrix.T, pushes)
-    m = len(keep)
-    return jnp.stack([states[..., :m], states[..., m:], pushes[..., m:]])
-
-
 def _near_jumps(scene: Scene, edges: Float[Array, " edge"]) -> Bool[Array, " b"]:
     """The blocks in which the load jumps, and the next ones on the side to which it is closer."""
     width = edges[1] - edges[0]
     place = (scene.load.jumps[:, None] - edges[:-1]) / width
     return jnp.any((place >= -0.5) & (place < 1.5), axis=0)
-
-
-def powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
-    """I, step, step², …: by doubling, so that a long recording takes only a few products of many matrices."""
-    found, next_one = jnp.eye(step.shape[0])[None], step
-    while found.shape[0] < count:
-        found = jnp.concatenate([found, found @ next_one])
-        next_one = next_one @ next_one
-    return found[:count]

@@ -6,7 +6,6 @@ from jaxtyping import Array, Float
 
 from ..foundation.compiling import compiled
 from .initial_guesses import state_matrices
-from .least_squares import Minimum
 from .misfit import OFFSET_UNIT
 from .problem import Problem
 from .samples import Sampled
@@ -60,24 +59,10 @@ def periods_aside(
     return list(shifted[(bounds[0] <= offsets) & (offsets <= bounds[1])]), 0.5 * period
 
 
-def slid_throughout(problem: Problem, best: Minimum) -> bool:
-    """Whether no contact event happens in the fitted responses, which are then what was fitted."""
-    for k, mine in enumerate(problem.misfits):
-        if isinstance(mine, KickMisfit) and _has_events(problem, k, jnp.asarray(best.x)):
-            return False
-    return True
-
-
 @compiled
 def _responses(problem: Problem, which: int, u: Float[Array, " k"], sampled: Sampled, begin: Float[Array, ""]):
     mine = problem.misfits[which]
-    return mine.response(problem.at(u), (begin, None), sampled, mine.uneventful).means
-
-
-@compiled
-def _has_events(problem: Problem, which: int, x: Float[Array, " j"]):
-    mine, own = problem.misfits[which], problem.own(x)[which]
-    return jnp.any(mine.response(problem.at(x[: problem.size]), own, mine.sampled, False).contacts)
+    return mine.response(problem.at(u), (begin, None), sampled).means
 
 
 def _period(problem: Problem, u: Float[np.ndarray, " k"]) -> float:

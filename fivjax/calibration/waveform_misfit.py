@@ -21,7 +21,7 @@ from .characteristic import characteristic_residual
 from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, finite, window
 from .mode_poles import strongest_poles
 from .noise import noise_of_means
-from .responses import Response, powers, sliding_throughout, through_events
+from .responses import Response, response_of
 from .samples import Sampled, sampled
 
 # The least share of the signal's energy that poles must explain to count as those of a small motion.
@@ -83,8 +83,6 @@ class KickMisfit(AbstractWaveformMisfit):
     y0: Float[Array, " state"] | None  # the state at time 0, None for steady sliding; zeros where it is not known
     scale: Float[Array, " m"] | None  # units of an unknown state
     free: tuple[int, ...] = eqx.field(static=True)  # the places in a state that are unknown
-    # Whether contact events are excluded: then matrix exponentials are enough, and a hundred times as fast.
-    uneventful: bool = eqx.field(static=True)
     unknowns: int = eqx.field(static=True)
     projected: int = eqx.field(static=True, default=0)
 
@@ -102,7 +100,7 @@ class KickMisfit(AbstractWaveformMisfit):
 
     def predicted(self, scene: Scene, own) -> tuple[Float[Array, "B k"], Bool[Array, "B k"]]:
         """The blocks' means, and which are next to an instant at which they jump."""
-        response = self.response(scene, own, self.sampled, self.uneventful)
+        response = self.response(scene, own, self.sampled)
         accelerations, velocities = self.sampled.jumping(self.channels)
         model = self.sampled.of_blocks(response.means)
         if self.sampled.filtered:
@@ -110,13 +108,11 @@ class KickMisfit(AbstractWaveformMisfit):
         touched = (response.contacts | response.loads)[:, None] & accelerations
         return model, touched | (response.landings[:, None] & velocities)
 
-    def response(self, scene: Scene, own, sampled: Sampled, uneventful: bool) -> Response:
-        """The response as `sampled`, with or without contact events."""
-        scene, (offset, y0) = scene.replace(**self.known), own
+    def response(self, scene: Scene, own, sampled: Sampled) -> Response:
+        """The response as `sampled`."""
+        offset, y0 = own
         begin = offset + self.edges[0]
-        if uneventful:
-            return sliding_throughout(scene, sampled, begin, self.channels)
-        return through_events(scene, self.method, y0, sampled, begin, self.channels)
+        return response_of(scene.replace(**self.known), self.method, y0, sampled, begin, self.channels)
 
     def first(self, scene: Scene) -> Float[np.ndarray, " u"]:
         """Where to start for the recording's own unknowns: for a state, with the free motion without friction that is closest
@@ -171,9 +167,7 @@ def _weighted_waves(scene: Scene, mine: KickMisfit):
     return columns, (weight * mine.means).ravel(), linear.equilibrium[jnp.array(mine.free)]
 
 
-def misfit_of_waveform(
-    recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene, uneventful: bool
-) -> AbstractMisfit:
+def misfit_of_waveform(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> AbstractMisfit:
     """A recording of a small motion or of a kick, averaged over blocks, ready to be compared."""
     known = {name: jnp.asarray(value) for name, value in recording.known.items()}
     sigma = noise_of_means(recording, blocks)
@@ -203,10 +197,10 @@ def misfit_of_waveform(
     }
     if recording.regime == "sliding":
         return SlidingMisfit(**common, projected=2 * modes + len(displacements))
-    return _kick(recording, method, scene.replace(**recording.known), uneventful, common)
+    return _kick(recording, method, scene.replace(**recording.known), common)
 
 
-def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventful: bool, common: dict) -> KickMisfit:
+def _kick(recording: Recording, method: AbstractStepper, scene: Scene, common: dict) -> KickMisfit:
     low, high = recording.offset
     # What is predicted begins this much before the first sample; before a known state nothing is known.
     before = -float(common["edges"][0] + common["sampled"].lead)
@@ -222,7 +216,6 @@ def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventfu
         y0=None if recording.y0 is None else start_state(scene, recording.y0),
         scale=None,
         free=(),
-        uneventful=uneventful,
         unknowns=int(low < high),
     )
     if not starts_unknown(scene, recording):
@@ -239,3 +232,12 @@ def _kick(recording: Recording, method: AbstractStepper, scene: Scene, uneventfu
 def starts_unknown(scene: Scene, recording: Recording) -> bool:
     """Whether a run has no known start: on a belt at rest nothing slides steadily."""
     return recording.regime == "kick" and recording.y0 is None and bool(np.any(np.asarray(scene.belt_speed) == 0))
+
+
+def powers(step: Float[Array, "m m"], count: int) -> Float[Array, "count m m"]:
+    """I, step, step², …: by doubling, so that a long recording takes only a few products of many matrices."""
+    found, next_one = jnp.eye(step.shape[0])[None], step
+    while found.shape[0] < count:
+        found = jnp.concatenate([found, found @ next_one])
+        next_one = next_one @ next_one
+    return found[:count]

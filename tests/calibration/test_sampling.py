@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 import fivjax as fj
-from fivjax.calibration.responses import sliding_throughout, through_events
+from fivjax.calibration.responses import response_of
 from fivjax.calibration.samples import sampled
 from fivjax.io.low_pass import LowPass
 from fivjax.io.recordings import averaged, channel
@@ -28,7 +28,7 @@ def run(scene):
     return signals[first - FINER :]
 
 
-def predicted(scene, respond, sampling, rate, **about):
+def predicted(scene, sampling, rate, **about):
     data = fj.Recording(RATE, dict.fromkeys(NAMES, np.zeros(COUNT)), "kick", sampling, **about)
     with jax.enable_x64(True):
         blocks = averaged(data, rate)
@@ -37,10 +37,7 @@ def predicted(scene, respond, sampling, rate, **about):
         @jax.jit
         def response(scene):
             begin = jnp.asarray(BEGIN + blocks.edges[0])
-            if respond is through_events:
-                found = through_events(scene, fj.EventExact(), None, way, begin, CHANNELS)
-            else:
-                found = sliding_throughout(scene, way, begin, CHANNELS)
+            found = response_of(scene, fj.EventExact(), None, way, begin, CHANNELS)
             return way.of_blocks(found.means), found
 
         means, found = response(scene)
@@ -51,35 +48,33 @@ def of_blocks(samples, per_block):
     return samples[: len(samples) // per_block * per_block].reshape(-1, per_block, samples.shape[1]).mean(axis=1)
 
 
-@pytest.mark.parametrize(
-    ("respond", "p"), [(sliding_throughout, 1.2), pytest.param(through_events, 3.0, marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("rate", [pytest.param(2000.0, marks=pytest.mark.slow), 500.0])
-def test_points_and_averages_are_those_of_a_run(respond, p, rate):
-    """A decaying response and, through events, one with two dozen landings: every block without an event or a jump of the load."""
+@pytest.mark.parametrize("p", [1.2, 3.0])
+@pytest.mark.parametrize("rate", [2000.0, 500.0])
+def test_points_and_averages_are_those_of_a_run(p, rate):
+    """A decaying response and one with two dozen landings: every block without an event or a jump of the load."""
     scene = paper(mu=0.2, p=p)
     fine = run(scene)
     size = fine.std(axis=0)
-    means, found, per_block = predicted(scene, respond, "points", rate)
+    means, found, per_block = predicted(scene, "points", rate)
     quiet = ~np.asarray(found.contacts | found.loads)
-    assert quiet.mean() > (0.9 if respond is sliding_throughout else 0.3)
-    assert np.any(found.landings) == (respond is through_events)
+    assert quiet.mean() > (0.9 if p < 2 else 0.3)
+    assert np.any(found.landings) == (p > 2)
     wanted = of_blocks(fine[FINER::FINER][:COUNT], per_block)
     assert np.abs((means - wanted) / size)[quiet].max() < 1e-6
-    means, found, _ = predicted(scene, respond, "averages", rate)
+    means, found, _ = predicted(scene, "averages", rate)
     weight = np.ones(FINER + 1)
     weight[1:-1:2], weight[2:-1:2] = 4.0, 2.0
     windows = np.lib.stride_tricks.sliding_window_view(fine, FINER + 1, axis=0)[FINER // 2 :: FINER][:COUNT]
     wanted = of_blocks(windows @ (weight / weight.sum()), per_block)
     # By Simpson's rule. After a landing a fast vibration has only a dozen of its steps to a period.
-    assert np.abs((means - wanted) / size)[quiet].max() < (1e-5 if respond is sliding_throughout else 2e-4)
+    assert np.abs((means - wanted) / size)[quiet].max() < (1e-5 if p < 2 else 2e-4)
 
 
 @pytest.mark.slow
 def test_an_average_holds_the_impulse_of_a_landing():
     """The change of velocity over each step is exact, whatever happens in it."""
     scene = paper(mu=0.2, p=3.0)
-    means, found, _ = predicted(scene, through_events, "averages", RATE)
+    means, found, _ = predicted(scene, "averages", RATE)
     assert np.any(found.landings)
     edges = BEGIN + (np.arange(COUNT + 1) - 0.5) / RATE
     dt = 5e-5
@@ -110,7 +105,7 @@ def test_a_low_pass_is_butterworths():
 def test_samples_through_a_low_pass_are_those_of_the_filtered_motion(given):
     """A kick's response, filtered in time by SciPy from a finely stepped run, with events and impulses."""
     scene = paper(mu=0.2, p=3.0)
-    means, *_ = predicted(scene, through_events, "points", RATE, filter=given)
+    means, *_ = predicted(scene, "points", RATE, filter=given)
     dt = 1e-5
     fine = fj.simulate(scene, BEGIN + (COUNT + 1) / RATE, dt)
     # Accelerations are changes of velocity, in which impulses are whole; each is the mean over its step.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.calibration.responses import through_events
+from fivjax.calibration.responses import response_of
 from fivjax.calibration.samples import Sampled
 from fivjax.io.recordings import Channel
 from fivjax.simulation.rows import rows_at
@@ -143,7 +143,7 @@ def test_a_kick_that_ends_with_a_block_of_a_recording(y0):
         @jax.jit
         def means(instants):
             scene = cases.paper(start=instants[0], duration=instants[1], p=1.3, belt_speed=1.0)
-            return through_events(scene, FEW, begin, sampled, jnp.zeros(()), channels).means
+            return response_of(scene, FEW, begin, sampled, jnp.zeros(()), channels).means
 
         found = jax.jit(jax.jacfwd(means))(jnp.array([0.0, 0.04]))
         for k, direction in enumerate(np.eye(2)):
