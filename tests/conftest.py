@@ -5,6 +5,7 @@ import os
 import shutil
 import tempfile
 from importlib import metadata
+from importlib.util import find_spec
 
 import pytest
 
@@ -22,10 +23,13 @@ COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_opt
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
 
+# The same holds for kernels: a third of the time without the later optimisations.
+KERNELS_COMPILED_FOR_TESTS = "-march=native -O1 -fno-slp-vectorize"
+
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
 LONGEST = (
-    "maps gradients oracle kernels several_contacts energy cea creeping steppers calibrate properties contact cycles "
+    "maps gradients oracle kernels several_contacts energy cea creeping steppers calibrate one_sided properties contact cycles "
     "kernel_functions calibration_goodness branches tradeoff simulate extending attractor several_sliding verdicts "
     "returns_by_kernels notebooks basins damaged_stores checkpoint smallest_kick kept_programs reproduce standstill design "
     "several_maps proofs_side_by_side nearby_cycle sampling"
@@ -67,10 +71,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--compiling", action="store_true", help="say in the end how long XLA's compiler worked")
 
 
+def _runs_tests(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Each process that runs tests notes the seconds of each of XLA's programs; those found compiled count by what it took
     to read them."""
     config = session.config
+    if "not slow" in config.option.markexpr and _runs_tests(config) and find_spec("warp"):
+        import warp
+
+        warp.config.cpu_compiler_flags = KERNELS_COMPILED_FOR_TESTS
     if not config.getoption("--compiling"):
         return
     config.stash[_SECONDS] = []

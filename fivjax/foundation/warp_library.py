@@ -86,9 +86,9 @@ def compiler_flags() -> str:
     """Those of all kernels on a CPU: with the same ones Warp compiles its own headers only once in a process."""
     # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster. Loops over few coordinates
     # are slower in vectors: an energy ledger takes five times as long. What is compared with itself is compared to see whether
-    # it is a number.
+    # it is a number. What a user has set for Warp comes last, and so counts.
     own = warp().config.cpu_compiler_flags or "-march=native"
-    return f"{own} -O3 -fno-vectorize -ffp-contract=fast -Wno-tautological-compare"
+    return f"-O3 -fno-vectorize -ffp-contract=fast -Wno-tautological-compare {own}"
 
 
 def folder_of_texts() -> Path | None:
