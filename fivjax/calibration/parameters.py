@@ -66,19 +66,20 @@ class FreeParameters(eqx.Module):
         self.names, self.kinds = names, tuple(kinds)
         self.lower, self.upper, self.size = np.array(lower), np.array(upper), np.array(size)
 
-    def values(self, u: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The parameters, in their own units."""
+    def values(self, u: Float[Array | np.ndarray, " k"]) -> Float[Array | np.ndarray, " k"]:
+        """The parameters, in their own units; known ones by NumPy."""
+        by = np if isinstance(u, np.ndarray) else jnp
         found = []
         for k, kind in enumerate(self.kinds):
             if kind == "both":
                 # tanh does not overflow, and its derivative is not NaN.
-                share = 0.5 * (1.0 + jnp.tanh(0.5 * u[k]))
+                share = 0.5 * (1.0 + by.tanh(0.5 * u[k]))
                 found.append(self.lower[k] + (self.upper[k] - self.lower[k]) * share)
             elif kind == "lower":
-                found.append(self.lower[k] + self.size[k] * jnp.exp(u[k]))
+                found.append(self.lower[k] + self.size[k] * by.exp(u[k]))
             else:
                 found.append(self.size[k] * u[k])
-        return jnp.stack(found)
+        return by.stack(found)
 
     def unbounded(self, values) -> np.ndarray:
         """The inverse of `values`; numbers outside the bounds are first moved inside."""
@@ -95,7 +96,7 @@ class FreeParameters(eqx.Module):
                 found.append(value / self.size[k])
         return np.array(found)
 
-    def scene(self, scene: Scene, u: Float[Array, " k"]) -> Scene:
+    def scene(self, scene: Scene, u: Float[Array | np.ndarray, " k"]) -> Scene:
         """The scene with these parameters."""
         values = self.values(u)
         return scene.replace(**{name: values[k] for k, name in enumerate(self.names)})

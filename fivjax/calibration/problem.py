@@ -56,7 +56,7 @@ class Problem(eqx.Module):
 
     def first(self, u: np.ndarray) -> np.ndarray:
         """A point with these parameters, and first values of the recordings' own unknowns."""
-        scene = self.at(jnp.asarray(u))
+        scene = self.at(u)
         return np.concatenate([u, *(m.first(scene) for m in self.misfits)])
 
     def without(self, touched: list[np.ndarray]) -> "Problem":
@@ -77,7 +77,7 @@ class Problem(eqx.Module):
         """Whether there is a scene with these parameters: a law may refuse some together, such as a kinetic coefficient above
         the static one."""
         try:
-            self.at(jnp.asarray(x[: self.size]))
+            self.at(x[: self.size])
         except ValueError:
             return False
         return True
