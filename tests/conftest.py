@@ -50,6 +50,11 @@ def pytest_configure(config: pytest.Config) -> None:
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    runs_tests = hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
+    if "not slow" in config.option.markexpr and runs_tests and find_spec("warp"):
+        import warp
+
+        warp.config.cpu_compiler_flags = KERNELS_COMPILED_FOR_TESTS
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -71,18 +76,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--compiling", action="store_true", help="say in the end how long XLA's compiler worked")
 
 
-def _runs_tests(config: pytest.Config) -> bool:
-    return hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
-
-
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Each process that runs tests notes the seconds of each of XLA's programs; those found compiled count by what it took
     to read them."""
     config = session.config
-    if "not slow" in config.option.markexpr and _runs_tests(config) and find_spec("warp"):
-        import warp
-
-        warp.config.cpu_compiler_flags = KERNELS_COMPILED_FOR_TESTS
     if not config.getoption("--compiling"):
         return
     config.stash[_SECONDS] = []

@@ -16,7 +16,7 @@ from ..io.recordings import QUANTITIES, Channel
 from ..model.scene import Scene, steady_sliding
 from ..simulation.jump_instants import begun_at, load_from, next_jump
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
-from ..steppers.core import next_part
+from ..steppers.core import end_after, next_part
 from ..steppers.event_exact import for_derivatives
 from ..steppers.kernel_scope import has_kernel
 from .inside import advance_with_channels, jumps, terms_of
@@ -96,6 +96,7 @@ class _Step(NamedTuple):
     y_end: State
     contact_end: Contact
     sums: Float[Array, " k"]  # integrals up to its end
+    begun: Bool[Array, ""]  # False for the start, before any step
     # Since the last row.
     taken: Int[Array, ""]
     changed: Bool[Array, ""]
@@ -114,43 +115,51 @@ def _sample(args, instants: Float[Array, " q"]):
     if at_rest:
         q, _ = steady_sliding(scene, scene.load.force)
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
-    contact = status_from_forces(mechanics, load_from(scene, start), y0)
+    contact = status_from_forces(mechanics, load_from(scene.load, start), y0)
     first = begun_at(scene, mechanics, contact, y0, start)
 
     def step(now: _Step, instant) -> _Step:
-        t, until = now.end, next_jump(scene, now.end)
+        t, until = now.end, next_jump(scene.load, now.end)
         if not method.chooses_its_steps:
             until = jnp.minimum(until, instant)
         part, is_last = next_part(until - t, method.dt)
-        load = load_from(scene, t)
+        load = load_from(scene.load, t)
         after, terms, unit = advance_with_channels(method, mechanics, now.contact_end, load, now.y_end, part, how.along)
         if how.averages:
             integral = jnp.concatenate([now.sums[None], terms * (unit / jnp.arange(1, len(terms) + 1))[:, None]])
             terms = jnp.where(summed, integral, jnp.pad(terms, ((0, 1), (0, 0))))
         sums = value_and_rate(terms, unit, after.h)[0]
-        end = jnp.where(is_last & (after.h >= until - t), until, t + after.h)
         changed, landed = jumps(now.contact, now.contact_end)
         changed, landed = now.changed | changed, now.landed | landed
-        return _Step(t, terms, unit, now.contact_end, end, after.y, after.contact, sums, now.taken + 1, changed, landed)
+        return _Step(
+            t=t,
+            terms=terms,
+            unit=unit,
+            contact=now.contact_end,
+            end=end_after(after, t, until, is_last),
+            y_end=after.y,
+            contact_end=after.contact,
+            sums=sums,
+            begun=jnp.ones((), bool),
+            taken=now.taken + 1,
+            changed=changed,
+            landed=landed,
+        )
 
-    def row(carry, instant):
-        now, begun = carry
+    def row(now: _Step, instant):
         instant = edge + instant
 
-        def going(carry):
-            now, begun = carry
+        def going(now: _Step):
             # A sample at a jump of the load is the one just after it; an average ends before it.
             before = now.end < instant if how.averages or not method.chooses_its_steps else now.end <= instant
-            return (before | ~begun) & (now.taken < MOST_ADVANCES)
+            return (before | ~now.begun) & (now.taken < MOST_ADVANCES)
 
-        now, begun = jax.lax.while_loop(going, lambda carry: (step(carry[0], instant), carry[1] | True), (now, begun))
+        now = jax.lax.while_loop(going, lambda now: step(now, instant), now)
         value, _ = value_and_rate(now.terms, now.unit, instant - now.t)
         reached = now.end >= instant
         seen = jnp.where(reached, value, jnp.nan), now.changed, now.landed
-        none = jnp.zeros((), bool)
         # A motion that has failed goes no further.
-        now = now._replace(taken=jnp.where(reached, 0, now.taken), changed=none, landed=none)
-        return (now, begun), seen
+        return now._replace(taken=jnp.where(reached, 0, now.taken), changed=none, landed=none), seen
 
     none, terms = jnp.zeros((), bool), jnp.zeros((terms_of(method) + how.averages, len(how.channels)))
     begin = _Step(
@@ -162,11 +171,12 @@ def _sample(args, instants: Float[Array, " q"]):
         y_end=first.y,
         contact_end=contact,
         sums=jnp.zeros(len(how.channels)),
+        begun=none,
         taken=jnp.zeros((), jnp.int32),
         changed=none,
         landed=none,
     )
-    return (), jax.lax.scan(row, (depending_on((scene, y0, edge), begin), none), instants)[1]
+    return (), jax.lax.scan(row, depending_on((scene, y0, edge), begin), instants)[1]
 
 
 _sampling = KernelFunction(_sample)

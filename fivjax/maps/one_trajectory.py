@@ -15,6 +15,7 @@ from ..contact import Contact, State
 from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
+from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.propagation import Propagation
@@ -129,8 +130,7 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
     """The end of a step from `t` (s): at most `dt` (s) later, never beyond a jump of the load, and exactly at a jump that is
     reached.
     """
-    ahead = load.jumps > t
-    jump = jnp.min(jnp.where(ahead, load.jumps, jnp.inf), initial=jnp.inf)
+    jump = next_jump(load, t)
     # Equal steps up to the jump. The 1e-6 keeps rounding from adding another step of vanishing length.
     steps = jnp.ceil((jump - t) / dt - 1e-6)
     return jnp.where(steps <= 1, jump, t + jnp.where(jnp.isfinite(jump), (jump - t) / jnp.maximum(steps, 1), dt))

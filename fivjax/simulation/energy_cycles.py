@@ -29,6 +29,7 @@ from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from . import energy as accounts
 from .energy import Energy, EnergyData, Ledger
+from .jump_instants import next_jump
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -186,8 +187,7 @@ def _find(args, numbers: Float[Array, " most"]):
 
     def stretch(now: _Instant) -> tuple[_Instant, Array, Array]:
         """The motion to the next such instant, the next jump of the load or the end, whichever comes first."""
-        jumps = jnp.where(scene.load.jumps > now.t, scene.load.jumps, jnp.inf)
-        stop = jnp.minimum(end, jnp.min(jumps, initial=jnp.inf))
+        stop = jnp.minimum(end, next_jump(scene.load, now.t))
 
         def enter(total, segment: Segment):
             return accounts.enter(energy_data, method, mechanics, total[0], segment), segment.contact.status

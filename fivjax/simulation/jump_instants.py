@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
+from ..model.load import AbstractLoad
 from ..model.scene import Scene
 from ..steppers.base import advance_between, rates
 from ..steppers.core import Segment, nothing
@@ -29,16 +30,15 @@ class Begun(eqx.Module, Generic[Total]):
     total: Total
 
 
-def next_jump(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+def next_jump(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
     """The first jump of the load after an instant (s); infinite where there is none."""
-    jumps = scene.load.jumps
-    return jnp.min(jnp.where(jumps > t, jumps, jnp.inf), initial=jnp.inf)
+    return jnp.min(jnp.where(load.jumps > t, load.jumps, jnp.inf), initial=jnp.inf)
 
 
-def load_from(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
+def load_from(load: AbstractLoad, t: Float[Array, ""]) -> Float[Array, ""]:
     """The load (N) from an instant (s) up to its next jump."""
-    until = next_jump(scene, t)
-    return scene.load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
+    until = next_jump(load, t)
+    return load(jnp.where(jnp.isfinite(until), 0.5 * (t + until), t + 1.0))
 
 
 def load_before(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
-from ..steppers.core import Segment, next_part
+from ..steppers.core import Segment, end_after, next_part
 from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
@@ -140,7 +140,7 @@ def _followed(args, instants, method: EventExact):
 def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:
     """A step of no length at the start."""
     none, no = jnp.zeros((), y0.dtype), jnp.zeros((), jnp.int32)
-    load = load_from(scene, none)
+    load = load_from(scene.load, none)
     contact = physics.status_from_forces(mechanics, load, y0)
     ledger = None if accounts_of is None else accounts.open_ledger(accounts_of, y0)
     series = jnp.zeros((method.order_ + 1, y0.shape[0]), y0.dtype).at[0].set(y0)
@@ -172,12 +172,11 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
 
 def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_of, now: Step) -> Step:
     t, y, contact = now.end, now.y_end, now.contact_end
-    until = next_jump(scene, t)
-    load = load_from(scene, t)
+    until = next_jump(scene.load, t)
+    load = load_from(scene.load, t)
     part, is_last = next_part(until - t, method.dt)
     # The ledger counts crossings of the section.
     after, states, unit = method.with_series(mechanics, contact, load, y, part, accounts_of is not None)
-    arrived = is_last & (after.h >= until - t)
     ledger = None
     if accounts_of is not None:
         ledger = accounts.enter(accounts_of, method, mechanics, now.ledger_end, Segment(t, load, contact, y, after))
@@ -189,7 +188,7 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
         series=states,
         unit=unit,
         ledger=now.ledger_end,
-        end=jnp.where(arrived, until, t + after.h),
+        end=end_after(after, t, until, is_last),
         y_end=after.y,
         contact_end=after.contact,
         ledger_end=ledger,

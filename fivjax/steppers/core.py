@@ -70,6 +70,13 @@ def left_after(after: Advance, left: Float[Array, ""], is_last: Bool[Array, ""])
     return jnp.where(is_last & (after.h >= left), 0.0, left - after.h)
 
 
+def end_after(
+    after: Advance, t: Float[Array, ""], until: Float[Array, ""], is_last: Bool[Array, ""]
+) -> Float[Array, ""]:
+    """When an advance from `t` (s) ends: exactly at the end of the time asked for, if it comes that far."""
+    return jnp.where(is_last & (after.h >= until - t), until, t + after.h)
+
+
 def follow(
     stepper: AbstractStepper,
     mechanics: Mechanics,
