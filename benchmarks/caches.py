@@ -27,7 +27,7 @@ import numpy as np
 import xarray as xr
 
 import fivjax as fj
-from fivjax.foundation import kept_folder, kept_kernels
+from fivjax.foundation import kept_folder
 from tests.helpers import recordings
 
 FLIPS, KILLS, MAPS = 200, 50, int(os.environ.get("CACHES_MAPS", "20"))
@@ -52,11 +52,11 @@ def a_map(folder: Path, name: str) -> tuple[int, str, xr.Dataset | None]:
 def kinds(folder: Path) -> dict[str, list[Path]]:
     """The files that a map has kept, by kind."""
     traced = sorted((folder / "cache" / "fivjax" / "fivjax-traced").iterdir())
-    kernels = sorted(path for path in (folder / "cache" / "warp").rglob("*") if path.is_file())
+    values, kernels = ("_laws", "written"), ("kernel-",)
     return {
-        "kept programs": [path for path in traced if not path.name.startswith("_written_out")],
-        "kept values": [path for path in traced if path.name.startswith("_written_out")],
-        "kernels": kernels,
+        "kept programs": [path for path in traced if not path.name.startswith((*values, *kernels))],
+        "kept values": [path for path in traced if path.name.startswith(values)],
+        "kernels": [path for path in traced if path.name.startswith(kernels)],
     }
 
 
@@ -81,12 +81,7 @@ def damages(folder: Path) -> None:
             whole = path.read_bytes()
             for _, content in damaged(whole, rng):
                 path.write_bytes(content)
-                if kind == "kernels":
-                    # A number of blanks may be added to the list of digests.
-                    read = kept_kernels._is_whole(path.parent) and not content.startswith(whole)
-                else:
-                    read = kept_folder.read_kept(path) is not None
-                count, wrong = count + 1, wrong + bool(read)
+                count, wrong = count + 1, wrong + (kept_folder.read_kept(path) is not None)
             path.write_bytes(whole)
             path.chmod(0o600)
         print(f"{kind}: {len(files)} files, {count} damages, {wrong} read", flush=True)
@@ -116,29 +111,15 @@ def kills(folder: Path) -> None:
     results = [xr.Dataset({"x": ("t", np.full(100_000, float(k)))}) for k in range(2)]
     contents = [bytes([k]) * 500_000 for k in range(2)]
 
-    def of_kernel(part: Path) -> list[Path]:
-        # The digests differ, so that each takes the place of the other.
-        for k in range(2):
-            (part / f"file{k}").write_bytes(contents[k])
-        return [part / "file0", part / "file1"]
-
     def whole_result(path: Path) -> bool:
         return float(np.ptp(fj.open(path)["x"].values)) == 0.0
 
-    sources = Path(tempfile.mkdtemp(dir=folder))
-    files = of_kernel(sources)
-
-    def kernel(path: Path, k: int) -> None:
-        (path / kept_kernels.DIGESTS).unlink(missing_ok=True)  # so that it is written again
-        kept_kernels._keep(path.parent, path.name, files)
-
     studies: dict[str, tuple[Callable, Callable]] = {
         "fj.save": (lambda path, k: fj.save(results[k], path), whole_result),
-        "kept programs": (
+        "compiled code": (
             lambda path, k: kept_folder.keep(path, contents[k]),
             lambda path: kept_folder.read_kept(path) in contents,
         ),
-        "kernels": (kernel, lambda path: kept_kernels._is_whole(path) or not (path / kept_kernels.DIGESTS).exists()),
     }
     for name, (write, is_whole) in studies.items():
         place = Path(tempfile.mkdtemp(dir=folder))

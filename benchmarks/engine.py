@@ -51,7 +51,7 @@ CALLS = {
 def cpu_seconds(code: str, cache: str) -> float:
     """Of a fresh process that runs this."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    env = {**os.environ, "WARP_CACHE_PATH": cache}
+    env = {**os.environ, "XDG_CACHE_HOME": cache}
     subprocess.run([sys.executable, "-c", code], check=True, env=env, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

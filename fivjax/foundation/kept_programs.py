@@ -81,22 +81,16 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
     return call
 
 
-def kept_value(make: Callable[..., R], *args, folder: Path | None = None) -> R:
-    """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs, or in a
-    folder that has been checked.
-    """
-    if folder is None:
-        path = _place(make, _folder() or "", None, args)
-    else:
-        named = _named(make, None, args)
-        path = None if named is None else folder / named
+def kept_value(make: Callable[..., R], *args) -> R:
+    """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs."""
+    path = _place(make, _folder() or "", None, args)
     if path is None:
         return make(*args)
     found = _found(path, from_text)
     if found is None:
         found = make(*args)
         with contextlib.suppress(NotPlain):
-            _keep(path, to_text(found).encode())
+            keep_code(path, to_text(found).encode())
     return found
 
 
@@ -150,8 +144,21 @@ def _program(
         content, program = _made(function, structure, rest, arrays, options)
     except (NotPlain, NotImplementedError, ValueError):  # what `jax.export` refuses
         return None
-    _keep(path, content)
+    keep_code(path, content)
     return ready(content) if program is None else program
+
+
+def place_of_code(name: str) -> Path | None:
+    """The file with this name in the folder for compiled code; none where nothing can be kept."""
+    folder = _folder()
+    place = folder_to_keep_in(folder) if folder else None
+    return None if place is None else place / name
+
+
+def keep_code(path: Path, content: bytes) -> None:
+    """Write a file of that folder, and make room for it."""
+    keep(path, content)
+    make_room(path.parent, LARGEST)
 
 
 def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
@@ -178,11 +185,6 @@ def _found(path: Path, ready: Callable[[bytes], R]) -> R | None:
     except Exception:  # of a kind that this JAX does not read: made anew
         path.unlink(missing_ok=True)
         return None
-
-
-def _keep(path: Path, content: bytes) -> None:
-    keep(path, content)
-    make_room(path.parent, LARGEST)
 
 
 def _made(function: Callable, structure, rest: tuple, arrays: Sequence, options) -> tuple[bytes, Callable | None]:

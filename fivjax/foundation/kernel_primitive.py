@@ -6,6 +6,7 @@ tangents beside values takes its place.
 
 import ctypes
 import functools
+import hashlib
 import math
 from collections.abc import Sequence
 
@@ -16,9 +17,9 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from .built_kernels import FOUND, GIVEN, Kernel, kernel_of, width_for
+from .built_kernels import GIVEN, Kernel, kernel_of, width_for
 from .kernel_text import Form, Place
-from .warp_library import warp
+from .xla_calls import Places, called_by_xla
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -200,27 +201,23 @@ def _lowered(given, dots, instants, *, kernel: _Hashed):
         dots[None],
         instants.reshape(-1, instants.shape[-1]),
     )
-    call = _callable(kernel)
-    dims = {f"{name}_": (lanes, *shape[given.ndim - 1 :]) for name, shape in zip(FOUND, shapes, strict=True)}
-    return [found.reshape(shape) for found, shape in zip(call(*flat, output_dims=dims), shapes, strict=True)]
+    of_lanes = [jax.ShapeDtypeStruct((lanes, *shape[given.ndim - 1 :]), np.float64) for shape in shapes]
+    found = _callable(kernel)(of_lanes)(*flat)
+    return [part.reshape(shape) for part, shape in zip(found, shapes, strict=True)]
 
 
 @functools.cache
 def _callable(kernel: _Hashed):
     """A function of JAX arrays that launches the kernel."""
-    wp, own = warp(), kernel.kernel
 
-    def launch(given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_):
-        for part in (rows_, end_dots_, row_dots_):
-            ctypes.memset(part.ptr, 0, part.capacity)
-        own.launch_on_arrays([given_, dots_, instants_, ends_, rows_, end_dots_, row_dots_])
+    def launch(places: Places) -> None:
+        for address, shape in places[len(GIVEN) :]:
+            ctypes.memset(address, 0, math.prod(shape) * np.dtype(np.float64).itemsize)
+        kernel.kernel.launch(places)
 
-    launch.__annotations__ = {
-        f"{name}_": wp.array(dtype=wp.float64, ndim=axes) for name, axes in {**GIVEN, **FOUND}.items()
-    }
-    # The module that Warp looks whether it is loaded.
-    launch.__module__ = own.kernel.module.name
-    return wp.jax_callable(launch, num_outputs=len(FOUND), graph_mode=wp.JaxCallableGraphMode.NONE)
+    # XLA may keep a program for other processes, where the same name has to mean the same.
+    digest = hashlib.sha256(kernel.kernel.of_lanes.body.encode()).hexdigest()
+    return called_by_xla(f"fivjax_kernel_{digest}", launch)
 
 
 mlir.register_lowering(kernel_p, mlir.lower_fun(_lowered, multiple_results=True), platform="cpu")

@@ -1,30 +1,32 @@
 """NVIDIA Warp, where it is installed: kernels of one thread for each trajectory, on a CPU or on GPUs.
 
-It comes with fivjax where it has wheels. It is imported only where it is used, because that takes a third of a second.
+It comes with fivjax where it has wheels. It is imported only where there are GPUs, or where its compiler cannot be used without
+(`c_functions`), because that takes a third of a second.
 """
 
 import contextlib
-import ctypes.util
+import ctypes
 import functools
+import hashlib
 import importlib.util
+import linecache
 import os
+import sys
 import tempfile
 import threading
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 
-from . import kept_kernels
-from .kernel_headers import own_headers
 from .standard_error import silent
 
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()
 # One trajectory takes a GPU some thirty times as long as a core of a CPU: what that comes to for all of several cores.
 LEAST_ON_GPUS = 1024
-# Modules that are loaded, with the devices that they are loaded on.
-_LOADED: set[tuple[Any, str]] = set()
+# The library of a CUDA driver, by the beginnings of what an operating system calls itself.
+DRIVERS = {"linux": "libcuda.so.1", "win": "nvcuda.dll"}
 
 
 def is_installed() -> bool:
@@ -51,8 +53,7 @@ def _initialised():
             "`pip install warp-lang` on all machines of the run, or on none."
         ) from None
     # Where there is no CUDA driver, Warp's library says so on the process' standard error, whatever its settings.
-    without_driver = ctypes.util.find_library("cuda") is None
-    with _quietly(wp), silent() if without_driver else contextlib.nullcontext():
+    with _quietly(wp), contextlib.nullcontext() if has_driver() else silent():
         if not _has_place(wp):
             # What Warp would take is a folder named ~ in the present one.
             wp.config.kernel_cache_dir = os.path.join("~", ".cache", "warp", wp.config.version)
@@ -83,22 +84,29 @@ def _init_elsewhere(wp) -> None:
 
 
 def compiler_flags() -> str:
-    """Those of all kernels on a CPU: with the same ones Warp compiles its own headers only once in a process."""
+    """Those of all kernels on a CPU. What a user has set for Warp, if it is imported, comes last, and so counts."""
     # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster. Loops over few coordinates
     # are slower in vectors: an energy ledger takes five times as long. What is compared with itself is compared to see whether
-    # it is a number. What a user has set for Warp comes last, and so counts.
-    own = warp().config.cpu_compiler_flags or "-march=native"
+    # it is a number.
+    own = getattr(getattr(sys.modules.get("warp"), "config", None), "cpu_compiler_flags", None) or "-march=native"
     return f"-O3 -fno-vectorize -ffp-contract=fast -Wno-tautological-compare {own}"
 
 
-def folder_of_texts() -> Path | None:
-    """Where the code of kernels is kept, if it can be."""
-    return kept_kernels.folder_of_texts(warp())
+@functools.cache
+def has_driver() -> bool:
+    """Whether there is a CUDA driver."""
+    name = next((name for system, name in DRIVERS.items() if sys.platform.startswith(system)), None)
+    try:
+        return name is not None and ctypes.CDLL(name) is not None
+    except OSError:
+        return False
 
 
 def gpus() -> list[str]:
     """The GPUs that kernels run on: all of them, or none where JAX is told to use the CPU only."""
-    return [] if jax.config.jax_platforms == "cpu" else [device.alias for device in warp().get_cuda_devices()]
+    if jax.config.jax_platforms == "cpu" or not has_driver():
+        return []
+    return [device.alias for device in warp().get_cuda_devices()]
 
 
 def gpus_for(trajectories: int) -> list[str]:
@@ -106,16 +114,31 @@ def gpus_for(trajectories: int) -> list[str]:
     return gpus() if trajectories >= LEAST_ON_GPUS else []
 
 
-def load(module, names: list[str], own: bool = False) -> None:
-    """Compile a Warp module for these devices, or find it among the kernels that are kept. The code may be all our `own`, with
-    numbers and addresses for arguments: then it needs few of Warp's headers.
-    """
+def warp_kernel(body: str, addresses: Sequence[str], numbers: Sequence[str]):
+    """A kernel of one lane for each thread, from the body of a function of `lane` and of these."""
+    wp = warp()
+    signature = ", ".join([*(f"{name}: wp.uint64" for name in addresses), *(f"{name}: int" for name in numbers)])
+    code = (
+        f"@wp.func_native(body)\ndef of_lane(lane: int, {signature}): ...\n\n"
+        f"def of_lanes(first: int, {signature}):\n    of_lane(first + wp.tid(), {', '.join((*addresses, *numbers))})\n"
+    )
+    name = hashlib.sha256(repr((body, code)).encode()).hexdigest()[:16]
+    # Warp reads a kernel's source by `inspect`, which looks here.
+    place = f"<fivjax kernel {name}>"
+    linecache.cache[place] = (len(code), None, code.splitlines(keepends=True), place)
+    space = {"wp": wp, "body": body}
+    exec(compile(code, place, "exec"), space)
+    module = wp.get_module(f"fivjax.kernel_{name}")
+    module.options.update(max_unroll=1, cpu_compiler_flags=compiler_flags(), enable_backward=False)
+    return wp.kernel(space["of_lanes"], enable_backward=False, module=module)
+
+
+def launched(kernel, device: str, first: int, last: int, *args: int) -> None:
+    """Run such a kernel for the lanes from `first` to before `last`."""
     wp = warp()
     with ONE_AT_A_TIME, _quietly(wp):
-        missing = [name for name in names if (module, name) not in _LOADED]
-        if missing:
-            kept_kernels.load(wp, module, missing, functools.partial(own_headers, wp) if own else None)
-            _LOADED.update((module, name) for name in missing)
+        kernel.module.load(device)
+    wp.launch(kernel, dim=last - first, inputs=[first, *args], device=device)
 
 
 @contextlib.contextmanager

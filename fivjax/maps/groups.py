@@ -23,8 +23,8 @@ from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
-from ..steppers.kernel_advance import MOST_COORDINATES
 from ..steppers.kernel_scope import has_kernel
+from ..steppers.matrix_kernel import MOST_COORDINATES
 from ..steppers.propagation import MATRIX_ROWS, Propagation
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift

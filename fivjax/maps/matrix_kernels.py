@@ -3,8 +3,10 @@
 No trajectory waits for the slowest of a block, as by XLA, and nothing is padded.
 """
 
+import enum
+import functools
 from concurrent.futures import Executor
-from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,20 +16,49 @@ from jaxtyping import Int
 
 from ..foundation.blocks import workers
 from ..foundation.flattened import Flattened, flatten
-from ..foundation.warp_library import ONE_AT_A_TIME, gpus, gpus_for, load, warp
+from ..foundation.lane_functions import AT_A_TIME, LaneFunction
+from ..foundation.warp_library import gpus_for, warp
 from ..section.about_sliding import mechanics_about_sliding
-from ..steppers.kernel_advance import stepping
-from ..steppers.kernel_laws import Form
+from ..section.crossings import MOST_TO_CROSSING
 from ..steppers.kernel_matrices import matrices
+from ..steppers.matrix_kernel import Form, motion_in_cpp
 from .groups import Task, with_values
-from .kernel_programs import Programs, ReturnColumn, programs
 
 # Forms of batches, by what all jobs of a run have in common: a trace takes as long as thousands of returns.
 _FORMS: dict[Any, Form] = {}
+# The least steps that are worth a part of a call's work of its own.
+LEAST_STEPS = 4096
+
+
+class ReturnColumn(enum.IntEnum):
+    """Columns of a row on its way to the section: first what is asked, then what is found, and the state from `STATE` on."""
+
+    CROSSINGS, LONGEST, STATUS, DIRECTION, EVENTS, CROSSED, TIME, PEAK, STATE = range(9)
+
+
+class FollowColumn(enum.IntEnum):
+    """Entries of what tells a kernel the columns of a trajectory's row."""
+
+    T, Y, MODE, MODE_DIRECTION, CROSSING, STATUS_CHANGES, LAST_CHANGE, JUMPS, LOADS = range(9)
+
+
+# What is one group's; what is one lane's; and what all lanes have in common, with the numbers that a kernel is told.
+OF_GROUPS, OF_LANES = ("matrices", "mechanics", "intervals"), ("groups", "rows", "path")
+NUMBERS = ("width", "to_section", "kept", "peaks", "count_of_jumps", "steps")
+
+
+@functools.cache
+def kernel(form: Form) -> LaneFunction:
+    """The kernel for scenes of this form: `matrix_kernels.cpp`."""
+    columns = {column.name: int(column) for kind in (ReturnColumn, FollowColumn) for column in kind}
+    enums = ", ".join(f"{name} = {value}" for name, value in {**columns, "MOST_TO_CROSSING": MOST_TO_CROSSING}.items())
+    text = (Path(__file__).parent / "matrix_kernels.cpp").read_text(encoding="utf-8")
+    body = f"{motion_in_cpp(form)}\nenum {{ {enums} }};\n{text}"
+    return LaneFunction(body, (*OF_GROUPS, *OF_LANES, "columns"), NUMBERS)
 
 
 def begin_building(task: Task, pool: Executor) -> None:
-    """Begin to compile the kernels for a task in one of these threads."""
+    """Begin to compile the kernel for a task in one of these threads."""
 
     def mechanics(row):
         return mechanics_about_sliding(with_values(task.scene, task.names, row))
@@ -37,14 +68,7 @@ def begin_building(task: Task, pool: Executor) -> None:
     if key not in _FORMS:
         # Without values: those of a group may be none that a scene could have.
         _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
-    pool.submit(_build, _FORMS[key])
-
-
-def _build(form: Form) -> Programs:
-    with ONE_AT_A_TIME:
-        found = programs(form)
-        load(found.module, ["cpu", *gpus()])
-    return found
+    pool.submit(lambda: kernel(_FORMS[key]).on_cpu)
 
 
 def for_conclusions(shared: Flattened) -> Flattened:
@@ -54,28 +78,17 @@ def for_conclusions(shared: Flattened) -> Flattened:
 
 
 class MatrixKernels:
-    """The kernels for a batch, with the data of its groups on each device."""
+    """The kernel for a batch, with the data of its groups on each device."""
 
     def __init__(self, shared: Flattened, pool: Executor):
-        wp, tree = warp(), shared.tree
-        mechanics, prepared = tree.mechanics, tree.prepared
-        form = Form.of(mechanics, leading=1)
-        self.pool, self.wp = pool, wp
-        self.types, self.programs = stepping(form).types, _build(form)
+        mechanics, prepared = shared.tree.mechanics, shared.tree.prepared
+        self.pool, self.kernel = pool, kernel(Form.of(mechanics, leading=1))
         self.for_conclusions = for_conclusions(shared)
-        self.longest = np.asarray(tree.longest_return)
+        self.longest = np.asarray(shared.tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)
-        of_groups = [
-            (windows.ravel(), wp.float64),
-            (numbers, self.types.mechanics),
-            (np.array(prepared.interval), wp.float64),
-        ]
-        self.threads = workers()
-        self.of_groups = {
-            device: [wp.array(part, dtype=kind, device=device) for part, kind in of_groups]
-            for device in ("cpu", *gpus())
-        }
+        self.of_groups = [np.ascontiguousarray(part, float) for part in (windows, numbers, prepared.interval)]
+        self.on_device: dict[tuple, list] = {}  # the same there, and columns
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
         """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
@@ -89,7 +102,7 @@ class MatrixKernels:
         path = np.full((count, kept * size), np.nan)
         # From one crossing to the next there are roughly nine steps.
         each = int(9 * np.mean(rows[:, of.CROSSINGS]))
-        self._launch(self.programs.returned, group, [rows, path], each, [kept, int(peaks)])
+        self._launch(group, rows, path, each, to_section=1, kept=kept, peaks=int(peaks))
         path, y, crossed = path.reshape(count, kept, size), rows[:, of.STATE :], rows[:, of.CROSSED].astype(int)
         lost = (crossed < rows[:, of.CROSSINGS]) | ~np.all(np.isfinite(y), axis=1)
         rows[lost, of.PEAK], rows[lost, of.STATE :] = np.nan, np.nan
@@ -104,46 +117,41 @@ class MatrixKernels:
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further, in place."""
         _, at = trajectories.starts
-        columns = self.programs.columns(
+        columns = (
             *(at.t, at.y, at.contact.status, at.contact.direction, at.crossing, at.events, at.last_event),
             *(at.steps.jumps, at.steps.loads),
         )
-        jumps = trajectories.tree[1].steps.jumps.shape[-1]
-        self._launch(self.programs.followed, group, [trajectories.numbers], steps, [columns, jumps, steps])
+        jumps, rows = trajectories.tree[1].steps.jumps.shape[-1], trajectories.numbers
+        self._launch(group, rows, np.zeros((1, 1)), steps, columns, count_of_jumps=jumps, steps=steps)
 
-    def _launch(self, kernel, group: Int[np.ndarray, " m"], rows: list[np.ndarray], steps: int, values: list) -> None:
-        """Run a kernel for each row of these arrays, which are changed in place. A row takes some `steps` steps."""
-        count, wp, group = len(group), self.wp, group.astype(np.int32)
-        # Parts of a call's work on a CPU for each thread, because some take longer; and the least steps that are worth a
-        # part.
-        at_a_time, least_steps = 4, 4096
+    def _launch(
+        self,
+        group: Int[np.ndarray, " m"],
+        rows: np.ndarray,
+        path: np.ndarray,
+        each: int,
+        columns: tuple = (0,),
+        **told: int,
+    ) -> None:
+        """Run the kernel for each of these rows, which are changed in place. A row takes some `each` steps."""
+        count, group = len(group), np.ascontiguousarray(group, np.int32)
+        at = np.array(columns, np.int32)
+        assert rows.flags.c_contiguous
+        numbers = [{"width": rows.shape[1], **told}.get(name, 0) for name in NUMBERS]
         devices = gpus_for(count)
         if not devices:
-            given = [
-                *self.of_groups["cpu"],
-                *(wp.array(part, device="cpu", copy=False) for part in (group, *rows)),
-                *values,
-            ]
-            parts = max(1, min(count, at_a_time * self.threads, count * steps // least_steps))
-            ends = np.linspace(0, count, parts + 1).astype(int).tolist()
-
-            def run(part: tuple[int, int]) -> None:
-                wp.launch(kernel, dim=part[1] - part[0], inputs=[*given, part[0]], device="cpu")
-        else:
-            ends = np.linspace(0, count, len(devices) + 1).astype(int).tolist()
-
-            def run(part: tuple[int, int]) -> None:
-                device = devices[ends.index(part[0])]
-                own = slice(*part)
-                moved = [wp.array(whole[own], device=device) for whole in (group, *rows)]
-                given = [*self.of_groups[device], *moved, *values, 0]
-                wp.launch(kernel, dim=part[1] - part[0], inputs=given, device=device)
-                for whole, array in zip(rows, moved[1:], strict=True):
-                    whole[own] = array.numpy()
-
-        parts = [part for part in pairwise(ends) if part[0] < part[1]]
-        if len(parts) == 1:
-            run(parts[0])
+            arrays = (*self.of_groups, group, rows, path, at)
+            parts = max(1, min(count, AT_A_TIME * workers(), count * each // LEAST_STEPS))
+            self.kernel.in_parts([*(array.ctypes.data for array in arrays), *numbers], count, parts, self.pool)
             return
-        for _ in self.pool.map(run, parts):
-            pass
+
+        def call(device: str, own: list) -> list[int]:
+            if (device, *columns) not in self.on_device:
+                self.on_device[device, *columns] = [
+                    warp().array(part, device=device) for part in (*self.of_groups, columns)
+                ]
+            *of_groups, place = (array.ptr for array in self.on_device[device, *columns])
+            of_lanes = [array.ptr for array in own]
+            return [*of_groups, *of_lanes, *[0] * (len(OF_LANES) - len(own)), place, *numbers]
+
+        self.kernel.on_gpus(devices, [group], [rows, path] if len(path) == count else [rows], call)

@@ -1,5 +1,6 @@
 """Kernels: the same motion as by the oracle and by the series stepper, and the same maps as without kernels."""
 
+import functools
 import re
 import warnings
 
@@ -13,15 +14,15 @@ import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
 from fivjax.foundation import warp_library
 from fivjax.foundation.compiling import compiled
+from fivjax.foundation.lane_functions import LaneFunction
 from fivjax.foundation.scalar_code import scalar_source
-from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, load, warp
+from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps import groups as sharing
-from fivjax.maps.kernel_programs import programs
+from fivjax.maps.matrix_kernels import kernel
 from fivjax.maps.one_trajectory import next_step_end
 from fivjax.steppers import kernel_scope
-from fivjax.steppers.kernel_advance import stepping
-from fivjax.steppers.kernel_laws import Form
 from fivjax.steppers.kernel_matrices import matrices
+from fivjax.steppers.matrix_kernel import Form, motion_in_cpp
 from fivjax.steppers.propagation import INTERVALS, ORDER, propagators
 from tests.helpers import oracle
 from tests.helpers.transients import CASES, scene_of
@@ -69,59 +70,37 @@ def marched(method, scene: fj.Scene, t1: float, y0=None):
         raise AssertionError("it did not arrive")
 
 
-MARCHES = {}
+# One trajectory advanced until it arrives; every advance is noted.
+MARCH = """
+double *state = (double*)states, *mode = (double*)modes, *time = (double*)times;
+const double *jump = (const double*)jumps, *load = (const double*)loads, end = *(const double*)until;
+Motion::Step after;
+for (int k = 0, past = 0; k < most && time[k] < end; ++k) {
+    while (past < count && jump[past] <= time[k]) ++past;
+    const double next = past < count && jump[past] < end ? jump[past] : end;
+    const double *y = state + 2 * N * k, *of_group = (const double*)matrices, *own = (const double*)mechanics;
+    Motion::advance(of_group, own, *(const double*)interval, y, mode + 2 * k, load[past], next - time[k], after);
+    time[k + 1] = after.h >= next - time[k] ? next : time[k] + after.h;
+    for (int j = 0; j < 2 * N; ++j) state[2 * N * (k + 1) + j] = after.y[j];
+    for (int j = 0; j < 2; ++j) mode[2 * (k + 1) + j] = after.mode[j];
+}
+"""
 
 
-def march_of(form: Form):
-    """A kernel that advances one trajectory and notes every advance."""
-    if form not in MARCHES:
-        wp, of = warp(), stepping(form)
-        real, t, advance = wp.float64, of.types, of.advance
-
-        @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
-        def march(
-            m: t.matrices,
-            mechanics: wp.array(dtype=t.mechanics),
-            interval: real,
-            states: wp.array(dtype=t.state),
-            modes: wp.array(dtype=t.mode),
-            jumps: wp.array(dtype=real),
-            loads: wp.array(dtype=real),
-            end: real,
-            times: wp.array(dtype=real),
-        ):
-            time = real(0.0)
-            past = int(0)
-            for k in range(MOST):
-                while past < jumps.shape[0] and jumps[past] <= time:
-                    past += 1
-                until = end
-                if past < jumps.shape[0]:
-                    until = wp.min(end, jumps[past])
-                if time < end:
-                    after = advance(m, mechanics[0], interval, 0, states[k], modes[k], loads[past], until - time)
-                    if after.h >= until - time:
-                        time = until
-                    else:
-                        time += after.h
-                    states[k + 1] = after.y
-                    modes[k + 1] = after.mode
-                    times[k + 1] = time
-
-        MARCHES[form] = march
-    return MARCHES[form], stepping(form).types
+@functools.cache
+def march_of(form: Form) -> LaneFunction:
+    given = "matrices", "mechanics", "interval", "states", "modes", "jumps", "loads", "until", "times"
+    return LaneFunction(motion_in_cpp(form) + MARCH, given, ("count", "most"))
 
 
 def by_kernel(scene: fj.Scene, t1: float, y0=None, mode=None):
     """The state at `t1`, (time, new status) of every status change on the way, and the duration of the first advance."""
-    wp = warp()
     y = at_rest(scene) if y0 is None else np.asarray(y0, float)
     with jax.enable_x64(True):
         mechanics, windows, contact = jax.tree.map(np.asarray, prepared(scene, jnp.asarray(y)))
         jumps = np.asarray(scene.load.jumps)
         middles = [jumps[0] - 1, *(0.5 * (jumps[1:] + jumps[:-1])), jumps[-1] + 1]
         loads = np.array([float(scene.load(jnp.asarray(t))) for t in middles])
-    march, t = march_of(Form.of(mechanics))
     table = matrices(
         jax.tree.map(lambda leaf: leaf[None], windows), len(y) // 2, mechanics.tangential, mechanics.normal
     )
@@ -129,18 +108,9 @@ def by_kernel(scene: fj.Scene, t1: float, y0=None, mode=None):
     states, modes, times = np.zeros((MOST + 1, len(y))), np.zeros((MOST + 1, 2)), np.full(MOST + 1, np.nan)
     states[0], modes[0], times[0] = y, (contact.status, contact.direction) if mode is None else mode, 0.0
 
-    def array(data, kind):
-        return wp.array(data, dtype=kind, device="cpu", copy=False)
-
-    given = [
-        array(table.ravel(), wp.float64),
-        array(numbers, t.mechanics),
-        wp.float64(float(windows.interval)),
-        *(array(states, t.state), array(modes, t.mode), array(jumps, wp.float64), array(loads, wp.float64)),
-        *(wp.float64(t1), array(times, wp.float64)),
-    ]
-    load(march.module, ["cpu"])
-    wp.launch(march, dim=1, inputs=given, device="cpu")
+    given = [table, numbers, windows.interval, states, modes, jumps, loads, t1, times]
+    arrays = [np.ascontiguousarray(part, float) for part in given]
+    march_of(Form.of(mechanics)).on_cpu(0, 1, *(array.ctypes.data for array in arrays), len(jumps), MOST)
     count = int(np.sum(np.isfinite(times)))
     assert times[count - 1] == t1, "it did not arrive"
     changed = 1 + np.flatnonzero(modes[1:count, 0] != modes[: count - 1, 0])
@@ -286,6 +256,7 @@ def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
 
 
 def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
+    monkeypatch.setattr(warp_library, "has_driver", lambda: True)
     monkeypatch.setattr(warp(), "get_cuda_devices", lambda: [type("Device", (), {"alias": "cuda:0"})()])
     assert gpus_for(LEAST_ON_GPUS) == ["cuda:0"] or jax.config.jax_platforms == "cpu"
     assert gpus_for(LEAST_ON_GPUS - 1) == []
@@ -299,14 +270,14 @@ def test_kernels_compile_for_a_gpu(paper_scene, tmp_path):
     """There is none here; the compiler for them is part of Warp."""
     with jax.enable_x64(True):
         mechanics, *_ = prepared(paper_scene, jnp.zeros(6))
-    of = programs(Form.of(mechanics))
-    before = dict(of.module.options)
+    of_warp = kernel(Form.of(mechanics)).of_warp
+    before = dict(of_warp.module.options)
     try:
-        warp().compile_aot_module(of.module, arch=90, module_dir=tmp_path, use_ptx=True)
+        warp().compile_aot_module(of_warp.module, arch=90, module_dir=tmp_path, use_ptx=True)
     finally:
-        of.module.options.update(before)
+        of_warp.module.options.update(before)
     (code,) = tmp_path.glob("*.ptx")
-    assert {"followed", "returned"} <= set(re.findall(r"entry programs__locals__([a-z]+)_", code.read_text()))
+    assert re.search(r"entry of_lanes", code.read_text())
 
 
 def everything(x, y):
@@ -330,33 +301,19 @@ def everything(x, y):
 
 
 def test_arithmetic_written_out_is_that_of_jax():
-    wp = warp()
     source, size = scalar_source(everything, x=2, y=3)
-    two, three, found_type = (wp.types.vector(length, wp.float64) for length in (2, 3, size))
-
-    @wp.func_native(f"wp::vec_t<{size}, wp::float64> found;\n{source}\nreturn found;")
-    def written(x: two, y: three) -> found_type: ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def evaluate(x: wp.array(dtype=two), y: wp.array(dtype=three), found: wp.array(dtype=found_type)):
-        i = wp.tid()
-        found[i] = written(x[i], y[i])
-
+    ends = f"double* found = (double*)founds + {size} * lane;\n"
+    given = "const double *x = (const double*)xs + 2 * lane, *y = (const double*)ys + 3 * lane;\n"
     random = np.random.default_rng(0)
     x, y = 3 * random.normal(size=(50, 2)), 3 * random.normal(size=(50, 3))  # where negative, not a number
     y[0], x[1] = 0.0, 0.0
-    found = wp.zeros(50, dtype=found_type, device="cpu")
-    load(evaluate.module, ["cpu"])
-    wp.launch(
-        evaluate,
-        dim=50,
-        inputs=[wp.array(x, dtype=two, device="cpu"), wp.array(y, dtype=three, device="cpu"), found],
-        device="cpu",
-    )
+    found = np.zeros((50, size))
+    evaluate = LaneFunction(given + ends + source, ("xs", "ys", "founds"))
+    evaluate.on_cpu(0, 50, *(array.ctypes.data for array in (x, y, found)))
     with jax.enable_x64(True):
         expected = np.array([everything(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(x, y, strict=True)])
     assert np.any(np.isnan(expected))
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
 def test_control_points_between_samples_are_those_of_the_cubic_with_the_gap_and_its_rate_at_both():
