@@ -253,7 +253,7 @@ def steps() -> None:
     with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
         batch = Batch(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16), mu[:, None], pool)
         trajectories = begin(batch, group, np.full((len(group), 1), 1.3))
-        kernels, prepared = batch.kernels, batch.shared.tree.prepared
+        kernels, prepared = batch.matrix_kernels, batch.shared.tree.prepared
         kernels.follow(group, trajectories, steps)
         found = []
         for _ in range(5):

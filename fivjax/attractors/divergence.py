@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..section.return_maps import ReturnMaps, Section
+from ..section.return_maps import ReturnMaps, Section, section_at
 from .motions import Motions
 
 # Over so many returns growth is measured, again and again, and so often at most: the first returns turn directions to where
@@ -18,6 +18,8 @@ APART = 1e-7
 # Neighbours have parted by so many e-folds since they were closest, as in chaos; or closed in by so many since they were
 # furthest apart, as on a cycle. On a torus they do both by turns, by two or three e-folds.
 PARTED, CLOSED_IN = 30.0, 15.0
+# What may be a torus is followed for longer where neighbours have parted by so many; and is none if they then part by so many.
+SUSPICIOUS, PARTED_ON_TORUS = 4.0, 12.0
 
 
 class Divergence(NamedTuple):
@@ -41,9 +43,9 @@ class _Growth(NamedTuple):
     path: Float[np.ndarray, "m k 2n"]  # the motions' weighted states on the section
 
 
-def long_divergence(maps: ReturnMaps, motions: Motions) -> Divergence:
+def long_divergence(maps: ReturnMaps, motions: Motions, chaotic_from: float = PARTED) -> Divergence:
     """Whether neighbours part or close in exponentially where these motions lead to: asked over thousands of returns, because
-    events may be rare. On a torus they do neither.
+    events may be rare. On a torus they do neither. They part exponentially if it is by so many e-folds.
     """
     group = motions.group
     first = maps.returns(*motions, 1)
@@ -61,7 +63,7 @@ def long_divergence(maps: ReturnMaps, motions: Motions) -> Divergence:
         # Not a number is neither.
         with np.errstate(invalid="ignore"):
             furthest = np.fmax(furthest, parted - least)
-            left = ((parted - least < PARTED) & (most - parted < CLOSED_IN))[running]
+            left = ((parted - least < chaotic_from) & (most - parted < CLOSED_IN))[running]
         running, at, beside = running[left], at.rows(left), beside[left]
         if not len(running):
             break
@@ -69,8 +71,35 @@ def long_divergence(maps: ReturnMaps, motions: Motions) -> Divergence:
         closing_in = most - parted >= CLOSED_IN
         # Where they have parted by more than on a torus before they close in, the motion was chaotic for a time: another
         # solver's rounding may lead to another attractor.
-        chaotic = furthest >= np.where(closing_in, 7.0, PARTED)
+        chaotic = furthest >= np.where(closing_in, 7.0, chaotic_from)
     return Divergence(chaotic, closing_in & ~chaotic, last, time, events)
+
+
+def parts_along(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], paths: Float[np.ndarray, "m k 2n"]
+) -> Bool[np.ndarray, " m"]:
+    """Whether neighbours part exponentially along these motions, by their weighted states on the section in order: chaos that
+    is as weak as an e-fold in some hundred returns looks like a torus in all other respects.
+    """
+    states = paths / maps.weights
+    beside, since = states[:, 0] * (1 + APART), np.zeros(len(group))
+    furthest = np.zeros(len(group))
+    for start in range(0, states.shape[1] - MEASURED_OVER, MEASURED_OVER):
+        here, there = states[:, start], states[:, start + MEASURED_OVER]
+        apart = np.linalg.norm(maps.weights * (beside - here), axis=1)
+        at = section_at(beside, maps.normal, maps.sliding[group])
+        away = maps.returns(group, at, MEASURED_OVER).at.y - there
+        distance = np.linalg.norm(maps.weights * away, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            since = np.fmax(since + np.log(distance / apart), 0.0)
+            step = APART * np.linalg.norm(maps.weights * there, axis=1) / distance
+        furthest = np.fmax(furthest, since)
+        beside = there + step[:, None] * away
+    chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < SUSPICIOUS))
+    if len(rows):
+        at = section_at(states[rows, -1], maps.normal, maps.sliding[group[rows]])
+        chaotic[rows] = long_divergence(maps, Motions(group[rows], at), PARTED_ON_TORUS).chaotic
+    return chaotic
 
 
 def growth_rates(maps: ReturnMaps, motions: Motions):

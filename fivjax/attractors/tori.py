@@ -4,7 +4,7 @@ and how high they go.
 A set counts as a torus by these checks, each with its tolerance beside it: the motion goes on and repeats nothing
 (`goes_on`), drifts no more (`is_drifting`), and its amplitude has settled (`_settled_amplitude`); whatever starts on the
 edge of a tube about the set comes back (`returning`); and motions that start there go about the same set without
-parting (`_attracting_tubes`, `_on_one_torus`).
+parting (`_attracting_tubes`, `_on_one_torus`), also along the whole of what was traced (`_chaotic`).
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from .cycles import (
     points_on,
     stable_cycles,
 )
-from .divergence import growth_rates
+from .divergence import growth_rates, parts_along
 from .motions import NOMINATED, Motions
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
 from .tube import Tube, thin, tree_of
@@ -98,6 +98,9 @@ def tori_from(
             new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
             for row in _with_cycles_amid(maps, group, traced, new):
                 del new[row]
+            for row in _chaotic(maps, group, traced, new):
+                del new[row], traced[row]
+                around.pop(row, None)
             found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
             locked += of_locked
             for row in {*new, *(row for row, _ in of_locked)}:
@@ -313,6 +316,18 @@ def _with_cycles_amid(
     stable = np.max(np.abs(np.linalg.eigvals(closed.jacobian)), axis=1) < 1
     found = zip((rows[k] for k in near), stable, points_on(maps, own[near], closed), strict=True)
     return sorted({row for row, attracts, y in found if attracts and np.all(tubes[row].holds(maps.weights * y))})
+
+
+def _chaotic(
+    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], tubes: dict[int, Tube]
+) -> list[int]:
+    """The rows of tubes that are about a motion from which neighbours part exponentially."""
+    rows = list(tubes)
+    if not rows:
+        return []
+    count = min(len(traced[row].states) for row in rows)
+    paths = np.array([traced[row].states[-count:] for row in rows])
+    return [row for row, parts in zip(rows, parts_along(maps, group[rows], paths), strict=True) if parts]
 
 
 def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]]:

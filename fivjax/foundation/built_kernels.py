@@ -24,6 +24,9 @@ GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and direction
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
 # What a kernel is told beside where they are: the length of a row of numbers, from one row of instants to the next, and theirs.
 SIZES = ("numbers", "step", "count")
+# Where trajectories share numbers in groups: where these are, and the group of each; they are told the length of a group's row.
+OF_GROUPS = ("shared", "groups")
+_SHARED = "const double* shared = (const double*)shared_ + (long long)each_ * ((const int*)groups_)[lane];\n"
 _NO_DOTS = np.zeros((1, 1, 1))
 
 
@@ -36,34 +39,41 @@ def width_for(directions: int, numbers: int) -> int:
 class Kernel:
     """A compiled kernel: of a `KernelFunction`, or of the one whose derivatives are taken, with so many directions."""
 
-    def __init__(self, function, form: Form, wide: tuple[bool, ...], width: int):
+    def __init__(self, function, form: Form, wide: tuple[bool, ...], width: int, shared: int):
         own = function.differentiated if width else function.function
         self.function, self.form, self.wide, self.width = own, form, wide, width
-        self.text = text(kept_value(written, own, form, wide))
-        body = _body(self.text.source, self.text.widths, width)
-        self.of_lanes = LaneFunction(body, [f"{name}_" for name in (*GIVEN, *FOUND)], [f"{name}_" for name in SIZES])
+        self.text = text(kept_value(written, own, form, wide, shared))
+        places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
+        body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)
+        self.of_lanes = LaneFunction(body, [f"{name}_" for name in places], [f"{name}_" for name in sizes])
 
-    def launched(self, given, instants, dots=None, pool: Executor | None = None):
-        """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both."""
+    def launched(self, given, instants, dots=None, pool: Executor | None = None, groups: tuple | None = None):
+        """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both. `groups` are
+        the rows of numbers that are shared, and which of these each trajectory has.
+        """
         # Tangents that do not depend on what is perturbed are not written: they are zero.
         found = tuple(np.zeros(shape) for shape in self.shapes(given.shape[:-1], instants.shape[-1]))
         rows = [np.ascontiguousarray(part) for part in (given, _NO_DOTS if dots is None else dots, instants)]
         # Several tangents side by side are a type of the compiler for CPUs.
-        if self.width <= 1 and (devices := gpus_for(len(given))):
+        if groups is None and self.width <= 1 and (devices := gpus_for(len(given))):
 
             def told(_, arrays) -> list[int]:
                 return _told([(array.ptr or 0, array.shape) for array in arrays])
 
             self.of_lanes.on_gpus(devices, rows, found, told)
         else:
-            self.launch([(array.ctypes.data, array.shape) for array in (*rows, *found)], pool)
+            self.launch([(array.ctypes.data, array.shape) for array in (*rows, *found)], pool, groups)
         return found
 
-    def launch(self, places: Places, pool: Executor | None = None) -> None:
+    def launch(self, places: Places, pool: Executor | None = None, groups: tuple | None = None) -> None:
         """The same on the CPU for arrays at these places, in as many threads as there are cores."""
-        lanes = places[len(GIVEN)][1][0]
+        lanes, told = places[len(GIVEN)][1][0], _told(places)
+        if groups is not None:
+            table, group = np.ascontiguousarray(groups[0], float), np.ascontiguousarray(groups[1], np.int32)
+            told[len(places) : len(places)] = table.ctypes.data, group.ctypes.data
+            told.append(table.shape[1])
         alone = lanes == 1 or (pool is None and lanes < LEAST_IN_THREADS)
-        self.of_lanes.in_parts(_told(places), lanes, 1 if alone else min(lanes, AT_A_TIME * workers()), pool)
+        self.of_lanes.in_parts(told, lanes, 1 if alone else min(lanes, AT_A_TIME * workers()), pool)
 
     def shapes(self, batch: tuple[int, ...], count: int) -> tuple[tuple[int, ...], ...]:
         """Those of what is found, for a batch of trajectories with so many instants."""
@@ -106,13 +116,15 @@ _KERNELS: dict = {}
 _making = threading.RLock()
 
 
-def kernel_of(function, form: Form, wide: tuple[bool, ...] = (), width: int = 0) -> Kernel:
-    """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`."""
-    key = function, form.kept, wide, width
+def kernel_of(function, form: Form, wide: tuple[bool, ...] = (), width: int = 0, shared: int = 0) -> Kernel:
+    """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`. So
+    many of the first arrays are `shared` by the trajectories of a group.
+    """
+    key = function, form.kept, wide, width, shared
     if key not in _KERNELS:
         with _making:
             if key not in _KERNELS:
-                _KERNELS[key] = Kernel(function, form, wide, width)
+                _KERNELS[key] = Kernel(function, form, wide, width, shared)
     return _KERNELS[key]
 
 

@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .built_kernels import kernel_of, width_for
 from .compiling import compiled
@@ -91,6 +91,19 @@ class KernelFunction:
         """
         kernel = kernel_of(self, form)
         return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
+
+    def of_groups(
+        self,
+        form: Form,
+        shared: int,
+        table: Float[np.ndarray, "groups numbers"],
+        group: Int[np.ndarray, " lanes"],
+        given: Float[np.ndarray, "lanes numbers"],
+        pool: Executor | None = None,
+    ):
+        """The same where so many of the first arrays are `shared` by the trajectories of a group: it has a row of the table."""
+        kernel = kernel_of(self, form, shared=shared)
+        return kernel.results(*kernel.launched(given, np.atleast_2d(NO_ROWS), pool=pool, groups=(table, group))[:2])
 
     def derived_of_many(
         self, form: Form, given, instants, wide: tuple[bool, ...], directions, pool: Executor | None = None

@@ -134,9 +134,9 @@ class Text:
         return ends, rows, end_dots, row_dots
 
 
-def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
+def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0) -> tuple:
     """A `Text`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its arrays
-    that are `wide`.
+    that are `wide`. So many of the first arrays are `shared` by the trajectories of a group.
     """
     like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
     instants = jax.ShapeDtypeStruct((2,), np.dtype("float64"))
@@ -169,7 +169,7 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...]) -> tuple:
         # What is asked for: no more is written.
         jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
         lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
-        of_kernel = _WriterOfKernel(jaxpr, len(like), len(moving), lengths)
+        of_kernel = _WriterOfKernel(jaxpr, shared, len(like), lengths)
         # Numbers that are known are computed now, whatever is being traced around this.
         with jax.ensure_compile_time_eval():
             source = of_kernel.source(traced.consts)
@@ -201,13 +201,13 @@ def _places(avals, leading: int = 0) -> list[tuple[int, tuple[int, ...], str]]:
 class _WriterOfKernel:
     """Writes a traced function whose results are at the end, and in rows: values, and tangents."""
 
-    def __init__(self, jaxpr, given: int, moving: int, lengths):
-        self.jaxpr, self.given, self.moving = jaxpr, given, moving
+    def __init__(self, jaxpr, shared: int, given: int, lengths):
+        self.jaxpr, self.shared, self.given = jaxpr, shared, given
         self.ends, self.rows, self.end_dots, self.row_dots = (
             jaxpr.outvars[start:end] for start, end in zip([0, *lengths], [*lengths, None], strict=True)
         )
         self.writer = writer(
-            {"given": "double", "dots": WIDE, "instants": "double", "rows": "double", "row_dots": WIDE}
+            {**dict.fromkeys(("shared", "given", "instants", "rows"), "double"), "dots": WIDE, "row_dots": WIDE}
         )
 
     def source(self, consts) -> str:
@@ -219,8 +219,9 @@ class _WriterOfKernel:
                 "A kernel's function must go along its instants by one `scan`, and use them nowhere else."
             )
         known: dict = dict(zip(jaxpr.constvars, map(of_numbers, consts), strict=True))
-        known |= dict(zip(numbers[: self.given], _given(writer, "given", numbers[: self.given]), strict=True))
-        known |= dict(zip(numbers[self.given :], _given(writer, "dots", numbers[self.given :]), strict=True))
+        shared, given, dots = numbers[: self.shared], numbers[self.shared : self.given], numbers[self.given :]
+        for name, own in (("shared", shared), ("given", given), ("dots", dots)):
+            known |= dict(zip(own, _given(writer, name, own), strict=True))
         known[instants] = View("instants", (0,), (2,), (1,), "double")
 
         def read(atom) -> Value:

@@ -89,7 +89,9 @@ _HANDLERS: dict[str, _Handler] = {}
 Places = list[tuple[int, tuple[int, ...]]]
 
 
-def called_by_xla(name: str, function: Callable[[Places], None]) -> Callable[[Sequence[jax.ShapeDtypeStruct]], Callable]:
+def called_by_xla(
+    name: str, function: Callable[[Places], None]
+) -> Callable[[Sequence[jax.ShapeDtypeStruct]], Callable]:
     """A function of JAX arrays, under `jit` on a CPU, for shapes and types of the results.
 
     `function` is told where the arrays are, then the results, which it writes; their content is arbitrary before.

@@ -26,7 +26,6 @@ from .following import Batch, bounds
 from .job_files import JobState
 from .one_trajectory import Progress
 from .results import APPROACHED, CHAOTIC, NO_ATTRACTOR, PERIODIC, TORUS
-from .series_kernels import SeriesKernels
 
 
 class Late(NamedTuple):
@@ -66,14 +65,10 @@ class Capture:
         return Catalogue(maps, known, self.report, self.batch.task.from_afar)
 
     def _return_maps(self) -> ReturnMaps:
-        batch, tree, kernels = self.batch, self.batch.shared.tree, self.batch.kernels
-        scene = batch.task.scene
-        exact = kernels is not None or isinstance(batch.task.method, EventExact)
+        batch, tree, scene = self.batch, self.batch.shared.tree, self.batch.task.scene
+        exact = batch.kernels is not None or isinstance(batch.task.method, EventExact)
         # Return maps are exact whatever follows the trajectories.
-        if kernels is None:
-            kernels = section_kernels(scene, tree.mechanics, tree.longest_return, batch.pool)
-        elif isinstance(kernels, SeriesKernels):
-            kernels = kernels.of_section
+        kernels = batch.matrix_kernels or section_kernels(scene, tree.mechanics, tree.longest_return, batch.pool)
         known_to = ROUNDED if exact else INTERPOLATED
         return ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, kernels, batch.pool, known_to)
 

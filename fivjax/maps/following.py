@@ -21,7 +21,7 @@ from ..foundation.kept_programs import kept
 from ..section.return_maps import BLOCK, Section, of_block
 from ..verdicts.sliding_proof import SlidingModes, used_up
 from .groups import Shared, Task, shared_by, with_values
-from .matrix_kernels import MatrixKernels, begin_building, for_conclusions
+from .matrix_kernels import MatrixKernels, begin_building
 from .one_trajectory import (
     UNBOUNDED_FROM,
     Progress,
@@ -31,7 +31,7 @@ from .one_trajectory import (
     with_initial_values,
     with_step,
 )
-from .series_kernels import SeriesKernels
+from .trajectory_kernels import TrajectoryKernels
 
 
 class Batch:
@@ -46,27 +46,29 @@ class Batch:
         self.block = BLOCK_OF_SEVERAL if len(task.scene.structure.contacts) > 1 else None
 
     @cached_property
-    def kernels(self) -> MatrixKernels | SeriesKernels | None:
-        """The kernels that follow the trajectories, if any do."""
-        if self.task.by_kernel:
-            return MatrixKernels(self.shared, self.pool)
-        return SeriesKernels(self.task, self.shared, self.pool) if self.task.by_series else None
+    def kernels(self) -> TrajectoryKernels | None:
+        """The kernels of trajectories, if there are any."""
+        by_kernel = self.task.by_kernel or self.task.by_series
+        return TrajectoryKernels(self.task, self.shared, self.pool) if by_kernel else None
+
+    @cached_property
+    def matrix_kernels(self) -> MatrixKernels | None:
+        """The kernels that step by matrices, if any do."""
+        return MatrixKernels(self.shared, self.pool) if self.task.by_kernel else None
 
 
 def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
     """Trajectories at their beginning, each with its kick and initial values in `columns`."""
     task = batch.task
+    if batch.kernels is not None:
+        return batch.kernels.begin(group, columns)
 
     def function(*block):
-        states = tuple(task.states.values())
-        return _begin_block(task.scene, task.names, task.history, states, task.limits.energy, task.by_kernel, *block)
+        return _begin_block(
+            task.scene, task.names, task.history, tuple(task.states.values()), task.limits.energy, *block
+        )
 
-    trajectories = in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
-    if (task.by_kernel or task.by_series) and len(group):
-        # What concludes is compiled while the kernels are being built.
-        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], trajectories.tree)
-        _conclude(batch, for_conclusions(batch.shared), np.zeros(1, int), columns, now, np.array(now.t))
-    return trajectories
+    return in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
 
 
 def follow(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
@@ -84,17 +86,15 @@ def follow(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, 
 
 
 def _follow_by_kernel(
-    batch: Batch, kernels: MatrixKernels | SeriesKernels, group: np.ndarray, trajectories: Flattened, steps: int
+    batch: Batch, kernels: TrajectoryKernels, group: np.ndarray, trajectories: Flattened, steps: int
 ) -> None:
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events
-    kernels.follow(group, trajectories, steps)
+    (batch.matrix_kernels or kernels).follow(group, trajectories, steps)
     # While its mode changes again and again, nothing can be proved of a trajectory.
     asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
     if len(asks):
-        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[asks], trajectories.tree)
-        concluded = _conclude(batch, kernels.for_conclusions, group[asks], columns, now, began[asks])
-        trajectories.numbers[asks] = concluded.numbers
+        kernels.conclude(group, trajectories, asks, began)
 
 
 def _may_be_concluded(
@@ -107,18 +107,6 @@ def _may_be_concluded(
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
     quiet = np.True_ if now.steps is None else np.all(now.steps.jumps <= now.t[:, None], axis=1)
     return (quiet & (now.events == events)) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * now.yardstick)
-
-
-def _conclude(
-    batch: Batch, shared: Flattened, group: np.ndarray, columns, now: Progress, began: np.ndarray
-) -> Flattened:
-    task = batch.task
-
-    def function(*block):
-        return _conclude_block(task.scene, task.method, task.names, task.history, *block)
-
-    # They are few of each group (a critical kick has a dozen), and what they share is little.
-    return in_blocks(function, shared, group, flatten((columns, now, began)), 8, batch.pool, size=64)
 
 
 def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:
@@ -141,15 +129,13 @@ def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
 
 
 @kept
-def _begin_block(
-    scene, names, history, states, energy: bool, for_kernel: bool, shared: Flattened, trajectories: Flattened
-) -> Flattened:
+def _begin_block(scene, names, history, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
     def group(shared, columns):
         own = with_values(scene, names, shared.values)
 
         def one(row):
             scene = with_values(own, history, row)
-            now = at_equilibrium(scene, shared, energy, for_kernel)
+            now = at_equilibrium(scene, shared, energy, for_kernel=False)
             return with_initial_values(now, scene, shared, states, row[len(history) :])
 
         return jax.vmap(one)(columns)
@@ -169,13 +155,6 @@ def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajec
 
 
 _follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
-
-
-@kept
-def _conclude_block(scene, method, names, history, shared: Flattened, trajectories: Flattened) -> Flattened:
-    columns, after, began = trajectories.tree
-    concluded = _of_all(scene, method, names, history, shared.tree, columns, conclude)
-    return flatten((columns, concluded(began, after)), row_axes=2)
 
 
 def _of_all(scene, method, names, history, everything: Shared, columns, function):

@@ -9,13 +9,12 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Int
 
 from ..foundation.blocks import workers
-from ..foundation.flattened import Flattened, flatten
+from ..foundation.flattened import Flattened
 from ..foundation.lane_functions import AT_A_TIME, LaneFunction
 from ..foundation.warp_library import gpus_for, warp
 from ..section.about_sliding import mechanics_about_sliding
@@ -71,19 +70,12 @@ def begin_building(task: Task, pool: Executor) -> None:
     pool.submit(lambda: kernel(_FORMS[key]).on_cpu)
 
 
-def for_conclusions(shared: Flattened) -> Flattened:
-    """What the proofs that are not left to kernels need: not the matrices."""
-    without = eqx.tree_at(lambda shared: shared.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
-    return flatten(jax.tree.map(np.asarray, without))
-
-
 class MatrixKernels:
     """The kernel for a batch, with the data of its groups on each device."""
 
     def __init__(self, shared: Flattened, pool: Executor):
         mechanics, prepared = shared.tree.mechanics, shared.tree.prepared
         self.pool, self.kernel = pool, kernel(Form.of(mechanics, leading=1))
-        self.for_conclusions = for_conclusions(shared)
         self.longest = np.asarray(shared.tree.longest_return)
         numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)

@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ..contact import Contact, Mechanics, State, Status
+from ..foundation import complex_pairs
+from ..foundation.complex_pairs import Pair
 from ..foundation.precision import in_double_precision
 from ..linear.linearisation import LOWEST_SLIP, LinearSliding
 from ..model.friction_per_contact import FrictionPerContact
@@ -157,7 +159,7 @@ def used_up(
     """
     linear = modes.linear
     z = deviation[sliding_states(deviation.shape[0] // 2, mechanics.normal)]
-    modal = modes.to_modal @ z.astype(modes.to_modal.dtype)
+    modal = complex_pairs.from_real(modes.to_modal, z)
     slides = (contact.status == Status.SLIDE) & (contact.direction == linear.direction)
     sliding = (jnp.all(slides) if mechanics.several else slides) & under_final_load
     sliding = sliding & modes.stable & linear.exists
@@ -169,13 +171,14 @@ def used_up(
     # The bound is costly. As the body of a loop it is computed for a batch only if some trajectory needs it: one for which
     # pressing and slip, with each cluster of modes at its present size, are within their margins.
     for shares, margin in parts:
-        sliding = sliding & (jnp.sum(jnp.hypot(members @ shares.real, members @ shares.imag)) < margin)
+        of_clusters = Pair(members @ shares.real, members @ shares.imag)
+        sliding = sliding & (jnp.sum(complex_pairs.size(of_clusters)) < margin)
 
     def bound(carry):
         _, _, signals = carry
         used = [envelope_peak(part, modes.envelope) / margin for part, (_, margin) in zip(signals, parts, strict=True)]
         # The loop changes `signals`, because XLA would move work on loop constants out of the loop and always compute it.
-        return jnp.zeros_like(sliding), jnp.max(jnp.stack(used)), [jnp.zeros_like(shares) for shares in signals]
+        return jnp.zeros_like(sliding), jnp.max(jnp.stack(used)), jax.tree.map(jnp.zeros_like, signals)
 
     begin = sliding, jnp.full_like(linear.slip_margin.ravel()[0], jnp.inf), [shares for shares, _ in parts]
     found = jax.lax.while_loop(lambda carry: carry[0], bound, begin)[1]
@@ -187,9 +190,9 @@ def _where_known(known: Bool[Array, ""], used: Float[Array, ""]) -> Float[Array,
     return jnp.where(known & (used >= 0), used, jnp.inf)
 
 
-def _parts(shares: Complex[Array, "*contacts k"], modal: Complex[Array, " k"], margin: Float[Array, "*contacts"]):
+def _parts(shares, modal: Pair, margin: Float[Array, "*contacts"]) -> list[tuple[Pair, Float[Array, ""]]]:
     """Of each contact the parts of the modes in a quantity with these shares, and how far it may fall."""
-    parts = shares * modal
+    parts = complex_pairs.times(shares, modal)
     return [(parts, margin)] if margin.ndim == 0 else [(parts[i], margin[i]) for i in range(len(margin))]
 
 
@@ -244,7 +247,7 @@ def envelope(eigenvalues: np.ndarray, clusters: np.ndarray) -> Envelope:
         )
 
 
-def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Array, ""]:
+def envelope_peak(shares: Complex[Array, " k"] | Pair, envelope: Envelope) -> Float[Array, ""]:
     r"""An upper bound on $\sup_{t ≥ 0} |\mathrm{Re} \sum_k a_k e^{λ_k t}|$ for decaying modes, which is tight for nearly
     parallel modes, too.
 
@@ -254,7 +257,7 @@ def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Arr
     $|u''| ≤ \sum |a_k| |λ_k - \barλ|^2 e^{…}$ is small. After the last instant the sum of sizes has decayed and is a sufficient
     bound. Clusters are bounded one by one.
     """
-    sizes = jnp.abs(shares)
+    sizes = complex_pairs.size(shares)
     growth = envelope.growth
     real, imag = (
         growth.real @ shares.real - growth.imag @ shares.imag,
@@ -268,7 +271,7 @@ def envelope_peak(shares: Complex[Array, " k"], envelope: Envelope) -> Float[Arr
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
-def _used_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Float[Array, ""]:
+def _used_nonlinearly(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
     r"""The share of what keeps it decaying that a motion uses up, for friction that depends on slip speed.
 
     The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
@@ -277,15 +280,15 @@ def _used_nonlinearly(modes: SlidingModes, modal: Complex[Array, " k"]) -> Float
     """
     linear = modes.linear
     balance = linear.slip_margin / linear.pressing_margin
-    weights = jnp.abs(modes.slip) + balance * jnp.abs(modes.pressing)
-    size = jnp.sum(weights * jnp.abs(modal))
-    drive = jnp.sum(weights * jnp.abs(modes.remainder))
+    weights = complex_pairs.size(modes.slip) + balance * complex_pairs.size(modes.pressing)
+    size = jnp.sum(weights * complex_pairs.size(modal))
+    drive = jnp.sum(weights * complex_pairs.size(modes.remainder))
     bend = 0.5 * linear.pressing_margin * linear.remainder_curvature + linear.remainder_slope / balance
     rate = -jnp.max(modes.eigenvalues.real)
     return jnp.maximum(drive * bend * size / rate, size / (linear.reach * linear.slip_margin))
 
 
-def _used_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"]) -> Float[Array, ""]:
+def _used_nonlinearly_together(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
     r"""The same for several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any normal force or slip
     speed, relative to its margin. No slip speed then changes by more than $E$ times its margin, nor does a normal force under
     constant friction. Up to $E$ = `LinearSliding.reach` no normal force reaches zero either, the remainders are at most
@@ -293,13 +296,13 @@ def _used_nonlinearly_together(modes: SlidingModes, modal: Complex[Array, " k"])
     """
     linear = modes.linear
     weights = jnp.maximum(_largest(modes.slip, linear.slip_margin), _largest(modes.pressing, linear.pressing_margin))
-    size = jnp.sum(weights * jnp.abs(modal))
-    drive = jnp.einsum("ck,k->c", jnp.abs(modes.remainder), weights)
+    size = jnp.sum(weights * complex_pairs.size(modal))
+    drive = complex_pairs.size(modes.remainder) @ weights
     bend = linear.remainder_slope + 0.5 * linear.remainder_curvature
     rate = -jnp.max(modes.eigenvalues.real)
     return jnp.maximum(jnp.sum(drive * bend) * size / rate, size / linear.reach)
 
 
-def _largest(shares: Complex[Array, "contacts k"], margin: Float[Array, " contacts"]) -> Float[Array, " k"]:
+def _largest(shares, margin: Float[Array, " contacts"]) -> Float[Array, " k"]:
     """The largest share of each mode in a quantity of any contact, relative to its margin."""
-    return jnp.max(jnp.abs(shares) / margin[:, None], axis=0)
+    return jnp.max(complex_pairs.size(shares) / margin[:, None], axis=0)

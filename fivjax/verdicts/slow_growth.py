@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact, Mechanics, State, Status
+from ..foundation import complex_pairs
+from ..foundation.complex_pairs import Pair
 from ..model.sliding import sliding_states
 from .sliding_proof import SlidingModes
 
@@ -23,10 +25,11 @@ def slid_on(
     """
     linear = modes.linear
     keep = sliding_states(deviation.shape[0] // 2, mechanics.normal)
-    modal = modes.to_modal @ deviation[keep].astype(modes.to_modal.dtype)
+    modal = complex_pairs.from_real(modes.to_modal, deviation[keep])
     growth = jnp.max(modes.eigenvalues.real)
     sliding = (contact.status == Status.SLIDE) & (contact.direction == linear.direction) & linear.exists & allowed
-    sizes = jnp.stack([jnp.sum(jnp.abs(shares * modal)) for shares in (modes.pressing, modes.slip)])
+    parts = [complex_pairs.times(shares, modal) for shares in (modes.pressing, modes.slip)]
+    sizes = jnp.stack([jnp.sum(complex_pairs.size(part)) for part in parts])
     margins = jnp.stack([linear.pressing_margin, linear.slip_margin])
     # The share of the time for which sliding is certain that is used, because rounding must not lead past an event.
     used = 0.999
@@ -37,5 +40,6 @@ def slid_on(
     worthwhile = time * frequency > least_periods * 2 * jnp.pi
     taken = sliding & modes.regular & (growth > 0) & worthwhile & jnp.isfinite(time)
     time = jnp.where(taken, time, 0.0)
-    moved = (modes.from_modal @ (jnp.exp(modes.eigenvalues * time) * modal)).real
+    rates = Pair(modes.eigenvalues.real * time, modes.eigenvalues.imag * time)
+    moved = complex_pairs.real_part(modes.from_modal, complex_pairs.times(complex_pairs.exponential(rates), modal))
     return jnp.where(taken, deviation.at[keep].set(moved), deviation), time

@@ -558,3 +558,39 @@ def test_a_cycle_that_meets_the_section_by_an_impact_is_followed_to_neighbours(p
         slope = float(jax.grad(period)(0.209064))
     ahead, behind = (fj.limit_cycle(scene.replace(mu=0.209064 + by), cycle).period for by in (apart, -apart))
     assert slope == pytest.approx((ahead - behind) / (2 * apart), rel=1e-6)
+
+
+def test_chaos_that_is_weak_is_no_torus():
+    """A mass that rebounds: all comes back to a set that looks like a torus, but on it neighbours part, by an e-fold in a hundred
+    returns. As a torus it had an amplitude that depended on who asked.
+    """
+    structure = fj.Structure(
+        np.diag([0.308732979187, 0.479436124607, 0.767955326046]),
+        [
+            [0.733579309965, 0.0607571807613, -0.0926634184535],
+            [0.0607571807613, 1.38939187244, 0.161218917496],
+            [-0.0926634184535, 0.161218917496, 1.80956193225],
+        ],
+        [
+            [26275.3815088, 3621.83960569, -5523.82508122],
+            [3621.83960569, 55718.6131007, 9610.53579609],
+            [-5523.82508122, 9610.53579609, 64453.9392079],
+        ],
+        [0.0, -0.5, -1.0],
+        tangential=0,
+        normal=2,
+    )
+    load = fj.Pulse(60.139180619, p=1.5, duration=0.0199395041492)
+    scene = fj.Scene(structure, fj.Coulomb(0.77515979742), 1.63774019416, load, restitution=0.694981415156)
+    run = fj.simulate(scene, 30.0, 0.1)
+    begun = np.concatenate([run.displacement[-1], run.velocity[-1]])
+    at_rest = scene.replace(p=1.0)
+    beside = begun.copy()
+    beside[:2] *= 1 + 1e-10
+    one, other = (fj.simulate(at_rest, 20.0, 0.1, y0=y0) for y0 in (begun, beside))
+    apart = np.linalg.norm(one.velocity - other.velocity, axis=1)
+    assert np.max(apart[-20:]) > 1e6 * np.max(apart[:5]) and np.max(np.abs(one.velocity)) < 10
+    found = fj.bistability_map(scene, p=[1.5, 3.0], progress=False)
+    assert np.all(found["verdict"] == fj.Verdict.UNDECIDED) and np.all(found["chaotic"])
+    with pytest.raises(fj.NoLimitCycle):
+        fj.limit_cycle(scene)

@@ -1,0 +1,121 @@
+"""Trajectories begun, followed and concluded by kernels, of which each does for one trajectory what `one_trajectory` says."""
+
+from concurrent.futures import Executor
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..foundation.built_kernels import kernel_of
+from ..foundation.carried import depending_on
+from ..foundation.complex_pairs import in_pairs
+from ..foundation.flattened import Flattened, flatten
+from ..foundation.kernel_functions import KernelFunction
+from ..foundation.kernel_text import Form
+from ..model.scene import Scene
+from ..section.by_kernel import in_parts, numbers_in_rows
+from ..steppers.base import AbstractStepper
+from ..steppers.propagation import Propagation
+from .groups import Shared, Task, with_values
+from .one_trajectory import Progress, Setting, at_equilibrium, conclude, with_initial_values, with_step
+
+
+class OfTask(eqx.Module):
+    """What is the same for all trajectories of a run."""
+
+    scene: Scene
+    names: tuple[str, ...] = eqx.field(static=True)
+    history: tuple[str, ...] = eqx.field(static=True)
+    states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
+    method: AbstractStepper | Propagation = eqx.field(static=True)
+    energy: bool = eqx.field(static=True)
+
+    def setting(self, shared: Shared, row) -> Setting:
+        """That of a trajectory with these values of the parameters of the kick."""
+        scene = with_values(with_values(self.scene, self.names, shared.values), self.history, row)
+        return Setting(scene, self.method, shared)
+
+
+def _begin_one(args, instants):
+    of_task, shared, row = args
+    scene = of_task.setting(shared, row).scene
+    now = at_equilibrium(scene, shared, of_task.energy, isinstance(of_task.method, Propagation))
+    return with_initial_values(now, scene, shared, of_task.states, row[len(of_task.history) :]), ()
+
+
+def _follow_one(args, instants):
+    """So many steps further, by series."""
+    of_task, shared, row, now, steps = args
+    shared = eqx.tree_at(lambda own: own.prepared, shared, shared.mechanics, is_leaf=lambda leaf: leaf is None)
+    setting = of_task.setting(shared, row)
+    begin = depending_on((setting.scene, shared.mechanics), now)
+    return jax.lax.fori_loop(0, steps, lambda _, now: with_step(setting, now), begin), ()
+
+
+def _conclude_one(args, instants):
+    of_task, shared, row, now, began = args
+    after = conclude(of_task.setting(shared, row), began, now)
+    return (after.t, after.skipped, after.y, after.verdict, after.bound), ()
+
+
+_begin, _follow, _conclude = map(KernelFunction, (_begin_one, _follow_one, _conclude_one))
+
+
+class TrajectoryKernels:
+    """The kernels for a batch, with the data of its groups."""
+
+    def __init__(self, task: Task, shared: Flattened, pool: Executor):
+        self.of_task = OfTask(
+            task.scene, task.names, task.history, tuple(task.states.values()), task.method, task.limits.energy
+        )
+        # Without the matrices of `Propagation`, which have a kernel of their own.
+        without = eqx.tree_at(lambda own: own.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
+        of_groups = in_pairs(jax.tree.map(np.asarray, without))
+        self.first = jax.tree.map(lambda leaf: leaf[0], of_groups)
+        rows = numbers_in_rows(of_groups)
+        of_all = numbers_in_rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.of_task))
+        self.table = np.concatenate([np.broadcast_to(of_all, (len(rows), of_all.shape[1])), rows], axis=1)
+        self.shared, self.pool = len(jax.tree.leaves((self.of_task, self.first))), pool
+
+    def begin(self, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
+        """Trajectories at their beginning, each with its kick and initial values."""
+        progress: Progress = self._of_each(_begin, group, (columns,))
+        trajectories = flatten((columns, progress))
+        if len(group):
+            # What concludes is compiled while other kernels are.
+            own = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], (columns, progress, progress.t))
+            self.pool.submit(lambda: kernel_of(_conclude, self._form(own), shared=self.shared).of_lanes.on_cpu)
+        return trajectories
+
+    def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
+        """Trajectories so many steps further by series, in place."""
+        columns, now = trajectories.tree
+        after = self._of_each(_follow, group, (columns, now, np.full(len(group), steps, np.int32)))
+        trajectories.numbers[:, columns.shape[-1] :] = flatten(after).numbers
+
+    def conclude(
+        self, group: Int[np.ndarray, " m"], trajectories: Flattened, rows: Int[np.ndarray, " r"], began
+    ) -> None:
+        """These trajectories with their verdicts, where they can be proved by now, in place. `began` is the time (s) at which
+        the present round of steps began.
+        """
+        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], trajectories.tree)
+        found = self._of_each(_conclude, group[rows], (columns, now, began[rows]))
+        _, at = trajectories.starts
+        for start, part in zip((at.t, at.skipped, at.y, at.verdict, at.bound), found, strict=True):
+            part = part.reshape(len(rows), -1)
+            trajectories.numbers[rows, start : start + part.shape[1]] = part
+
+    def _form(self, own: tuple) -> Form:
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
+        return Form.of((self.of_task, self.first, *first))[0]
+
+    def _of_each(self, function: KernelFunction, group: np.ndarray, own: tuple):
+        """The results of a kernel for each trajectory, of its group's data and its own."""
+        form, given = self._form(own), numbers_in_rows(own)
+        parts = [
+            function.of_groups(form, self.shared, self.table, group[rows], given[rows], self.pool)[0]
+            for rows in in_parts(len(group), 8 * given.shape[1])
+        ]
+        return jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]
