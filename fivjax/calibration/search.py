@@ -26,7 +26,7 @@ from .problem import About, Problem
 from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_aside
 from .waveform_misfit import KickMisfit
 
-# Number of guesses that go on from the coarse residuals to the waveform.
+# Number of guesses that go on from the coarse residuals to the waveform, beside the scene's own parameters.
 KEPT = 4
 # The most guesses of a limit cycle that are fitted, until one explains the recording; and steps to bring one to the frequency.
 MOST_IN_TURN, FREQUENCY_STEPS = 16, 2
@@ -141,7 +141,9 @@ class Search:
             )
             self.evaluations += found[-1].evaluations
         best_first = [one.x for one in sorted(found, key=lambda one: one.at.cost)]
-        return [Candidate(self.problem.first(x), None) for x in _distinct([*best_first, *self.guesses])[:KEPT]]
+        # Of an aliased recording coarse residuals say little. So the scene's own parameters go on, whatever others promise.
+        kept = _distinct([*best_first, *self.guesses])[:KEPT]
+        return [Candidate(self.problem.first(x), None) for x in _distinct([*kept, found[0].x, self.guesses[0]])]
 
     def _with_offsets(self, candidates: list[Candidate]) -> list[Candidate]:
         """The candidates with the time offsets at which each agrees best, over the whole recording or its beginning."""

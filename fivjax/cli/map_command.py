@@ -50,7 +50,7 @@ class Map:
     refine: int = 0
     """how often to halve the intervals where neighbours differ"""
     t_max: float | None = None
-    """time after which a trajectory without a verdict is called undecided (s); 20 s or 2000 periods unless given"""
+    """time after which a trajectory without a verdict is called undecided (s); 2000 periods of the slowest mode unless given"""
     memory: float = 2e9
     """memory for all jobs that run at a time (bytes)"""
     resume: Resume = None

@@ -119,7 +119,8 @@ def open(path: str | Path) -> "xr.Dataset":
 
     path = arguments.path("path", path)
     if not path.is_file():
-        raise ValueError(f"File `{path}` {'is a folder' if path.is_dir() else 'does not exist'}.")
+        folder = "is a folder; give the name of a file, or open a map's folder.zarr by `xarray.open_zarr`"
+        raise ValueError(f"File `{path}` {folder if path.is_dir() else 'does not exist'}.")
     accessor.register()
     attributes, variables = read_netcdf(path)
     # Of damaged or hostile names, sizes and attributes, xarray makes errors of many kinds.

@@ -218,8 +218,15 @@ def _instants(t, count: int) -> np.ndarray:
         return np.arange(count) / float(array)
     if array.shape != (count,):
         raise ValueError(f"Argument `t` must hold {count} instants, one for each sample, but has shape {array.shape}.")
-    array = arguments.axis("t", array)
     steps = np.diff(array)
+    if np.any(steps <= 0):
+        at = int(np.argmax(steps <= 0))
+        before, after = apart(*array[at : at + 2])
+        raise ValueError(
+            f"Argument `t` must be strictly increasing, but goes from {before} to {after} s after sample {at}. Sort the samples "
+            "of all signals along with it (`numpy.argsort`), and drop those that repeat."
+        )
+    arguments.axis("t", array)
     step = (array[-1] - array[0]) / (count - 1)
     off = np.abs(steps - step)
     if off.max() > UNEVEN * step:

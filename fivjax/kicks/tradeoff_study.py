@@ -76,7 +76,8 @@ def tradeoff(
 
     **Returns:** a dataset over `stepper` and `precision`: `cost` (s per trajectory-cycle: one trajectory over one period of the
     least stable sliding mode, on this machine, without compilation), `state_error` (of the worst coordinate, relative to
-    the largest displacement or velocity), `p_crit_error`, `wrong_verdicts` and `undecided` (shares of the kicks). The reference
+    the largest displacement or velocity), `p_crit_error` (NaN if by this method no kick within 0.05 of the critical one leads
+    to vibration, or none does not), `wrong_verdicts` and `undecided` (shares of the kicks). The reference
     is `EventExact(order=20)` at a tenth of the tolerance. `part_cost` over `part` is the cost of parts of the work, relative to
     that of the event-exact end state alone. With `refine`, over `halvings`: `refined_seconds`, `refined_computed` (the share of
     the points that were computed) and `refined_wrong` (that of points with a wrong verdict). The attribute

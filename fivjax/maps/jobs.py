@@ -27,8 +27,9 @@ from .groups import Task, groups_of
 from .job_files import JobFile, JobState
 from .results import Ended, Verdicts, not_run, record
 
-# How long trajectories are followed unless told: at least so many seconds, and so many periods of the slowest mode.
-LEAST_TIME, LEAST_PERIODS = 20.0, 2000.0
+# How long trajectories are followed after the last jump of their load, unless told: so many periods of the slowest mode, or so
+# many seconds if none oscillates.
+PERIODS, WITHOUT_PERIOD = 2000.0, 20.0
 
 
 class Job(NamedTuple):
@@ -100,7 +101,8 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     known_from, own_from = 4 * task.method.round, 16 * task.method.round
     limit = task.limits.t_max
     if limit is None:
-        limit = np.maximum(LEAST_TIME, LEAST_PERIODS * batch.shared.tree.modes.slowest_period)
+        period = np.asarray(batch.shared.tree.modes.slowest_period)
+        limit = np.where(period > 0, PERIODS * period, WITHOUT_PERIOD)
     limit = np.broadcast_to(limit, len(of_groups))
     done = 0
     if (earlier := file.last()) is not None:
@@ -122,7 +124,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
         _, now = trajectories.tree
         verdict = np.array(now.verdict)
         if task.limits.t_max is None:
-            in_time = now.t - now.skipped < np.maximum(limit, capture.settled_by)[group[pending]]
+            in_time = now.t - now.skipped - now.last_jump < np.maximum(limit, capture.settled_by)[group[pending]]
         else:
             in_time = now.t < limit[group[pending]]
         entered: dict[int, Captor] = {}

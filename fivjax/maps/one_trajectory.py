@@ -40,6 +40,7 @@ class Progress(eqx.Module):
     crossing: State  # the last crossing of the section under the final load; NaN before the first
     events: Int[Array, ""]  # status changes so far
     last_event: Float[Array, ""]  # time of the last of them, s; NaN before the first
+    last_jump: Float[Array, ""]  # of the load, s
     yardstick: Float[Array, ""]  # the weighted size of what made the motion, m
     verdict: Int[Array, ""]
     bound: Float[
@@ -101,6 +102,7 @@ def at_equilibrium(scene: Scene, shared: Shared, energy: bool, for_kernel: bool)
         crossing=jnp.full_like(y, jnp.nan),
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
+        last_jump=jnp.max(scene.load.jumps, initial=0.0),
         yardstick=largest * jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + belt,
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         bound=jnp.full((), jnp.inf, y.dtype),
@@ -159,6 +161,7 @@ def with_step(setting: Setting, now: Progress) -> Progress:
         crossing=jnp.where(crossed, rise.at, now.crossing),
         events=now.events + changed,
         last_event=jnp.where(changed, t, now.last_event),
+        last_jump=now.last_jump,
         yardstick=now.yardstick,
         verdict=now.verdict,
         bound=now.bound,
@@ -171,8 +174,7 @@ def _with_entry(setting: Setting, energy: EnergyRecord, before: Progress, load, 
     scene = setting.scene
     segment = Segment(before.t, load, before.contact, before.y, after)
     ledger = enter(EnergyData(scene), setting.method, setting.shared.mechanics, energy.ledger, segment)
-    kick_ends = jnp.max(scene.load.jumps, initial=0.0)
-    just_kicked = (t >= kick_ends) & jnp.isnan(energy.vibration)
+    just_kicked = (t >= before.last_jump) & jnp.isnan(energy.vibration)
     vibration = mechanical_energy(scene.structure, after.y)
     return EnergyRecord(ledger, jnp.where(just_kicked, vibration, energy.vibration))
 

@@ -206,8 +206,7 @@ def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monk
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     monkeypatch.setattr(Catalogue, "add_tori_by_turns", lambda _, motions, usable: usable)
     monkeypatch.setattr(Capture, "search_alone", lambda *_: None)
-    monkeypatch.setattr("fivjax.maps.jobs.LEAST_TIME", 2.0)
-    monkeypatch.setattr("fivjax.maps.jobs.LEAST_PERIODS", 1.0)
+    monkeypatch.setattr("fivjax.maps.jobs.PERIODS", 140.0)  # 2 s
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
     assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0
