@@ -223,8 +223,8 @@ def _instants(t, count: int) -> np.ndarray:
         at = int(np.argmax(steps <= 0))
         before, after = apart(*array[at : at + 2])
         raise ValueError(
-            f"Argument `t` must be strictly increasing, but goes from {before} to {after} s after sample {at}. Sort the samples "
-            "of all signals along with it (`numpy.argsort`), and drop those that repeat."
+            f"Argument `t` must be strictly increasing, but goes from {before} to {after} s after sample {at}. Sort the "
+            "samples of all signals along with it (`numpy.argsort`), and drop those that repeat."
         )
     arguments.axis("t", array)
     step = (array[-1] - array[0]) / (count - 1)
