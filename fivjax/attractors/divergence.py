@@ -20,6 +20,8 @@ APART = 1e-7
 PARTED, CLOSED_IN = 30.0, 15.0
 # What may be a torus is followed for longer where neighbours have parted by so many; and is none if they then part by so many.
 SUSPICIOUS, PARTED_ON_TORUS = 4.0, 12.0
+# Returns after which a neighbour is brought near again along a motion that is known: what parts slowly is still near then.
+RETURNS_ALONG = 128
 
 
 class Divergence(NamedTuple):
@@ -84,11 +86,11 @@ def parts_along(
     states = paths / maps.weights
     beside, since = states[:, 0] * (1 + APART), np.zeros(len(group))
     furthest = np.zeros(len(group))
-    for start in range(0, states.shape[1] - MEASURED_OVER, MEASURED_OVER):
-        here, there = states[:, start], states[:, start + MEASURED_OVER]
+    for start in range(0, states.shape[1] - RETURNS_ALONG, RETURNS_ALONG):
+        here, there = states[:, start], states[:, start + RETURNS_ALONG]
         apart = np.linalg.norm(maps.weights * (beside - here), axis=1)
         at = section_at(beside, maps.normal, maps.sliding[group])
-        away = maps.returns(group, at, MEASURED_OVER).at.y - there
+        away = maps.returns(group, at, RETURNS_ALONG).at.y - there
         distance = np.linalg.norm(maps.weights * away, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             since = np.fmax(since + np.log(distance / apart), 0.0)
