@@ -5,26 +5,25 @@ import os
 import shutil
 import tempfile
 from importlib import metadata
-from importlib.util import find_spec
 
 import pytest
 
 import fivjax as fj
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
-FLAGS = "XLA_FLAGS"
+FLAGS, KERNEL_FLAGS = "XLA_FLAGS", "FIVJAX_KERNEL_FLAGS"
 
 # Tests run most programs once or twice, so they wait for the compiler and not for what it has compiled. Without LLVM's
 # optimisations, and without parts that are compiled side by side, it takes less than half of the time. At this level LLVM would
 # choose instructions by a quick way, too (`fast-isel`), which makes wrong programs (`COMPILED_QUICKLY` in `compiling`): by the
-# thorough one the results are right. For a run as users compile, set `XLA_FLAGS`, which may be empty.
+# thorough one the results are right. For a run as users compile, set `XLA_FLAGS` and `FIVJAX_KERNEL_FLAGS`, which may be empty.
 COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_options=-fast-isel=false --xla_cpu_parallel_codegen_split_count=1"
 # Later versions have one way only; what XLA does not know ends the process.
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
 
 # The same holds for kernels: a third of the time without the later optimisations.
-KERNELS_COMPILED_FOR_TESTS = "-march=native -O1 -fno-slp-vectorize"
+KERNELS_COMPILED_FOR_TESTS = "-O1 -fno-slp-vectorize"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
@@ -47,14 +46,10 @@ def pytest_configure(config: pytest.Config) -> None:
     # Studies of minutes are worth optimising.
     if "not slow" in config.option.markexpr:
         os.environ.setdefault(FLAGS, COMPILED_FOR_TESTS)
+        os.environ.setdefault(KERNEL_FLAGS, KERNELS_COMPILED_FOR_TESTS)
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-    runs_tests = hasattr(config, "workerinput") or not config.getoption("numprocesses", None)
-    if "not slow" in config.option.markexpr and runs_tests and find_spec("warp"):
-        import warp
-
-        warp.config.cpu_compiler_flags = KERNELS_COMPILED_FOR_TESTS
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,7 +1,9 @@
 """`fivjax map`: a bi-stability map over two parameters."""
 
 import dataclasses
+import importlib
 import shutil
+import threading
 import warnings
 from pathlib import Path
 from typing import Annotated
@@ -90,6 +92,8 @@ class Map:
                 f"An interrupted map is kept in {_listed(begun)}. Go on with it by `--resume`, or delete that to begin anew."
             )
         scene, method = self.scene.scene(), self.method.stepper()
+        # What draws is imported while kernels are compiled and run, which leaves Python to it.
+        threading.Thread(target=importlib.import_module, args=("fivjax.plot",), daemon=True).start()
         try:
             with warnings.catch_warnings(), workers_of(self.workers, self.dask) as executor:
                 # The message printed below says more.

@@ -25,6 +25,8 @@ from .standard_error import silent
 ONE_AT_A_TIME = threading.RLock()
 # One trajectory takes a GPU some thirty times as long as a core of a CPU: what that comes to for all of several cores.
 LEAST_ON_GPUS = 1024
+# The environment variable with options for the compiler of kernels for CPUs.
+FLAGS = "FIVJAX_KERNEL_FLAGS"
 # The library of a CUDA driver, by the beginnings of what an operating system calls itself.
 DRIVERS = {"linux": "libcuda.so.1", "win": "nvcuda.dll"}
 
@@ -84,12 +86,11 @@ def _init_elsewhere(wp) -> None:
 
 
 def compiler_flags() -> str:
-    """Those of all kernels on a CPU. What a user has set for Warp, if it is imported, comes last, and so counts."""
+    """Those of all kernels on a CPU. What the environment says comes last, and so counts."""
     # Products and sums in one, and more of the compiler's thought: each makes steps a tenth faster. Loops over few coordinates
     # are slower in vectors: an energy ledger takes five times as long. What is compared with itself is compared to see whether
     # it is a number.
-    own = getattr(getattr(sys.modules.get("warp"), "config", None), "cpu_compiler_flags", None) or "-march=native"
-    return f"-O3 -fno-vectorize -ffp-contract=fast -Wno-tautological-compare {own}"
+    return f"-O3 -march=native -fno-vectorize -ffp-contract=fast -Wno-tautological-compare {os.environ.get(FLAGS, '')}"
 
 
 @functools.cache

@@ -143,6 +143,8 @@ def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
 def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
+        # Worked out from the structure's parameters once, not wherever they are used.
+        own = eqx.tree_at(lambda own: own.structure.source, own, own.structure.matrices)
         mechanics = mechanics_about_sliding(own)
         drift = None if mechanics.several else sticking_drift(own)
         weights = own.structure.weights

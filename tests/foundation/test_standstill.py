@@ -80,7 +80,7 @@ def test_a_batch_of_trajectories_has_no_lapack():
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 
     def begin(shared, rows):
-        return following._begin_block.__wrapped__(scene, names, ("p",), (), False, False, shared, rows)
+        return following._begin_block.__wrapped__(scene, names, ("p",), (), False, shared, rows)
 
     def follow(shared, rows):
         return following._follow_rows(scene, method, names, ("p",), np.int32(4), shared, rows)

@@ -391,7 +391,7 @@ def test_nothing_is_spent_on_a_ledger_that_nobody_asked_for(paper_scene, monkeyp
 
     # Nothing of what was written before, by this process or another one.
     monkeypatch.setattr(built_kernels, "_KERNELS", {})
-    monkeypatch.setattr(built_kernels, "kept_value", lambda function, *args, folder: function(*args))
+    monkeypatch.setattr(built_kernels, "kept_value", lambda function, *args: function(*args))
     monkeypatch.setattr(fj.EventExact, "within", refuse)
     monkeypatch.setattr(accounts, "enter", refuse)
     monkeypatch.setattr(accounts.EnergyData, "__init__", refuse)
