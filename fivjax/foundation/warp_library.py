@@ -137,9 +137,11 @@ def warp_kernel(body: str, addresses: Sequence[str], numbers: Sequence[str]):
 def launched(kernel, device: str, first: int, last: int, *args: int) -> None:
     """Run such a kernel for the lanes from `first` to before `last`."""
     wp = warp()
+    # On a CPU Warp has blocks of one thread. What a module is compiled for has to be what it is launched with.
+    block = 1 if device == "cpu" else 256
     with ONE_AT_A_TIME, _quietly(wp):
-        kernel.module.load(device)
-    wp.launch(kernel, dim=last - first, inputs=[first, *args], device=device)
+        kernel.module.load(device, block)
+    wp.launch(kernel, dim=last - first, inputs=[first, *args], device=device, block_dim=block)
 
 
 @contextlib.contextmanager

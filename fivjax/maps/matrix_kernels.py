@@ -139,9 +139,7 @@ class MatrixKernels:
 
         def call(device: str, own: list) -> list[int]:
             if (device, *columns) not in self.on_device:
-                self.on_device[device, *columns] = [
-                    warp().array(part, device=device) for part in (*self.of_groups, columns)
-                ]
+                self.on_device[device, *columns] = [warp().array(part, device=device) for part in (*self.of_groups, at)]
             *of_groups, place = (array.ptr for array in self.on_device[device, *columns])
             of_lanes = [array.ptr for array in own]
             return [*of_groups, *of_lanes, *[0] * (len(OF_LANES) - len(own)), place, *numbers]

@@ -12,12 +12,13 @@ from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
-from fivjax.foundation import warp_library
+from fivjax.foundation import built_kernels, warp_library
 from fivjax.foundation.compiling import compiled
 from fivjax.foundation.lane_functions import LaneFunction
 from fivjax.foundation.scalar_code import scalar_source
 from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps import groups as sharing
+from fivjax.maps import matrix_kernels
 from fivjax.maps.matrix_kernels import kernel
 from fivjax.maps.one_trajectory import next_step_end
 from fivjax.steppers import kernel_scope
@@ -263,6 +264,22 @@ def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(type(jax.config), "jax_platforms", "cpu", raising=False)
         assert gpus_for(LEAST_ON_GPUS) == []
+
+
+@pytest.mark.slow
+def test_maps_and_motions_on_devices_are_those_of_threads(paper_scene, monkeypatch):
+    """Two stand-ins, each with its part of the lanes: Warp's own kernels on the CPU, with arrays of Warp's."""
+    scene, axes = paper_scene.replace(belt_speed=1.0), dict(mu=[0.19, 0.227], p=np.linspace(1.0, 4.0, 5))
+    run = jax.vmap(lambda p: fj.simulate(scene.replace(p=p), 0.2, 0.02).velocity)
+    with jax.enable_x64(True):
+        expected = fj.bistability_map(scene, **axes, progress=False), run(jnp.asarray(axes["p"]))
+        for module in (matrix_kernels, built_kernels):
+            monkeypatch.setattr(module, "gpus_for", lambda _: ["cpu", "cpu"])
+        found = fj.bistability_map(scene, **axes, progress=False), run(jnp.asarray(axes["p"]))
+    np.testing.assert_array_equal(found[0].verdict, expected[0].verdict)
+    assert set(np.unique(found[0].verdict)) == {fj.Verdict.SLIDING, fj.Verdict.LIMIT_CYCLE}
+    np.testing.assert_allclose(found[0].amplitude, expected[0].amplitude, rtol=1e-9)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-9)
 
 
 @pytest.mark.slow
