@@ -51,6 +51,7 @@ OF_ONE = (*ANGLES, "sqrt", "cbrt", "exp", "log", "erf", "erfc", "floor", "ceil",
 OF_TWO = ("pow", "atan2")
 
 _loading = threading.RLock()
+_LOADED: set[bytes] = set()
 
 
 class Compiler(NamedTuple):
@@ -112,15 +113,17 @@ def c_function(source: str, name: str, types: Sequence, flags: str) -> Callable:
     digest = hashlib.sha256("\0".join((code, flags, own.target)).encode()).hexdigest()[:40]
     module = f"fivjax_{digest}".encode()
     with _loading:
-        place = place_of_code(f"kernel-{digest}")
-        kept = None if place is None else read_kept(place)
-        # What cannot be loaded is compiled anew.
-        if kept is None or not _loaded(own, kept, module):
-            compiled = _compiled(own, code, flags, place)
-            if place is not None:
-                keep_code(place, compiled)
-            if not _loaded(own, compiled, module):
-                raise OSError(f"The compiled function `{name}` cannot be loaded.")
+        if module not in _LOADED:
+            place = place_of_code(f"kernel-{digest}")
+            kept = None if place is None else read_kept(place)
+            # What cannot be loaded is compiled anew.
+            if kept is None or not _loaded(own, kept, module):
+                compiled = _compiled(own, code, flags, place)
+                if place is not None:
+                    keep_code(place, compiled)
+                if not _loaded(own, compiled, module):
+                    raise OSError(f"The compiled function `{name}` cannot be loaded.")
+            _LOADED.add(module)
         address = _address(own, module, name.encode())
     return ctypes.CFUNCTYPE(None, *types)(address)
 

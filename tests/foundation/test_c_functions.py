@@ -47,11 +47,13 @@ class Doubling:
         def lookup(library, name):
             return c_functions.compiler().library.wp_lookup(self.name, name)
 
+        monkeypatch.setattr(c_functions, "_LOADED", set())
         monkeypatch.setattr(c_functions, "_compiled", once)
         monkeypatch.setattr(c_functions, "_loaded", anew)
         monkeypatch.setattr(c_functions, "_address", lambda own, module, name: lookup(own.library, name))
 
     def in_a_new_process(self) -> list[float]:
+        c_functions._LOADED.clear()
         x = np.array([1.0, 2.5])
         c_functions.c_function(SOURCE, "doubled", TYPES, "-O2")(x.ctypes.data, len(x))
         return x.tolist()
@@ -137,12 +139,22 @@ def test_code_that_does_not_compile_is_an_error(caches, capfd):
     assert "error" in capfd.readouterr().err and not list(caches.glob("*"))
 
 
+def test_the_same_code_serves_twice(caches):
+    """Kernels of two functions may come to the same code, and a process loads that once."""
+    body = "double* x = (double*)xs; x[lane] += 3.0;"
+    x = np.zeros(2)
+    for _ in range(2):
+        LaneFunction(body, ("xs",)).on_cpu(0, 2, x.ctypes.data)
+    assert x.tolist() == [6.0, 6.0]
+
+
 def test_all_functions_that_code_may_call_are_declared():
     called = set(re.findall(r"wp::(\w+)\(", " ".join(cpp_numbers.BY_NUMBER.values())))
     assert len(called) > 15
     assert called <= set(re.findall(r"inline double (\w+)\(", c_functions._declarations()))
 
 
+@pytest.mark.slow
 def test_warp_is_asked_where_its_compiler_is_called_otherwise(monkeypatch, tmp_path):
     """The same lanes, by Warp's own kernels on the CPU."""
     text = (Path(importlib.util.find_spec("warp").origin).parent / "_src" / "context.py").read_text()
