@@ -50,8 +50,9 @@ ANGLES = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
 OF_ONE = (*ANGLES, "sqrt", "cbrt", "exp", "log", "erf", "erfc", "floor", "ceil", "round", "rint")
 OF_TWO = ("pow", "atan2")
 
-_loading = threading.RLock()
 _LOADED: set[bytes] = set()
+_LOADING: dict[bytes, threading.Lock] = {}
+_beginning = threading.Lock()
 
 
 class Compiler(NamedTuple):
@@ -112,7 +113,10 @@ def c_function(source: str, name: str, types: Sequence, flags: str) -> Callable:
     code = f"{_declarations()}\n{source}"
     digest = hashlib.sha256("\0".join((code, flags, own.target)).encode()).hexdigest()[:40]
     module = f"fivjax_{digest}".encode()
-    with _loading:
+    # Others may be compiled meanwhile.
+    with _beginning:
+        loading = _LOADING.setdefault(module, threading.Lock())
+    with loading:
         if module not in _LOADED:
             place = place_of_code(f"kernel-{digest}")
             kept = None if place is None else read_kept(place)
