@@ -18,6 +18,7 @@ from . import tube
 from .cycles import CROSSINGS, StableCycle, capturing_cycles
 from .motions import Motions
 from .returning import starts_beyond, starts_on_edges, tubes_returned_to
+from .tori import with_cycles_amid
 from .tube import Tube, thin
 
 
@@ -60,8 +61,12 @@ def approaches(
         states = _ways_in(maps, group[chosen], [cycles[k] for k in chosen], ways, report)
         led = [chosen[place] for place in states]
         tried = [Approach(cycles[k], Tube(own, tube.RADIUS)) for k, own in zip(led, states.values(), strict=True)]
-        for place in _drawn_in(maps, group[led], tried, report).tolist():
-            found[led[place]] = tried[place]
+        drawn = {led[place]: tried[place] for place in _drawn_in(maps, group[led], tried, report).tolist()}
+        curves = {k: maps.weights * one.cycle.points for k, one in drawn.items() if k in locked}
+        for k in with_cycles_amid(maps, group, curves, {k: drawn[k].tube for k in curves}):
+            del drawn[k]
+        for k, one in drawn.items():
+            found[k] = one
     return found
 
 

@@ -36,6 +36,8 @@ TUBES = ((tube.RADIUS, 512), (tube.RADIUS / 4, 2048), (tube.RADIUS / 16, 4096))
 TRACED, LONGER, LONGEST = 2048, 4096, 12288
 # So many states at a time: after each, motions that have come to a torus that is known are left out.
 AT_A_TIME = 512
+# An attractor this near to a tube, in its radii, may draw motions out of it.
+NEAR = 1.5
 # In chaos neighbours part by so much per return, and more.
 CHAOTIC_FROM = 0.05
 # Motions whose extent, or whose distance from others, is below this share of their size differ by rounding only.
@@ -96,7 +98,7 @@ def tori_from(
             if not tried:
                 continue
             new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
-            for row in _with_cycles_amid(maps, group, traced, new):
+            for row in with_cycles_amid(maps, group, {row: traced[row].states for row in new}, new):
                 del new[row]
             for row in _chaotic(maps, group, traced, new):
                 del new[row], traced[row]
@@ -300,22 +302,25 @@ def _attracting_tubes(
     return dict(tubes[back[k]] for k in kept), cycles
 
 
-def _with_cycles_amid(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], tubes: dict[int, Tube]
+def with_cycles_amid(
+    maps: ReturnMaps,
+    group: Int[np.ndarray, " m"],
+    traced: dict[int, Float[np.ndarray, "k 2n"]],
+    tubes: dict[int, Tube],
 ) -> list[int]:
-    """The rows of tubes that hold a stable cycle amid the closed curves which their motions trace: that from which a torus has
-    come, where it is stable again, or still. No start on a tube's edge need come to it.
+    """The rows of tubes that have a stable cycle amid the closed curves which their motions trace, by these states in order:
+    that from which a torus has come, where it is stable again, or still. No start on a tube's edge need come to it.
     """
     rows = list(tubes)
     if not rows:
         return []
-    middles = [(row, one) for row in rows for one in _middles(traced[row].states)]
+    middles = [(row, one) for row in rows for one in _middles(traced[row])]
     rows, own = [row for row, _ in middles], np.array([group[row] for row, _ in middles])
     states = np.array([one for _, one in middles]) / maps.weights
     near, closed = close_recurring(maps, Motions(own, section_at(states, maps.normal, maps.sliding[own])))
     stable = np.max(np.abs(np.linalg.eigvals(closed.jacobian)), axis=1) < 1
     found = zip((rows[k] for k in near), stable, points_on(maps, own[near], closed), strict=True)
-    return sorted({row for row, attracts, y in found if attracts and np.all(tubes[row].holds(maps.weights * y))})
+    return sorted({row for row, attracts, y in found if attracts and np.all(tubes[row].holds(maps.weights * y, NEAR))})
 
 
 def _chaotic(
@@ -345,8 +350,8 @@ def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]
 
 
 def holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
-    """Whether a stable cycle lies in the inner half of a tube: motions there may come to that instead."""
-    return any(np.all(one.holds(maps.weights * cycle.points)) for cycle in cycles)
+    """Whether a stable cycle lies in a tube, or next to it: motions in its inner half may come to that instead."""
+    return any(np.all(one.holds(maps.weights * cycle.points, NEAR)) for cycle in cycles)
 
 
 def _on_one_torus(paths: Float[np.ndarray, "m k 2n"]) -> bool:

@@ -233,7 +233,10 @@ class ReturnMaps:
         self, group, at: Section, crossings
     ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
         """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
-        if self.kernels is not None and not isinstance(self.kernels, SectionKernels):
+        # A kernel of tangents of several contacts is compiled for a minute, and used for a few motions.
+        if self.kernels is not None and (
+            len(self.structure.contacts) > 1 or not isinstance(self.kernels, SectionKernels)
+        ):
             return self._differences(group, at, crossings)
         if self.kernels is not None:
             (*section, time), derivatives = self.kernels.derived(group, *at, crossings)
@@ -273,29 +276,40 @@ class ReturnMaps:
 
     def _differences_of_few(self, group, at: Section, crossings):
         """By central differences, with the same program as the map. Neighbourhoods are checked with the map itself."""
-        count, size = at.y.shape
         lengths = np.linalg.norm(self.weights * at.y, axis=1)
-        row, place = np.nonzero(self._free(at.status, at.y))
-        base = self.returns(group, at, crossings)
-        derivatives = np.zeros((count, size, size))
+        row, along = self._directions(at)
+        base, slopes, left = self.returns(group, at, crossings), np.empty(along.shape), np.arange(len(row))
         for step in STEPS:
-            lengthwise = step * lengths[row] / self.weights[place]
-            away = np.zeros((len(row), size))
-            away[np.arange(len(row)), place] = lengthwise
-            starts = np.concatenate([at.y[row] + away, at.y[row] - away])
-            rows = np.tile(row, 2)
+            own, away = row[left], (step * lengths[row[left], None]) * along[left] / self.weights
+            starts, rows = np.concatenate([at.y[own] + away, at.y[own] - away]), np.tile(own, 2)
             image = self.returns(group[rows], Section(starts, at.status[rows], at.direction[rows]), crossings[rows])
-            ahead, behind = image.at.rows(slice(None, len(row))), image.at.rows(slice(len(row), None))
-            alike = (ahead.status == behind.status) & (ahead.status == base.at.status[row])
-            slopes = (ahead.y - behind.y) / (2 * lengthwise[:, None])
-            derivatives[row, :, place] = np.where(alike[:, None], slopes, np.nan)
+            ahead, behind = image.at.rows(slice(None, len(own))), image.at.rows(slice(len(own), None))
+            alike = (ahead.status == behind.status) & (ahead.status == base.at.status[own])
+            alike = np.all(alike.reshape(len(own), -1), axis=1)
+            slope = (ahead.y - behind.y) / (2 * step * lengths[own, None])
+            slopes[left] = np.where(alike[:, None], slope, np.nan)
             # Next to the onset of an event a step may lead to motions that have it.
-            events = base.events[row]
-            other = (image.events[: len(row)] != events) | (image.events[len(row) :] != events)
-            row, place = row[other], place[other]
-            if not len(row):
+            events = base.events[own]
+            left = left[(image.events[: len(own)] != events) | (image.events[len(own) :] != events)]
+            if not len(left):
                 break
+        derivatives = np.zeros((*at.y.shape, at.y.shape[1]))
+        if np.ndim(self.normal) == 0:
+            # What is no number says nothing of directions beside it.
+            place = np.argmax(along, axis=1)
+            derivatives[row, :, place] = slopes * self.weights[place, None]
+        else:
+            for k in range(len(at.y)):
+                derivatives[k] = slopes[row == k].T @ along[row == k] * self.weights
         return base.at, base.time, derivatives
+
+    def _directions(self, at: Section) -> tuple[Int[np.ndarray, " d"], Float[np.ndarray, "d 2n"]]:
+        """The weighted directions that each state's contact mode and the section leave free, with the row of the state."""
+        if np.ndim(self.normal) == 0:
+            row, place = np.nonzero(self._free(at.status, at.y))
+            return row, np.eye(len(self.weights))[place]
+        each = [self.free_directions(status, y).T for status, y in zip(at.status, at.y, strict=True)]
+        return np.repeat(np.arange(len(each)), list(map(len, each))), np.concatenate(each)
 
     def _exactly(self, program, size: int, group, at: Section, crossings):
         return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree

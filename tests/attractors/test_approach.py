@@ -12,6 +12,8 @@ from fivjax.attractors.catalogue import Attractors, Catalogue
 from fivjax.attractors.cycles import StableCycle
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.neighbourhood import Neighbourhood
+from fivjax.attractors.tori import holds_one_of
+from fivjax.attractors.tube import Tube
 from fivjax.section.return_maps import Images, Section
 
 STABLE, GROWTH = 4.0, 0.01
@@ -94,3 +96,36 @@ def test_a_map_by_approaches_says_what_it_says_by_neighbourhoods_alone(monkeypat
     assert np.all(slow["proof"].values[by_approach.values] == fj.Proof.ELLIPSOID)
     earlier = (fast["decided_at"] / slow["decided_at"]).values[by_approach.values]
     assert np.all(earlier <= 1) and np.median(earlier) < 0.7
+
+
+@pytest.mark.parametrize(("away", "near"), [(0.3, True), (0.65, True), (1.4, True), (1.6, False)])
+def test_no_tube_captures_next_to_another_cycle(away, near):
+    """The other's motions come into the inner half of the tube, too, where it lies in the outer half, or just beyond."""
+    angle = np.linspace(0.0, 2 * np.pi, 200, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    tube, maps = Tube(circle, 0.04), SimpleNamespace(weights=np.ones(2))
+    other = SimpleNamespace(points=np.array([[1 + 0.04 * away, 0.0]]))
+    assert holds_one_of(maps, tube, [other]) == near
+
+
+@pytest.mark.slow
+def test_a_cycle_in_the_outer_half_of_a_tube_keeps_its_trajectories():
+    """About a locked torus of 170 crossings: kicks above 3.6 lead to a cycle at 0.65 of the tube's radius from it."""
+    structure = fj.belt_oscillator(
+        m1=0.64721312749121,
+        m2=0.04723687388072624,
+        c1=1.0430509200919393,
+        c2=0.8665937714484849,
+        k1=109296.84124616739,
+        k2=114669.78585037433,
+    )
+    law = fj.ExponentialDecay(0.2711712562306021, 0.1813332863063123, 2.332806860325404)
+    scene = fj.Scene(structure, law, 3.64331263806095, fj.Pulse(100.0, 1.2))
+    late = [3.630091963292237, 3.844553540562549, 3.890253694613819, 3.9485377412757874, 3.9898535356477463]
+    p = np.concatenate([np.linspace(1.66, 3.47, 30), late])
+    m = fj.bistability_map(scene, p=p, progress=False)
+    assert np.all(m["verdict"] == fj.Verdict.LIMIT_CYCLE)
+    for kick, amplitude in list(zip(p, m["amplitude"].values, strict=True))[::6]:
+        run = fj.simulate(scene.replace(p=float(kick)), 150.0, 1e-3)
+        assert np.abs(run.velocity[-20_000:, 0]).max() == pytest.approx(amplitude, rel=2e-3)
+    np.testing.assert_allclose(m["amplitude"].values[-len(late) :], 2.2456459, rtol=1e-6)
