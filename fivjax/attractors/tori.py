@@ -330,8 +330,8 @@ def _chaotic(
     rows = list(tubes)
     if not rows:
         return []
-    count = min(len(traced[row].states) for row in rows)
-    paths = np.array([traced[row].states[-count:] for row in rows])
+    # As many of each, so that no answer depends on which others are asked.
+    paths = np.array([traced[row].states[-TRACED:] for row in rows])
     return [row for row, parts in zip(rows, parts_along(maps, group[rows], paths), strict=True) if parts]
 
 
