@@ -201,15 +201,22 @@ def test_each_trajectory_has_the_amplitude_of_its_own_cycle(count):
     assert 0 < m["attractor_multiplier"].item() < 1 and np.all(m["attractor"] == 0)
 
 
-def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch):
-    """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end."""
+@pytest.mark.parametrize("unit", [1.0, 1e-4])
+def test_what_the_search_has_missed_is_found_when_time_is_over(paper_scene, monkeypatch, unit):
+    """The paper's torus, kept from the searches that come first: it is found from where the trajectory is in the end. How long
+    that takes is a number of periods, in any unit of time (s).
+    """
+    given = paper_scene.parameters
+    faster = {name: float(given[name]) / unit for name in ("c1", "c2", "belt_speed")}
+    faster |= {name: float(given[name]) / unit**2 for name in ("k1", "k2", "force")}
+    paper_scene = paper_scene.replace(**faster, duration=float(given["duration"]) * unit)
     known = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     monkeypatch.setattr(Catalogue, "add_tori_by_turns", lambda _, motions, usable: usable)
     monkeypatch.setattr(Capture, "search_alone", lambda *_: None)
     monkeypatch.setattr("fivjax.maps.jobs.PERIODS", 140.0)  # 2 s
     late = fj.bistability_map(paper_scene, p=[1.1, 1.5], progress=False)
     assert late["verdict"].values.tolist() == known["verdict"].values.tolist() == [0, 1]
-    assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0
+    assert late["attractor_kind"].values.tolist() == ["torus"] and late["decided_at"].values[1] > 2.0 * unit
     assert late["attractor_amplitude"].item() == pytest.approx(known["attractor_amplitude"].item(), rel=2e-3)
 
 

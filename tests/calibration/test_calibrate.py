@@ -386,6 +386,18 @@ def test_command_line(tmp_path, decay, capsys, monkeypatch):
 QUIET = np.zeros((400, 1)) + 1e-3
 
 
+@pytest.mark.slow
+def test_other_guesses_do_not_lead_an_aliased_recording_away_from_the_scene():
+    """Ninety samples a second of a vibration with more than seventy: what does not depend on phases says little of it."""
+    truth = fj.Scene(fj.belt_oscillator(c1=1.3, k1=97e3), fj.Coulomb(0.2), 3.0, fj.Pulse(100.0, p=1.4))
+    run = fj.simulate(truth, 2.0, 1 / 90)
+    noisy = run.acceleration[:, :2] + 2.0 * np.random.default_rng(0).normal(size=(len(run.t), 2))
+    recording = fj.Recording(run.t, {"a0": noisy[:, 0], "a1": noisy[:, 1]}, "kick", offset=0.0)
+    fit = fj.calibrate(truth, recording, free=["mu", "c1", "k1"], bounds={"mu": (0.05, 0.5)}, progress=False)
+    assert fit.outcome is FitOutcome.CONVERGED
+    np.testing.assert_allclose(fit.estimates, [0.2, 1.3, 97e3], rtol=5e-3)
+
+
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
