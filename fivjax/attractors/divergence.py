@@ -90,13 +90,12 @@ def parts_along(
         here, there = states[:, start], states[:, start + RETURNS_ALONG]
         apart = np.linalg.norm(maps.weights * (beside - here), axis=1)
         at = section_at(beside, maps.normal, maps.sliding[group])
-        away = maps.returns(group, at, RETURNS_ALONG).at.y - there
-        distance = np.linalg.norm(maps.weights * away, axis=1)
+        away = maps.weights * (maps.returns(group, at, RETURNS_ALONG).at.y - there)
+        size = np.linalg.norm(maps.weights * there, axis=1, keepdims=True)
+        beside, distance = _brought_near(maps, there, away, size)
         with np.errstate(divide="ignore", invalid="ignore"):
             since = np.fmax(since + np.log(distance / apart), 0.0)
-            step = APART * np.linalg.norm(maps.weights * there, axis=1) / distance
         furthest = np.fmax(furthest, since)
-        beside = there + step[:, None] * away
     chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < SUSPICIOUS))
     if len(rows):
         at = section_at(states[rows, -1], maps.normal, maps.sliding[group[rows]])
@@ -121,6 +120,13 @@ def _beside(at: Section) -> Float[np.ndarray, "m 2n"]:
     return at.y * (1 + APART)
 
 
+def _brought_near(maps: ReturnMaps, y, away: Float[np.ndarray, "m 2n"], size: Float[np.ndarray, "m 1"]):
+    """Neighbours of states in these weighted directions, near again, relative to their `size`; and how far they were away."""
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return y + APART * size * away / distance / maps.weights, distance[:, 0]
+
+
 def _growth(maps: ReturnMaps, motions: Motions, beside) -> _Growth:
     weights, (group, at) = maps.weights, motions
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
@@ -130,8 +136,7 @@ def _growth(maps: ReturnMaps, motions: Motions, beside) -> _Growth:
     own = slice(None, len(group))
     at, other = pair.rows(own), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
-    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    beside, distance = _brought_near(maps, at.y, away, size)
     with np.errstate(divide="ignore", invalid="ignore"):
-        growth = np.log(distance[:, 0] / apart) / MEASURED_OVER
-        beside = at.y + APART * size * away / distance / weights
+        growth = np.log(distance / apart) / MEASURED_OVER
     return _Growth(growth, time[own], events[own], at, beside, weights * path[own])

@@ -69,7 +69,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
             # Threads that want the same program wait for the one that makes it.
             with lock:
                 if key not in programs:
-                    programs[key] = _program(function, folder, structure, rest, arrays, quickly_compiled)
+                    programs[key] = _program(function, structure, rest, arrays, quickly_compiled)
         program = programs[key]
         if program is not None:
             try:
@@ -83,7 +83,7 @@ def kept(function: Callable[P, R], *, quickly_compiled: bool = True) -> Callable
 
 def kept_value(make: Callable[..., R], *args) -> R:
     """What a function makes of its arguments: plain values (`plain_trees`) that take long to make. Kept like programs."""
-    path = _place(make, _folder() or "", None, args)
+    path = _place(make, None, args)
     if path is None:
         return make(*args)
     found = _found(path, from_text)
@@ -116,11 +116,9 @@ def _folder() -> str | None:
     return None if home is None else str(home / "fivjax" / FOLDER)
 
 
-def _program(
-    function: Callable, folder: str, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool
-) -> Callable | None:
+def _program(function: Callable, structure, rest: tuple, arrays: Sequence, quickly_compiled: bool) -> Callable | None:
     """A function of the arrays, read from the folder or made and written there; none where it cannot be named."""
-    path = _place(function, folder, structure, rest)
+    path = _place(function, structure, rest)
     if path is None:
         return None
     options = less_thought() if quickly_compiled else {}
@@ -161,11 +159,10 @@ def keep_code(path: Path, content: bytes) -> None:
     make_room(path.parent, LARGEST)
 
 
-def _place(function: Callable, folder: str, structure, rest: tuple) -> Path | None:
+def _place(function: Callable, structure, rest: tuple) -> Path | None:
     """The file for what a function makes of such arguments; none where these cannot be named, or nothing can be kept."""
-    named = _named(function, structure, rest) if folder else None
-    place = None if named is None else folder_to_keep_in(folder)
-    return None if place is None or named is None else place / named
+    named = _named(function, structure, rest) if _folder() else None
+    return None if named is None else place_of_code(named)
 
 
 def _named(function: Callable, structure, rest: tuple) -> str | None:

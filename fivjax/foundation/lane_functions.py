@@ -40,8 +40,8 @@ class LaneFunction:
             f'extern "C" void of_lanes(int first, int last, {", ".join(told)}) {{\n'
             f"    for (int lane = first; lane < last; ++lane) of_lane(lane, {names});\n}}\n"
         )
-        count = 2 + len(self.numbers)
-        types = [ctypes.c_int32] * 2 + [ctypes.c_uint64] * len(self.addresses) + [ctypes.c_int32] * (count - 2)
+        numbers = [ctypes.c_int32] * len(self.numbers)
+        types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
         return c_function(source, "of_lanes", types, compiler_flags())
 
     @functools.cached_property

@@ -105,8 +105,11 @@ def _may_be_concluded(
     or are not finite. Cheap. `began` and `events` are the time (s) and the number of events before the round.
     """
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
-    quiet = np.True_ if now.steps is None else np.all(now.steps.jumps <= now.t[:, None], axis=1)
-    return (quiet & (now.events == events)) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * now.yardstick)
+    return (
+        ((now.last_jump <= now.t) & (now.events == events))
+        | (now.t <= began)
+        | ~(largest <= UNBOUNDED_FROM * now.yardstick)
+    )
 
 
 def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:

@@ -18,6 +18,7 @@ from ..foundation.flattened import Flattened
 from ..foundation.lane_functions import AT_A_TIME, LaneFunction
 from ..foundation.warp_library import gpus_for, warp
 from ..section.about_sliding import mechanics_about_sliding
+from ..section.by_kernel import numbers_in_rows
 from ..section.crossings import MOST_TO_CROSSING
 from ..steppers.kernel_matrices import matrices
 from ..steppers.matrix_kernel import Form, motion_in_cpp
@@ -77,10 +78,10 @@ class MatrixKernels:
         mechanics, prepared = shared.tree.mechanics, shared.tree.prepared
         self.pool, self.kernel = pool, kernel(Form.of(mechanics, leading=1))
         self.longest = np.asarray(shared.tree.longest_return)
-        numbers = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(mechanics)], axis=1)
+        numbers = numbers_in_rows(mechanics)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)
         self.of_groups = [np.ascontiguousarray(part, float) for part in (windows, numbers, prepared.interval)]
-        self.on_device: dict[tuple, list] = {}  # the same there, and columns
+        self.on_device: dict[tuple, list] = {}  # the same on a device, and columns
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
         """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
@@ -138,10 +139,11 @@ class MatrixKernels:
             return
 
         def call(device: str, own: list) -> list[int]:
-            if (device, *columns) not in self.on_device:
-                self.on_device[device, *columns] = [warp().array(part, device=device) for part in (*self.of_groups, at)]
-            *of_groups, place = (array.ptr for array in self.on_device[device, *columns])
-            of_lanes = [array.ptr for array in own]
-            return [*of_groups, *of_lanes, *[0] * (len(OF_LANES) - len(own)), place, *numbers]
+            for key, parts in ((device,), self.of_groups), ((device, *columns), [at]):
+                if key not in self.on_device:
+                    self.on_device[key] = [warp().array(part, device=device) for part in parts]
+            nothing = [0] * (len(OF_LANES) - len(own))
+            groups, (place,) = self.on_device[device,], self.on_device[device, *columns]
+            return [*(array.ptr for array in (*groups, *own)), *nothing, place.ptr, *numbers]
 
         self.kernel.on_gpus(devices, [group], [rows, path] if len(path) == count else [rows], call)

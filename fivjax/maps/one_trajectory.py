@@ -152,7 +152,7 @@ def with_step(setting: Setting, now: Progress) -> Progress:
     changed = contact.status != now.contact.status
     changed = jnp.any(changed) if setting.shared.mechanics.several else changed
     # Crossings during the kick do not count for the motion after it.
-    crossed = rise.happened & jnp.all(scene.load.jumps <= now.t)
+    crossed = rise.happened & (now.last_jump <= now.t)
     return Progress(
         t=t,
         skipped=now.skipped,
@@ -192,7 +192,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
         jammed = sticks_forever(
             setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
         )
-    quiet_load = jnp.all(scene.load.jumps <= now.t)
+    quiet_load = now.last_jump <= now.t
     bound = used_up(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),

@@ -81,18 +81,16 @@ class TrajectoryKernels:
     def begin(self, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
         """Trajectories at their beginning, each with its kick and initial values."""
         progress: Progress = self._of_each(_begin, group, (columns,))
-        trajectories = flatten((columns, progress))
-        if len(group):
-            # What concludes is compiled while other kernels are.
-            own = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], (columns, progress, progress.t))
-            self.pool.submit(lambda: kernel_of(_conclude, self._form(own), shared=self.shared).of_lanes.on_cpu)
-        return trajectories
+        # What concludes is compiled while other kernels are.
+        form = self._form((columns, progress, progress.t))
+        self.pool.submit(lambda: kernel_of(_conclude, form, shared=self.shared).of_lanes.on_cpu)
+        return flatten((columns, progress))
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further by series, in place."""
         columns, now = trajectories.tree
         after = self._of_each(_follow, group, (columns, now, np.full(len(group), steps, np.int32)))
-        trajectories.numbers[:, columns.shape[-1] :] = flatten(after).numbers
+        trajectories.numbers[:, columns.shape[-1] :] = numbers_in_rows(after)
 
     def conclude(
         self, group: Int[np.ndarray, " m"], trajectories: Flattened, rows: Int[np.ndarray, " r"], began

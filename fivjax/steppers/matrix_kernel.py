@@ -103,8 +103,9 @@ def motion_in_cpp(form: Form) -> str:
         "struct Laws {",
         f"CUDA_CALLABLE static void row_of(const double* y, double load, double* found) {{ {filled} }}",
     ]
+    arguments = _arguments(form)
     for name, (source, size) in kept_value(_laws, form).items():
-        told = ", ".join(f"const double* {one}" for one in _arguments(form)[name])
+        told = ", ".join(f"const double* {one}" for one in arguments[name])
         if size == 1:
             lines.append(
                 f"CUDA_CALLABLE static double {name}({told}) {{ double found[1];\n{source}\nreturn found[0]; }}"
