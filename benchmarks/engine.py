@@ -127,7 +127,7 @@ def bulk() -> None:
     import numpy as np
 
     import fivjax as fj
-    from fivjax.foundation.kernel_text import Form
+    from fivjax.foundation.argument_forms import Form
     from fivjax.simulation import motion
     from tests.helpers.several_contacts import copies
 

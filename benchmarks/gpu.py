@@ -42,7 +42,7 @@ def axes_of(kind: str, points: int) -> dict[str, np.ndarray]:
 
 def motions(points: int) -> dict[str, np.ndarray]:
     """The same for motions of a second under constant friction, from the kernel of `simulate`: its last states as amplitudes."""
-    from fivjax.foundation.kernel_text import Form
+    from fivjax.foundation.argument_forms import Form
     from fivjax.simulation import motion
 
     rng, rows, form, times = np.random.default_rng(0), [], None, np.array([[0.0, 1.0]])
@@ -109,7 +109,7 @@ def told(where: str, found: dict) -> None:
 
 
 def main(kinds: list[str], sizes: list[int]) -> None:
-    from fivjax.foundation.warp_library import gpus, warp
+    from fivjax.kernels.warp_library import gpus, warp
 
     print([warp().get_device(name).name for name in gpus()] or "no GPU", f"{os.cpu_count()} cores")
     for kind in kinds:

@@ -23,8 +23,8 @@ from ..contact import Contact, Status
 from ..cycles.around import Round
 from ..foundation.carried import depending_on
 from ..foundation.compiling import power_of_4
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.numpy_evaluation import by_numpy
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
 from ..section.crossings import ByMethod

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact, Mechanics, State, status_from_forces
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
 from ..io.recordings import QUANTITIES, Channel
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene, steady_sliding
 from ..simulation.jump_instants import begun_at, load_from, next_jump
 from ..steppers.base import MOST_ADVANCES, AbstractStepper

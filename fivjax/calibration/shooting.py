@@ -25,9 +25,9 @@ from jaxtyping import Array, Complex, Float, Int
 from ..contact import Contact, Mechanics, State, Status, status_from_forces
 from ..contact.coordinates import at_places
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
 from ..io.recordings import Channel
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates
 from ..model.structure import Structure

@@ -13,8 +13,8 @@ from numpy.polynomial.polynomial import polyval
 
 from ..contact import Contact, State, Status
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import known_to_numpy
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..model.sliding import contact_coordinates
 from ..section.about_sliding import mechanics_about_sliding

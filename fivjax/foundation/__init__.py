@@ -1,1 +1,1 @@
-"""What all other packages use: double precision, compilation, checks of arguments, small linear systems."""
+"""What all other rooms use: double precision, checks of arguments, kept programs, small linear systems, progress."""

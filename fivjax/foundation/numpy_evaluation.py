@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
+from .argument_forms import Form
 from .compiling import compiled, transformed
 from .jaxprs import of_scan, solution, within
-from .kernel_text import Form
 from .linear_solve import eliminated, is_elimination
 from .numpy_primitives import function_of
 

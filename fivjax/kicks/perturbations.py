@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float
 
 from ..contact import Contact, Status
 from ..foundation.kept_programs import kept
-from ..foundation.kernel_functions import KernelFunction
+from ..kernels.functions import KernelFunction
 from ..linear.linearisation import LinearSliding, linear_sliding
 from ..model.scene import Scene
 from ..model.sliding import sliding_states

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Status
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import known_to_numpy
+from ..kernels.functions import KernelFunction
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import in_double_precision
+from ..kernels.functions import KernelFunction
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..contact import Mechanics
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
-from ..foundation.warp_library import is_installed
+from ..kernels.warp_library import is_installed
 from ..linear.linearisation import linear_sliding
 from ..model.friction import Coulomb
 from ..model.scene import Scene

@@ -15,17 +15,17 @@ from jaxtyping import Int
 
 from ..foundation.blocks import workers
 from ..foundation.flattened import Flattened
-from ..foundation.lane_functions import AT_A_TIME, LaneFunction
-from ..foundation.warp_library import gpus_for, warp
+from ..kernels.lane_functions import AT_A_TIME, LaneFunction
+from ..kernels.warp_library import gpus_for, warp
 from ..section.about_sliding import mechanics_about_sliding
 from ..section.by_kernel import numbers_in_rows
 from ..section.crossings import MOST_TO_CROSSING
 from ..steppers.kernel_matrices import matrices
-from ..steppers.matrix_kernel import Form, motion_in_cpp
+from ..steppers.matrix_kernel import MechanicsForm, motion_in_cpp
 from .groups import Task, with_values
 
 # Forms of batches, by what all jobs of a run have in common: a trace takes as long as thousands of returns.
-_FORMS: dict[Any, Form] = {}
+_FORMS: dict[Any, MechanicsForm] = {}
 # The least steps that are worth a part of a call's work of its own.
 LEAST_STEPS = 4096
 
@@ -48,7 +48,7 @@ NUMBERS = ("width", "to_section", "kept", "peaks", "count_of_jumps", "steps")
 
 
 @functools.cache
-def kernel(form: Form) -> LaneFunction:
+def kernel(form: MechanicsForm) -> LaneFunction:
     """The kernel for scenes of this form: `matrix_kernels.cpp`."""
     columns = {column.name: int(column) for kind in (ReturnColumn, FollowColumn) for column in kind}
     enums = ", ".join(f"{name} = {value}" for name, value in {**columns, "MOST_TO_CROSSING": MOST_TO_CROSSING}.items())
@@ -67,7 +67,7 @@ def begin_building(task: Task, pool: Executor) -> None:
     key = structure, tuple(np.shape(leaf) for leaf in leaves), task.names
     if key not in _FORMS:
         # Without values: those of a group may be none that a scene could have.
-        _FORMS[key] = Form.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
+        _FORMS[key] = MechanicsForm.of(jax.eval_shape(mechanics, np.zeros(len(task.names))))
     pool.submit(lambda: kernel(_FORMS[key]).on_cpu)
 
 
@@ -76,7 +76,7 @@ class MatrixKernels:
 
     def __init__(self, shared: Flattened, pool: Executor):
         mechanics, prepared = shared.tree.mechanics, shared.tree.prepared
-        self.pool, self.kernel = pool, kernel(Form.of(mechanics, leading=1))
+        self.pool, self.kernel = pool, kernel(MechanicsForm.of(mechanics, leading=1))
         self.longest = np.asarray(shared.tree.longest_return)
         numbers = numbers_in_rows(mechanics)
         windows = matrices(prepared, mechanics.free_load.shape[-1], mechanics.tangential, mechanics.normal)

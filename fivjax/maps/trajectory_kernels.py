@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..foundation.built_kernels import kernel_of
+from ..foundation.argument_forms import Form
 from ..foundation.carried import depending_on
 from ..foundation.complex_pairs import in_pairs
 from ..foundation.flattened import Flattened, flatten
-from ..foundation.kernel_functions import KernelFunction
-from ..foundation.kernel_text import Form
+from ..kernels.functions import KernelFunction
+from ..kernels.kernel import kernel_of
 from ..model.scene import Scene
 from ..section.by_kernel import in_parts, numbers_in_rows
 from ..steppers.base import AbstractStepper

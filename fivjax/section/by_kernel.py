@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..contact import Contact
-from ..foundation.kernel_text import Form
+from ..foundation.argument_forms import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..steppers.core import left_after, next_part
 from ..steppers.event_exact import EventExact, for_derivatives

@@ -19,9 +19,9 @@ from ..contact import Contact, Mechanics, State
 from ..foundation import arguments
 from ..foundation.carried import depending_on
 from ..foundation.compiling import power_of_4
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.precision import in_double_precision, is_known
 from ..io.datasets import labelled
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene, refuse_vector_contacts
 from ..model.sliding import contact_coordinates
 from ..steppers.core import Segment, follow

@@ -25,8 +25,8 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
 from ..foundation.carried import depending_on
 from ..foundation.compiling import compiled
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper, rates
 from ..steppers.core import left_after, next_part

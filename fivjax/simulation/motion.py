@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .. import contact as physics
 from ..contact import Contact, Mechanics, State
 from ..foundation.carried import depending_on
-from ..foundation.kernel_functions import KernelFunction
 from ..foundation.polynomial import value_and_rate
+from ..kernels.functions import KernelFunction
 from ..model.scene import Scene, steady_sliding
 from ..steppers.base import advance_between
 from ..steppers.core import Segment, end_after, next_part

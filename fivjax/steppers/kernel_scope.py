@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..foundation.kernel_text import Form, written
-from ..foundation.warp_library import is_installed
+from ..foundation.argument_forms import Form
+from ..kernels.code import written
+from ..kernels.warp_library import is_installed
 from ..model.scene import Scene
 from .base import AbstractStepper
 from .event_exact import EventExact

@@ -17,7 +17,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
 from ..contact.rounding import RESTING
 from ..foundation.kept_programs import kept_value
-from ..foundation.scalar_code import scalar_source
+from ..kernels.scalar_code import scalar_source
 from .kernel_matrices import BLOCK, abreast, blocks_of, padded, places_of
 from .propagation import INTERVALS, ORDER
 from .window import bracketed, fastest, first_is_safe, leading
@@ -32,14 +32,14 @@ RISE_STEPS, LOWEST_STEPS, PEAK_STEPS = 12, 6, 5
 BRACKET = {"ZEROS": 2, "ENDS": 4, "CROSSES": 6, "SPENT": 8, "DIPS": 10, "BRACKET": 12}
 
 
-class Form(NamedTuple):
+class MechanicsForm(NamedTuple):
     """What all scenes have in common that one kernel serves: everything in their mechanics but numbers."""
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, mechanics: Mechanics, leading: int = 0) -> "Form":
+    def of(cls, mechanics: Mechanics, leading: int = 0) -> "MechanicsForm":
         """That of mechanics whose numbers have so many leading axes."""
         leaves, structure = jax.tree.flatten(mechanics)
         return cls(structure, tuple(np.shape(leaf)[leading:] for leaf in leaves))
@@ -59,7 +59,7 @@ class Form(NamedTuple):
 
 
 @functools.cache
-def motion_in_cpp(form: Form) -> str:
+def motion_in_cpp(form: MechanicsForm) -> str:
     """The code of `Motion` with all that it refers to."""
     like = form.mechanics(np.zeros(form.numbers))
     n, normal = like.free_load.shape[0], like.normal
@@ -115,7 +115,7 @@ def motion_in_cpp(form: Form) -> str:
     return "\n".join([*lines, "};", (Path(__file__).parent / "matrix_motion.cpp").read_text(encoding="utf-8")])
 
 
-def _arguments(form: Form) -> dict[str, dict[str, int]]:
+def _arguments(form: MechanicsForm) -> dict[str, dict[str, int]]:
     """The vectors that each law takes, with their lengths."""
     n = form.mechanics(np.zeros(form.numbers)).free_load.shape[0]
     lengths = {
@@ -134,13 +134,13 @@ def _arguments(form: Form) -> dict[str, dict[str, int]]:
     return {law.__name__: {name: lengths[name] for name in inspect.signature(law).parameters} for law in laws}
 
 
-def _laws(form: Form) -> dict[str, tuple[str, int]]:
+def _laws(form: MechanicsForm) -> dict[str, tuple[str, int]]:
     """The laws in C++, by name: what computes their numbers, and how many these are. Traced in half a second."""
     arguments = _arguments(form)
     return {law.__name__: scalar_source(law, **arguments[law.__name__]) for law in _functions(form)}
 
 
-def _functions(form: Form) -> tuple:
+def _functions(form: MechanicsForm) -> tuple:
     def contact_of(mode):
         return Contact(mode[0].astype(jnp.int32), mode[1])
 

@@ -177,7 +177,9 @@ def test_warp_begins_without_a_folder_of_its_own(tmp_path):
     pytest.importorskip("warp")
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "temporary").mkdir()
-    code = "from fivjax.foundation.warp_library import warp; print(warp().config.kernel_cache_dir, warp().get_device('cpu'))"
+    code = (
+        "from fivjax.kernels.warp_library import warp; print(warp().config.kernel_cache_dir, warp().get_device('cpu'))"
+    )
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file"), "TMPDIR": str(tmp_path / "temporary")}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
     assert run.returncode == 0 and run.stdout.split()[0].startswith(str(tmp_path / "file"))

@@ -18,7 +18,7 @@ from tests.helpers import import_floors
 # The rooms by floor, lowest first. Rooms of one floor do not import one another.
 FLOORS = (
     ("foundation",),
-    ("model",),
+    ("kernels", "model"),
     ("contact", "io"),
     ("steppers", "linear"),
     ("section", "simulation"),

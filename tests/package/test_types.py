@@ -20,7 +20,7 @@ checker = types.ModuleType("checker")
 checker.checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 sys.modules["checker"] = checker
 
-ROOMS = ["foundation", "model", "contact", "steppers", "linear", "simulation", "cycles"]
+ROOMS = ["foundation", "kernels", "model", "contact", "steppers", "linear", "simulation", "cycles"]
 PROOFS = ["verdicts." + name for name in ("sliding_proof", "slow_growth", "sticking_proof", "verdict")]
 
 # What an earlier test traced is not looked for: the checker is at work while JAX traces.

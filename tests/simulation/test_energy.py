@@ -12,8 +12,8 @@ import pytest
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status
-from fivjax.foundation import built_kernels
 from fivjax.foundation.compiling import compiled
+from fivjax.kernels import kernel
 from fivjax.maps.engine import Limits, Listed, Means, run_to_verdict
 from fivjax.plot import energy as plot_energy
 from fivjax.section.about_sliding import mechanics_about_sliding
@@ -390,8 +390,8 @@ def test_nothing_is_spent_on_a_ledger_that_nobody_asked_for(paper_scene, monkeyp
         raise AssertionError("the ledger was touched")
 
     # Nothing of what was written before, by this process or another one.
-    monkeypatch.setattr(built_kernels, "_KERNELS", {})
-    monkeypatch.setattr(built_kernels, "kept_value", lambda function, *args: function(*args))
+    monkeypatch.setattr(kernel, "_KERNELS", {})
+    monkeypatch.setattr(kernel, "kept_value", lambda function, *args: function(*args))
     monkeypatch.setattr(fj.EventExact, "within", refuse)
     monkeypatch.setattr(accounts, "enter", refuse)
     monkeypatch.setattr(accounts.EnergyData, "__init__", refuse)

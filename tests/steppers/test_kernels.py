@@ -12,18 +12,19 @@ from scipy.linalg import expm
 
 import fivjax as fj
 from fivjax.contact import Mechanics, Status, status_from_forces
-from fivjax.foundation import built_kernels, warp_library
 from fivjax.foundation.compiling import compiled
-from fivjax.foundation.lane_functions import LaneFunction
-from fivjax.foundation.scalar_code import scalar_source
-from fivjax.foundation.warp_library import LEAST_ON_GPUS, gpus_for, warp
+from fivjax.kernels import kernel as built
+from fivjax.kernels import warp_library
+from fivjax.kernels.lane_functions import LaneFunction
+from fivjax.kernels.scalar_code import scalar_source
+from fivjax.kernels.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps import groups as sharing
 from fivjax.maps import matrix_kernels
 from fivjax.maps.matrix_kernels import kernel
 from fivjax.maps.one_trajectory import next_step_end
 from fivjax.steppers import kernel_scope
 from fivjax.steppers.kernel_matrices import matrices
-from fivjax.steppers.matrix_kernel import Form, motion_in_cpp
+from fivjax.steppers.matrix_kernel import MechanicsForm, motion_in_cpp
 from fivjax.steppers.propagation import INTERVALS, ORDER, propagators
 from tests.helpers import oracle
 from tests.helpers.transients import CASES, scene_of
@@ -89,7 +90,7 @@ for (int k = 0, past = 0; k < most && time[k] < end; ++k) {
 
 
 @functools.cache
-def march_of(form: Form) -> LaneFunction:
+def march_of(form: MechanicsForm) -> LaneFunction:
     given = "matrices", "mechanics", "interval", "states", "modes", "jumps", "loads", "until", "times"
     return LaneFunction(motion_in_cpp(form) + MARCH, given, ("count", "most"))
 
@@ -111,7 +112,7 @@ def by_kernel(scene: fj.Scene, t1: float, y0=None, mode=None):
 
     given = [table, numbers, windows.interval, states, modes, jumps, loads, t1, times]
     arrays = [np.ascontiguousarray(part, float) for part in given]
-    march_of(Form.of(mechanics)).on_cpu(0, 1, *(array.ctypes.data for array in arrays), len(jumps), MOST)
+    march_of(MechanicsForm.of(mechanics)).on_cpu(0, 1, *(array.ctypes.data for array in arrays), len(jumps), MOST)
     count = int(np.sum(np.isfinite(times)))
     assert times[count - 1] == t1, "it did not arrive"
     changed = 1 + np.flatnonzero(modes[1:count, 0] != modes[: count - 1, 0])
@@ -273,7 +274,7 @@ def test_maps_and_motions_on_devices_are_those_of_threads(paper_scene, monkeypat
     run = jax.vmap(lambda p: fj.simulate(scene.replace(p=p), 0.2, 0.02).velocity)
     with jax.enable_x64(True):
         expected = fj.bistability_map(scene, **axes, progress=False), run(jnp.asarray(axes["p"]))
-        for module in (matrix_kernels, built_kernels):
+        for module in (matrix_kernels, built):
             monkeypatch.setattr(module, "gpus_for", lambda _: ["cpu", "cpu"])
         found = fj.bistability_map(scene, **axes, progress=False), run(jnp.asarray(axes["p"]))
     np.testing.assert_array_equal(found[0].verdict, expected[0].verdict)
@@ -287,7 +288,7 @@ def test_kernels_compile_for_a_gpu(paper_scene, tmp_path):
     """There is none here; the compiler for them is part of Warp."""
     with jax.enable_x64(True):
         mechanics, *_ = prepared(paper_scene, jnp.zeros(6))
-    of_warp = kernel(Form.of(mechanics)).of_warp
+    of_warp = kernel(MechanicsForm.of(mechanics)).of_warp
     before = dict(of_warp.module.options)
     try:
         warp().compile_aot_module(of_warp.module, arch=90, module_dir=tmp_path, use_ptx=True)

@@ -17,8 +17,9 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from .built_kernels import GIVEN, Kernel, kernel_of, width_for
-from .kernel_text import Form, Place
+from ..foundation.argument_forms import Form
+from .code import Place
+from .kernel import GIVEN, Kernel, kernel_of, width_for
 from .xla_calls import Places, called_by_xla
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fivjax.foundation import c_functions, cpp_numbers, kept_folder, lane_functions
+from fivjax.foundation import kept_folder
 from fivjax.foundation.kept_folder import NotKept
-from fivjax.foundation.lane_functions import LaneFunction
+from fivjax.kernels import c_functions, cpp_numbers, lane_functions
+from fivjax.kernels.lane_functions import LaneFunction
 
 pytest.importorskip("warp")
 SOURCE = 'extern "C" void doubled(double* x, int count) { for (int i = 0; i < count; ++i) x[i] *= 2.0; }'

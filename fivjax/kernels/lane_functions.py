@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from .blocks import in_threads, workers
+from ..foundation.blocks import in_threads, workers
 from .c_functions import c_function, compiler
 from .warp_library import compiler_flags, launched, warp, warp_kernel
 

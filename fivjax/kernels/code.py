@@ -2,86 +2,21 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
 
 import jax
 import numpy as np
 from jax.extend.core import Literal
 from jax.interpreters import partial_eval
 
+from ..foundation.argument_forms import Form
+from ..foundation.jaxprs import of_scan
+from ..foundation.plain_trees import from_text, structure_to_text
 from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers
 from .cpp_code import writer
 from .cpp_loops import scan
 from .cpp_numbers import WIDE, kind_of
 from .cpp_writer import Writer
-from .jaxprs import of_scan
-from .plain_trees import from_text, structure_to_text
-
-
-class Form(NamedTuple):
-    """What all calls have in common that one kernel serves: everything but numbers."""
-
-    structure: Any
-    leaves: tuple  # shapes and types of arrays, and what is no array
-
-    @classmethod
-    def of(cls, args) -> tuple["Form", list]:
-        """The form of some arguments, and their arrays."""
-        leaves, structure = jax.tree.flatten(args)
-        arrays = list(map(_array, leaves))
-        told = tuple(leaf if array is None else array for leaf, array in zip(leaves, arrays, strict=True))
-        return cls(structure, told), [leaf for leaf, array in zip(leaves, arrays, strict=True) if array is not None]
-
-    @property
-    def kept(self) -> "Form":
-        """The first that was the same, so that a kernel is looked up without comparing all that a form says."""
-        return _FORMS.setdefault(self, self)
-
-    def args(self, arrays: Sequence) -> Any:
-        """The arguments with these arrays."""
-        remaining = iter(arrays)
-        leaves = [next(remaining) if isinstance(leaf, Array) else leaf for leaf in self.leaves]
-        return jax.tree.unflatten(self.structure, leaves)
-
-    @property
-    def arrays(self) -> list["Array"]:
-        """Those of the arguments, in order."""
-        return [leaf for leaf in self.leaves if isinstance(leaf, Array)]
-
-
-_FORMS: dict[Form, Form] = {}
-
-
-class Array(NamedTuple):
-    """An array of a form."""
-
-    shape: tuple[int, ...]
-    dtype: str
-
-    @property
-    def size(self) -> int:
-        return count_of(self.shape)
-
-
-_NUMBER = Array((), "float64")
-
-
-def _array(leaf) -> Array | None:
-    """What is told of an array; of what is none, nothing."""
-    # In the order in which they are most frequent: a call looks at some hundred of them.
-    if isinstance(leaf, np.ndarray):
-        return Array(leaf.shape, _name_of(leaf.dtype))
-    if isinstance(leaf, float):
-        return _NUMBER
-    if isinstance(leaf, jax.Array | np.generic):
-        return Array(leaf.shape, _name_of(np.dtype(leaf.dtype)))
-    return None
-
-
-@functools.cache
-def _name_of(own: np.dtype) -> str:
-    return "float64" if np.issubdtype(own, np.floating) else own.name
 
 
 @dataclasses.dataclass(frozen=True)

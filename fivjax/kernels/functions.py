@@ -1,8 +1,8 @@
 """JAX functions of one trajectory that kernels compute, for one trajectory or many, with their derivatives.
 
-A `KernelFunction` is traced, written as C++ (`kernel_text`) and compiled by Warp's own compiler (`built_kernels`), once for
+A `KernelFunction` is traced, written as C++ (`code`) and compiled by Warp's own compiler (`kernel`), once for
 arguments of one form. With known values it takes and gives arrays of NumPy, and XLA compiles nothing. Inside JAX's
-transformations it is a primitive (`kernel_primitive`). Where no kernel may serve, XLA compiles the same function.
+transformations it is a primitive (`primitive`). Where no kernel may serve, XLA compiles the same function.
 """
 
 import functools
@@ -13,12 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .built_kernels import kernel_of, width_for
-from .compiling import compiled
-from .forking import refuse_if_forked
-from .kernel_primitive import is_real, values
-from .kernel_text import Form
-from .precision import is_known, known_to_numpy
+from ..foundation.argument_forms import Form
+from ..foundation.compiling import compiled
+from ..foundation.forking import refuse_if_forked
+from ..foundation.precision import is_known, known_to_numpy
+from .kernel import kernel_of, width_for
+from .primitive import is_real, values
 
 # The instants of a function without rows.
 NO_ROWS = np.zeros(1)

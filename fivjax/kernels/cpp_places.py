@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..foundation.numpy_primitives import gathered_places, scattered_places
 from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers, reshaped
 from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
 from .cpp_writer import FEW, Writer
-from .numpy_primitives import gathered_places, scattered_places
 
 # Reductions, by the primitive that they repeat, and running totals.
 FOLDED = {

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
+from ..foundation.jaxprs import within
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, is_known, natural, of_numbers, of_text
 from .cpp_numbers import (
     BY_NUMBER,
@@ -32,7 +33,6 @@ from .cpp_numbers import (
     text_of,
     without_repeats,
 )
-from .jaxprs import within
 
 # Arrays with more numbers are gone through by loops.
 FEW = 40

@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 
-from .standard_error import silent
+from ..foundation.standard_error import silent
 
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()

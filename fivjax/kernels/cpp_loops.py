@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ..foundation.jaxprs import of_scan, solution, within
 from .cpp_arrays import Value, View
 from .cpp_numbers import WIDE, kind_of, text_of
 from .cpp_writer import Writer
-from .jaxprs import of_scan, solution, within
 
 
 def _while(writer: Writer, equation, operands) -> list[Value]:

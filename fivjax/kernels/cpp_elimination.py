@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
+from ..foundation.jaxprs import within
+from ..foundation.linear_solve import fivjax_elimination, is_elimination
 from .cpp_arrays import Value
 from .cpp_numbers import WIDE
 from .cpp_writer import Writer
-from .jaxprs import within
-from .linear_solve import fivjax_elimination, is_elimination
 
 # Smaller systems are written out: in many of them zeros are known, and leave little.
 LEAST = 4

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
+from ..foundation.numpy_primitives import function_of
 from .cpp_arrays import Value, View, of_numbers
-from .numpy_primitives import function_of
 
 # Types in C++. What is wide is declared by the kernel: so many numbers in double precision.
 WIDE = "wide"

@@ -1,4 +1,4 @@
-"""Kernels built from code of JAX functions (`kernel_text`), and how they are launched."""
+"""Kernels built from code of JAX functions (`code`), and how they are launched."""
 
 import threading
 from concurrent.futures import Executor
@@ -6,9 +6,10 @@ from concurrent.futures import Executor
 import jax
 import numpy as np
 
-from .blocks import workers
-from .kept_programs import kept_value
-from .kernel_text import Form, text, written
+from ..foundation.argument_forms import Form
+from ..foundation.blocks import workers
+from ..foundation.kept_programs import kept_value
+from .code import text, written
 from .lane_functions import AT_A_TIME, LaneFunction
 from .warp_library import gpus_for
 from .xla_calls import Places

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fivjax.foundation.kernel_functions import KernelFunction
-from fivjax.foundation.kernel_text import Form
+from fivjax.foundation.argument_forms import Form
 from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
+from fivjax.kernels.functions import KernelFunction
 
 
 def with_loops(x, matrix, count):

@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .kept_folder import read_kept
-from .kept_programs import keep_code, place_of_code
-from .whole_files import own_folder
+from ..foundation.kept_folder import read_kept
+from ..foundation.kept_programs import keep_code, place_of_code
+from ..foundation.whole_files import own_folder
 
 # The library of the compiler, and that of Warp's core, by the beginnings of what an operating system calls itself.
 LIBRARIES = {
