@@ -88,5 +88,5 @@ def numbers_in_rows(tree) -> Float[np.ndarray, "g k"]:
 
 def in_parts(count: int, each: int) -> list[slice]:
     """So many rows in parts that take `AT_A_TIME` bytes, if a row takes `each`."""
-    size = max(1, AT_A_TIME // each)
+    size = max(1, AT_A_TIME // max(each, 1))
     return [slice(start, start + size) for start in range(0, count, size)]

@@ -133,6 +133,16 @@ def falling(decay, belt_speed) -> fj.Scene:
     return fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.1, decay), belt_speed, fj.Pulse(100.0, 1.01))
 
 
+def test_axes_need_no_kick(paper_scene):
+    """Trajectories with no parameter of their own are as those of a map over the kick that the scene has."""
+    mu = np.linspace(0.05, 0.228, 8)
+    own = fj.bistability_map(paper_scene, mu=mu, progress=False)
+    kicked = fj.bistability_map(paper_scene, mu=mu, p=[paper_scene.load.p], progress=False).isel(p=0)
+    assert set(own["verdict"].values) == {0, 1}
+    for name in ("verdict", "amplitude"):
+        np.testing.assert_array_equal(own[name], kicked[name])
+
+
 def test_speed_dependent_friction_has_verdicts_too():
     """Eq. 1 with a gentle fall: sliding is proved although the motion is nonlinear."""
     gentle = fj.bistability_map(falling(0.01, 3.0), p=[1.01, 1.1], progress=False)
