@@ -25,6 +25,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
+from ..linear.linearisation import sliding_rates
 from ..model.contact_coordinates import to_contact_coordinates
 from ..model.scene import Scene, refuse_several_contacts, scene_in_contact_coordinates
 from ..section.about_sliding import sliding_state
@@ -34,7 +35,6 @@ from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
 from .branch_points import Point, seen
 from .following import follow_branch
-from .meeting_sliding import sliding_rates
 from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
 from .pseudo_arclength import Curve, Family
 from .special_derivatives import derivatives_of_special_points

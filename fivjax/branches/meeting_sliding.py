@@ -1,28 +1,11 @@
 """The end of a branch of shrinking cycles: the sliding equilibrium at its stability limit."""
 
 import numpy as np
-from jaxtyping import Complex
 
-from ..foundation.kept_programs import kept
-from ..linear.linearisation import linear_sliding
-from ..model.scene import Scene
+from ..linear.linearisation import sliding_rates
 from .branch_points import Point
 from .pseudo_arclength import Family
 from .special_points import MEETS_SLIDING, Special
-
-
-@kept
-def _sliding_matrix(scene: Scene):
-    return linear_sliding(scene).matrix
-
-
-def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
-    """Eigenvalues of steady sliding, in 1/s, the fastest growing first."""
-    matrix = np.asarray(_sliding_matrix(scene))
-    if not np.all(np.isfinite(matrix)):
-        return np.full(len(matrix), np.nan, complex)
-    values = np.linalg.eigvals(matrix).astype(complex)
-    return values[np.lexsort((-values.imag, -values.real))]
 
 
 def where_sliding_is_met(family: Family, last: Point) -> Point | None:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from .branch_points import Point
 from .grazing import looked_at, row_of
-from .meeting_sliding import sliding_rates
 from .multiple_shooting import images, moved_along, parameter_direction
 from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier

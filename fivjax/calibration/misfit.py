@@ -22,8 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..contact import Contact
-from ..foundation.numpy_evaluation import by_numpy
-from ..linear.linearisation import linear_sliding
+from ..linear.linearisation import sliding_rates
 from ..model.scene import Scene
 
 # The residual of a motion that is not finite: large enough never to be chosen, small enough to be squared.
@@ -84,14 +83,8 @@ class AbstractMisfit(eqx.Module):
 
 def sliding_frequencies(scene: Scene) -> Float[np.ndarray, " m"]:
     """Frequencies of the sliding modes, in Hz."""
-    modes = np.linalg.eigvals(np.asarray(_sliding_matrix(scene)))
-    modes = np.abs(modes.imag) / (2 * np.pi)
+    modes = np.abs(sliding_rates(scene).imag) / (2 * np.pi)
     return modes[modes > 0]
-
-
-@by_numpy
-def _sliding_matrix(scene: Scene):
-    return linear_sliding(scene).matrix
 
 
 def window(edges, share) -> Float[Array, " B"]:

@@ -72,21 +72,11 @@ def is_known(value) -> bool:
 def is_differentiated_in_reverse(value) -> bool:
     """Whether this value is traced by `jax.grad`, `jax.vjp` or `jax.linearize`, as far as a tracer tells."""
     # The tracer's class is not public. In a version of JAX that calls it otherwise, JAX's own error comes instead of ours.
-    return "LinearizeTracer" in _tracers_of(value)
-
-
-def times_differentiated(value) -> int:
-    """How often the derivative of this value is taken, one derivative within the other, as far as a tracer tells."""
-    return sum(name in ("JVPTracer", "LinearizeTracer") for name in _tracers_of(value))
-
-
-def _tracers_of(value) -> list[str]:
-    """The names of the tracers' classes, one within the other."""
-    found = []
     while isinstance(value, jax.core.Tracer):
-        found.append(type(value).__name__)
+        if type(value).__name__ == "LinearizeTracer":
+            return True
         value = getattr(value, "primal", getattr(value, "val", None))
-    return found
+    return False
 
 
 def refusing_reverse_in_single_precision(function: Callable[P, R]) -> Callable[P, R]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -110,6 +110,31 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int 
             source = of_kernel.source(traced.consts)
     places = _places(ends), _places(rows, 1), _places(end_dots), _places(row_dots, 1)
     return structures[-1], source, *map(tuple, places)
+
+
+def with_slopes(function: Callable, args: tuple, instants) -> tuple:
+    """The results of a function, each with its derivative along a direction: `args` are the function's own and the parts of the
+    direction, one for each array of these, None where it is zero.
+    """
+    form, arrays = Form.of(args[0])
+    wide, dots = [dot is not None for dot in args[1]], [dot for dot in args[1] if dot is not None]
+
+    def of(some):
+        remaining = iter(some)
+        whole = [next(remaining) if is_wide else array for array, is_wide in zip(arrays, wide, strict=True)]
+        return function(form.args(whole), instants)
+
+    found, moved = jax.jvp(of, ([array for array, is_wide in zip(arrays, wide, strict=True) if is_wide],), (dots,))
+    real = jax.tree.map(lambda dot: None if dot.dtype == jax.dtypes.float0 else dot, moved)
+    return tuple(zip(found, real, strict=True))
+
+
+def form_with_slopes(form: Form, wide: Sequence[bool]) -> Form:
+    """The form of the arguments of `with_slopes`, for a direction along these arrays."""
+    arrays = [np.zeros(*array) for array in form.arrays]
+    return Form.of(
+        (form.args(arrays), tuple(np.zeros(a.shape) if w else None for a, w in zip(arrays, wide, strict=True)))
+    )[0]
 
 
 def text(plain: tuple) -> Text:

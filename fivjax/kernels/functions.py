@@ -17,6 +17,7 @@ from ..foundation.argument_forms import Form
 from ..foundation.compiling import compiled
 from ..foundation.forking import refuse_if_forked
 from ..foundation.precision import is_known, known_to_numpy
+from .code import with_slopes
 from .kernel import kernel_of, width_for
 from .primitive import is_real, values
 
@@ -123,6 +124,13 @@ class KernelFunction:
             dots = [np.concatenate([part[k] for part in parts], axis=-1) for k in (2, 3)]
         end_dots, row_dots = (part[..., :total] for part in dots)
         return kernel.results(ends, rows), kernel.slopes(end_dots, row_dots, instants.shape[-1])
+
+    @functools.cached_property
+    def with_slopes(self) -> "KernelFunction":
+        """The same with derivatives along one direction beside its results: these have derivatives, too."""
+        if isinstance(self.function, functools.partial):
+            raise NotImplementedError("Kernels have no third derivatives; take differences of second ones.")
+        return KernelFunction(functools.partial(with_slopes, self.differentiated))
 
     # Without kernels.
 

@@ -42,7 +42,7 @@ class Kernel:
 
     def __init__(self, function, form: Form, wide: tuple[bool, ...], width: int, shared: int):
         own = function.differentiated if width else function.function
-        self.function, self.form, self.wide, self.width = own, form, wide, width
+        self.function, self.form, self.wide, self.width = function, form, wide, width
         self.text = text(kept_value(written, own, form, wide, shared))
         places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
         body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)

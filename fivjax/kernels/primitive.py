@@ -17,8 +17,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ..foundation.argument_forms import Form
-from .code import Place
+from ..foundation.argument_forms import Array, Form
+from .code import Place, form_with_slopes
 from .kernel import GIVEN, Kernel, kernel_of, width_for
 from .xla_calls import Places, called_by_xla
 
@@ -78,9 +78,9 @@ def is_real(array) -> bool:
 
 
 def _bind(function, form: Form, arrays: Sequence, instants, wide: tuple[bool, ...], width: int, directions):
-    given = jnp.concatenate([jnp.ravel(jnp.asarray(array)).astype(jnp.float64) for array in arrays])
     dots = jnp.zeros((1, 1)) if directions is None else jnp.asarray(directions)
-    return kernel_p.bind(given, dots, jnp.asarray(instants), kernel=_Hashed(kernel_of(function, form, wide, width)))
+    kernel = _Hashed(kernel_of(function, form, wide, width))
+    return kernel_p.bind(dots, jnp.asarray(instants), *map(jnp.asarray, arrays), kernel=kernel)
 
 
 class _Hashed:
@@ -100,109 +100,107 @@ kernel_p = Primitive("fivjax_kernel")
 kernel_p.multiple_results = True
 
 
+def _batch_of(kernel: _Hashed, arrays: Sequence) -> tuple[int, ...]:
+    """The leading axes that all arrays have alike, over trajectories."""
+    return arrays[0].shape[: arrays[0].ndim - len(kernel.kernel.form.arrays[0].shape)]
+
+
+def _in_rows(arrays: Sequence, lanes: int, xp):
+    """The numbers of the arrays, a row for each trajectory."""
+    return xp.concatenate([xp.reshape(array, (lanes, -1)).astype(np.float64) for array in arrays], axis=1)
+
+
 @kernel_p.def_abstract_eval
-def _abstract(given, dots, instants, *, kernel: _Hashed):
-    return [
-        jax.core.ShapedArray(shape, np.dtype("float64"))
-        for shape in kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])
-    ]
+def _abstract(dots, instants, *arrays, kernel: _Hashed):
+    shapes = kernel.kernel.shapes(_batch_of(kernel, arrays), instants.shape[-1])
+    return [jax.core.ShapedArray(shape, np.dtype("float64")) for shape in shapes]
 
 
 @kernel_p.def_impl
-def _known(given, dots, instants, *, kernel: _Hashed):
-    given, dots, instants = map(np.asarray, (given, dots, instants))
-    own, batch = kernel.kernel, given.shape[:-1]
-    found = own.launched(
-        given.reshape(-1, given.shape[-1]), instants.reshape(-1, instants.shape[-1]), dots.reshape(-1, *dots.shape[-2:])
+def _known(dots, instants, *arrays, kernel: _Hashed):
+    dots, instants, *arrays = map(np.asarray, (dots, instants, *arrays))
+    batch = _batch_of(kernel, arrays)
+    found = kernel.kernel.launched(
+        _in_rows(arrays, math.prod(batch), np), instants.reshape(-1, instants.shape[-1]), dots[None]
     )
     return [jnp.asarray(part.reshape(batch + part.shape[1:])) for part in found]
 
 
 def _batched(operands, axes, *, kernel: _Hashed):
-    given, dots, instants = operands
-    of_given, of_dots, of_instants = axes
+    (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = operands, axes
     size = next(part.shape[axis] for part, axis in zip(operands, axes, strict=True) if axis is not None)
     if of_dots is not None:
         raise NotImplementedError("Directions of a kernel's tangents are not batched.")
-    given = jnp.moveaxis(given, of_given, 0) if of_given is not None else jnp.broadcast_to(given, (size, *given.shape))
+    arrays = [
+        jnp.broadcast_to(array, (size, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
+        for array, axis in zip(arrays, of_arrays, strict=True)
+    ]
+    batch = _batch_of(kernel, arrays)
     if of_instants is not None:
         instants = jnp.moveaxis(instants, of_instants, 0)
         instants = jnp.broadcast_to(
-            instants.reshape(size, *[1] * (given.ndim - instants.ndim), *instants.shape[1:]),
-            (*given.shape[:-1], instants.shape[-1]),
+            instants.reshape(size, *[1] * (len(batch) + 1 - instants.ndim), *instants.shape[1:]),
+            (*batch, instants.shape[-1]),
         )
     elif instants.ndim > 1:
         instants = jnp.broadcast_to(instants, (size, *instants.shape))
-    return kernel_p.bind(given, dots, instants, kernel=kernel), [0] * 4
+    return kernel_p.bind(dots, instants, *arrays, kernel=kernel), [0] * 4
 
 
 batching.primitive_batchers[kernel_p] = _batched
 
 
-def _further_derivative(primals, tangents, *, kernel: _Hashed):
-    """Those of what a kernel finds, by XLA: of the second order, if it finds derivatives itself."""
-    tangents = tuple(ad.instantiate_zeros(tangent) for tangent in tangents)
-    return jax.jvp(_program_of(kernel), tuple(map(jnp.asarray, primals)), tangents)
+def _second_derivative(primals, tangents, *, kernel: _Hashed):
+    """Derivatives of what a kernel finds, tangents included."""
+    (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = primals, tangents
+    if not isinstance(of_dots, ad.Zero) or not isinstance(of_instants, ad.Zero):
+        raise NotImplementedError("A kernel has no derivative with respect to its instants and its directions.")
+    # What does not move takes no width.
+    moves = [not isinstance(tangent, ad.Zero) and is_real(tangent) for tangent in of_arrays]
+
+    def of(some):
+        remaining = iter(some)
+        whole = [next(remaining) if moving else still for still, moving in zip(arrays, moves, strict=True)]
+        return _with_slopes(kernel, dots, instants, *whole)
+
+    some, along = ([part for part, moving in zip(parts, moves, strict=True) if moving] for parts in (arrays, of_arrays))
+    return kernel_p.bind(*primals, kernel=kernel), jax.jvp(of, (some,), (along,))[1]
 
 
-ad.primitive_jvps[kernel_p] = _further_derivative
+ad.primitive_jvps[kernel_p] = _second_derivative
 
 
-@functools.cache
-def _program_of(kernel: _Hashed):
-    return jax.jit(functools.partial(_found_by_xla, kernel.kernel))
+def _with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
+    """What a kernel finds, so that its tangents have derivatives: by the kernel of a function that gives both."""
+    own = kernel.kernel
+    if _batch_of(kernel, arrays):
+        axes = None, 0 if instants.ndim > 1 else None, *(0 for _ in arrays)
+        return jax.vmap(functools.partial(_with_slopes, kernel), axes)(dots, instants, *arrays)
+    wide = [array for array, moves in zip(own.form.arrays, own.wide, strict=True) if moves]
+    function, form = own.function.with_slopes, form_with_slopes(own.form, own.wide)
+    ends, rows = jax.vmap(lambda dot: values(function, form, (*arrays, *_arrays(wide, dot)), instants), 1, 1)(dots)
+    found, slopes, count = [], [], instants.shape[-1]
+    for numbers, places, repeated in ((ends, own.text.ends, 1), (rows, own.text.rows, count)):
+        # What is found, and then its slopes.
+        size = repeated * sum(place.size for place in places)
+        found.append(numbers[:size, 0])
+        slopes.append(numbers[size:])
+    parts = zip((*found, *slopes), own.shapes((), count), strict=True)
+    # A row that has no numbers is one zero.
+    return [part if part.shape == shape else jnp.zeros(shape) for part, shape in parts]
 
 
-def _found_by_xla(kernel: Kernel, given, dots, instants) -> list:
-    """What a kernel finds, by XLA: the same numbers in the same places."""
-    if given.ndim > 1:
-        axes = 0, None, 0 if instants.ndim > 1 else None
-        return jax.vmap(functools.partial(_found_by_xla, kernel), axes)(given, dots, instants)
-    moving = kernel.wide + (False,) * len(kernel.form.arrays)
-
-    def arrays_from(numbers, chosen):
-        found, start = [], 0
-        for array in (array for array, is_chosen in zip(kernel.form.arrays, chosen, strict=False) if is_chosen):
-            found.append(numbers[start : start + array.size].reshape(array.shape).astype(array.dtype))
-            start += array.size
-        return found
-
-    arrays = arrays_from(given, (True,) * len(moving))
-
-    def results(some):
-        left = iter(some)
-        whole = [next(left) if moves else array for array, moves in zip(arrays, moving, strict=False)]
-        return tuple(map(jax.tree.leaves, kernel.function(kernel.form.args(whole), instants)))
-
-    def in_a_row(leaves):
-        leaves = [jnp.ravel(leaf).astype(jnp.float64) for leaf in leaves]
-        return jnp.concatenate(leaves) if leaves else jnp.zeros(1)
-
-    some = [array for array, moves in zip(arrays, moving, strict=False) if moves]
-    ends, rows = results(some)
-    if not kernel.width:
-        of_ends, of_rows = jnp.zeros((1, 1)), jnp.zeros((1, 1))
-    else:
-
-        def along(dots):
-            slopes = jax.jvp(results, (some,), (arrays_from(dots, moving),))[1]
-            return [in_a_row([slope for slope in part if slope.dtype != jax.dtypes.float0]) for part in slopes]
-
-        of_ends, of_rows = jax.vmap(along, in_axes=1, out_axes=1)(dots)
-    shapes = kernel.shapes((), instants.shape[-1])
-    found = in_a_row(ends), in_a_row(rows), of_ends, of_rows
-    return [part if part.shape == shape else jnp.zeros(shape) for part, shape in zip(found, shapes, strict=True)]
+def _arrays(like: Sequence[Array], numbers) -> list:
+    """The arrays of which these are the numbers, one after the other."""
+    ends = np.cumsum([array.size for array in like])[:-1]
+    return [part.reshape(array.shape) for array, part in zip(like, jnp.split(numbers, ends), strict=True)]
 
 
-def _lowered(given, dots, instants, *, kernel: _Hashed):
-    shapes = kernel.kernel.shapes(given.shape[:-1], instants.shape[-1])
-    lanes = math.prod(given.shape[:-1])
-    flat = (
-        given.reshape(lanes, given.shape[-1]),
-        dots[None],
-        instants.reshape(-1, instants.shape[-1]),
-    )
-    of_lanes = [jax.ShapeDtypeStruct((lanes, *shape[given.ndim - 1 :]), np.float64) for shape in shapes]
+def _lowered(dots, instants, *arrays, kernel: _Hashed):
+    batch = _batch_of(kernel, arrays)
+    shapes, lanes = kernel.kernel.shapes(batch, instants.shape[-1]), math.prod(batch)
+    flat = _in_rows(arrays, lanes, jnp), dots[None], instants.reshape(-1, instants.shape[-1])
+    of_lanes = [jax.ShapeDtypeStruct((lanes, *shape[len(batch) :]), np.float64) for shape in shapes]
     found = _callable(kernel)(of_lanes)(*flat)
     return [part.reshape(shape) for part, shape in zip(found, shapes, strict=True)]
 

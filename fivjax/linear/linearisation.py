@@ -4,11 +4,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, Status
 from ..foundation.linear_solve import solve
+from ..foundation.numpy_evaluation import by_numpy
 from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_states
@@ -158,6 +159,20 @@ def _of_several(scene: Scene, mechanics: Mechanics) -> LinearSliding:
         exists=jnp.all((normal_force > 0) & (direction != 0)) & jnp.all(jnp.isfinite(q)),
         solvable=physics.slides_uniquely(mechanics),
     )
+
+
+def sliding_rates(scene: Scene) -> Complex[np.ndarray, " m"]:
+    """Eigenvalues of steady sliding, in 1/s, the fastest growing first; NaN where it has no finite state matrix."""
+    matrix = np.asarray(_sliding_matrix(scene))
+    if not np.all(np.isfinite(matrix)):
+        return np.full(len(matrix), np.nan, complex)
+    values = np.linalg.eigvals(matrix).astype(complex)
+    return values[np.lexsort((-values.imag, -values.real))]
+
+
+@by_numpy
+def _sliding_matrix(scene: Scene):
+    return linear_sliding(scene).matrix
 
 
 def state_matrix(

@@ -26,10 +26,11 @@ from .one_trajectory import (
     UNBOUNDED_FROM,
     Progress,
     Setting,
-    at_equilibrium,
     conclude,
-    with_initial_values,
     with_step,
+)
+from .one_trajectory import (
+    begin as begin_one,
 )
 from .trajectory_kernels import TrajectoryKernels
 
@@ -137,9 +138,7 @@ def _begin_block(scene, names, history, states, energy: bool, shared: Flattened,
         own = with_values(scene, names, shared.values)
 
         def one(row):
-            scene = with_values(own, history, row)
-            now = at_equilibrium(scene, shared, energy, for_kernel=False)
-            return with_initial_values(now, scene, shared, states, row[len(history) :])
+            return begin_one(with_values(own, history, row), shared, states, row[len(history) :], energy=energy)
 
         return jax.vmap(one)(columns)
 

@@ -78,13 +78,22 @@ class LoadSteps(eqx.Module):
         self.loads = jax.vmap(load)(between) - load.final
 
 
-def at_equilibrium(scene: Scene, shared: Shared, energy: bool, for_kernel: bool) -> Progress:
-    """A trajectory at the sliding equilibrium of its scene, before the kick."""
+def begin(
+    scene: Scene, shared: Shared, places: tuple[int, ...], values, *, energy: bool = False, for_kernel: bool = False
+) -> Progress:
+    """A trajectory at the sliding equilibrium of its scene, before the kick. At these places of its state it has `values`
+    (totals, not deviations) instead, where they are not NaN.
+    """
     modes = shared.modes
     q, _ = steady_sliding(scene, scene.load.force)
     equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
     # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
     y = equilibrium - modes.linear.equilibrium + jnp.finfo(q.dtype).eps * jnp.abs(equilibrium)
+    own = jnp.zeros_like(y)
+    if places:
+        at = np.array(places)
+        y = y.at[at].set(jnp.where(jnp.isnan(values), y[at], values - modes.linear.equilibrium[at]))
+        own = y
     verdict = jnp.where(
         ~modes.linear.solvable,
         Verdict.PAINLEVE,
@@ -103,28 +112,13 @@ def at_equilibrium(scene: Scene, shared: Shared, energy: bool, for_kernel: bool)
         events=jnp.zeros((), jnp.int32),
         last_event=jnp.full((), jnp.nan, y.dtype),
         last_jump=jnp.max(scene.load.jumps, initial=0.0),
-        yardstick=largest * jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + belt,
+        yardstick=jnp.maximum(
+            largest * jnp.max(jnp.abs(weights * modes.linear.equilibrium)) + belt, jnp.max(jnp.abs(weights * own))
+        ),
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         bound=jnp.full((), jnp.inf, y.dtype),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
         steps=steps if for_kernel else None,
-    )
-
-
-def with_initial_values(now: Progress, scene: Scene, shared: Shared, places: tuple[int, ...], values) -> Progress:
-    """The trajectory with total values (not deviations) at these indices of its initial state; NaN leaves an entry as it is."""
-    if not places:
-        return now
-    equilibrium, at = shared.modes.linear.equilibrium, jnp.array(places)
-    y = now.y.at[at].set(jnp.where(jnp.isnan(values), now.y[at], values - equilibrium[at]))
-    contact = physics.status_from_forces(shared.mechanics, scene.load.force - scene.load.final, y)
-    energy = None if now.energy is None else EnergyRecord(open_ledger(EnergyData(scene), y), now.energy.vibration)
-    yardstick = jnp.maximum(now.yardstick, jnp.max(jnp.abs(scene.structure.weights * y)))
-    return eqx.tree_at(
-        lambda now: (now.y, now.contact, now.yardstick, now.energy),
-        now,
-        (y, contact, yardstick, energy),
-        is_leaf=lambda leaf: leaf is None,
     )
 
 

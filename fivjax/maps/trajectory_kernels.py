@@ -18,7 +18,7 @@ from ..section.by_kernel import in_parts, numbers_in_rows
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
 from .groups import Shared, Task, with_values
-from .one_trajectory import Progress, Setting, at_equilibrium, conclude, with_initial_values, with_step
+from .one_trajectory import Progress, Setting, begin, conclude, with_step
 
 
 class OfTask(eqx.Module):
@@ -39,9 +39,9 @@ class OfTask(eqx.Module):
 
 def _begin_one(args, instants):
     of_task, shared, row = args
-    scene = of_task.setting(shared, row).scene
-    now = at_equilibrium(scene, shared, of_task.energy, isinstance(of_task.method, Propagation))
-    return with_initial_values(now, scene, shared, of_task.states, row[len(of_task.history) :]), ()
+    scene, own = of_task.setting(shared, row).scene, row[len(of_task.history) :]
+    for_kernel = isinstance(of_task.method, Propagation)
+    return begin(scene, shared, of_task.states, own, energy=of_task.energy, for_kernel=for_kernel), ()
 
 
 def _follow_one(args, instants):

@@ -23,7 +23,6 @@ from ..foundation.precision import (
     known_to_numpy,
     real,
     refusing_reverse_in_single_precision,
-    times_differentiated,
 )
 from ..foundation.progress import following, tick
 from ..io.datasets import labelled
@@ -238,9 +237,7 @@ def simulate(
     # By NumPy, because JAX would compile a small program for each operation.
     saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1))
     stepper = with_step_as_array(method)
-    # Kernels have first derivatives only.
-    once = all(times_differentiated(leaf) < 2 for leaf in jax.tree.leaves((scene, y0)))
-    if has_kernel(scene, method) and once:
+    if has_kernel(scene, method):
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             ending, found = rows_by_kernel(scene, method, given, saved, most, bool(energy))
             tick(len(saved) - 1)

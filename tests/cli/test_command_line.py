@@ -34,7 +34,7 @@ def test_what_a_question_loads(option):
 
 
 def test_the_program_ends_at_once_with_its_code_and_all_it_has_said():
-    command = [sys.executable, "-m", "fivjax.cli"]
+    command = [sys.executable, "-m", "fivjax"]
     ran = subprocess.run([*command, "cea", "--mu", "-1"], capture_output=True, text=True)
     assert ran.returncode == 2 and ran.stderr.startswith("fivjax: ") and "mu" in ran.stderr
     reading, writing = os.pipe()
@@ -46,7 +46,7 @@ def test_the_program_ends_at_once_with_its_code_and_all_it_has_said():
 
 
 def test_the_module_is_the_program():
-    ran = subprocess.run([sys.executable, "-m", "fivjax.cli", "--version"], capture_output=True, text=True, check=True)
+    ran = subprocess.run([sys.executable, "-m", "fivjax", "--version"], capture_output=True, text=True, check=True)
     assert ran.stdout == f"fivjax {fj.__version__}\n"
 
 

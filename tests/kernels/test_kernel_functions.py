@@ -187,7 +187,7 @@ def test_numpy_reads_and_writes_the_places_of_arrays_that_jax_does():
 
 
 def test_second_derivatives_of_a_kernel_are_those_of_its_function():
-    """By XLA's programs: `hessian`, and the derivative of a derivative under `vmap` and `jit`."""
+    """The derivative of a derivative, under `vmap` and `jit`."""
     x, matrix, count = given(3)
     instants = np.linspace(0.1, 1.0, 4)
 

@@ -1,0 +1,5 @@
+"""`python -m fivjax` is `fivjax`."""
+
+from .cli.ending import program
+
+program()

@@ -1,5 +1,0 @@
-"""`python -m fivjax.cli` is `fivjax`."""
-
-from .ending import program
-
-program()
