@@ -10,6 +10,7 @@ of values that are exact to rounding.
 import numpy as np
 from jaxtyping import Float
 
+from ..linear.linearisation import sliding_rates
 from .branch_points import Point
 from .grazing import looked_at, row_of
 from .multiple_shooting import images, moved_along, parameter_direction

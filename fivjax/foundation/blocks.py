@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from .flattened import Flattened
+from .precision import own_settings
 
 # Trajectories in a block: few enough to stay in a core's cache, and enough to outweigh the start of each kernel.
 BLOCK_ON_CPU = 64
@@ -77,7 +78,7 @@ def in_blocks(
         real = filled[chosen % len(slots)] & (chosen < len(slots))[:, None]
         place = slots[np.where(chosen < len(slots), chosen, start)]
         device = devices[start // rows % len(devices)] if len(devices) > 1 else None
-        with jax.enable_x64(True), jax.default_device(device):  # each thread has its own settings
+        with own_settings(), jax.default_device(device):
             own = Flattened(shared.numbers[group[place[:, 0]]], shared.form)
             result = function(own, Flattened(trajectories.numbers[place], trajectories.form))
             return place[real], np.asarray(result.numbers)[real], result.form

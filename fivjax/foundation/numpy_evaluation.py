@@ -17,6 +17,7 @@ from .compiling import compiled, transformed
 from .jaxprs import of_scan, solution, within
 from .linear_solve import eliminated, is_elimination
 from .numpy_primitives import function_of
+from .precision import own_settings
 
 # Calls after which it is compiled, and results that are kept in case they are asked for again.
 REPAID, LATEST = 100, 16
@@ -45,7 +46,7 @@ def by_numpy(function: Callable[P, R]) -> Callable[P, R]:
         if calls[form] > REPAID:
             return otherwise(*args, **kwargs)
         if form not in traced:
-            with jax.enable_x64(True):
+            with own_settings():
                 like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
                 structures = []
 

@@ -12,8 +12,9 @@ Two consequences are dealt with here:
   the values are not known yet, and stay JAX's.
 """
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -30,13 +31,20 @@ R = TypeVar("R")
 Returned = Array | np.ndarray
 
 
+@contextlib.contextmanager
+def own_settings() -> Iterator[None]:
+    """Double precision, and arrays of any rank together, whatever the caller has set. Each thread has settings of its own."""
+    with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
+        yield
+
+
 def in_double_precision(function: Callable[P, R]) -> Callable[P, R]:
     """`function`, run with double precision available; results stay as they are."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         refuse_if_forked()
-        with jax.enable_x64(True):
+        with own_settings():
             return function(*args, **kwargs)
 
     return wrapped
@@ -48,7 +56,7 @@ def returning_numpy(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         refuse_if_forked()
-        with jax.enable_x64(True):
+        with own_settings():
             return jax.tree.map(known_to_numpy, function(*args, **kwargs))
 
     return wrapped

@@ -12,6 +12,7 @@ from jax.interpreters import partial_eval
 from ..foundation.argument_forms import Form
 from ..foundation.jaxprs import of_scan
 from ..foundation.plain_trees import from_text, structure_to_text
+from ..foundation.precision import own_settings
 from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers
 from .cpp_code import writer
 from .cpp_loops import scan
@@ -94,7 +95,7 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int 
         return found, tuple(tuple(dot for dot in dots if dot.dtype != jax.dtypes.float0) for dots in moved)
 
     moving = [array for array, is_wide in zip(like, wide, strict=False) if is_wide]
-    with jax.enable_x64(True):
+    with own_settings():
         if moving:
             traced, shapes = jax.make_jaxpr(with_tangents, return_shape=True)(like, moving, instants)
             (ends, rows), (end_dots, row_dots) = shapes

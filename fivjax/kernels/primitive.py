@@ -1,7 +1,7 @@
 """Kernels as a primitive of JAX's.
 
 Under `jit` it calls the kernel, under `vmap` it is one call for more trajectories, and under `jvp` a kernel that computes
-tangents beside values takes its place.
+tangents beside values takes its place. JAX applies these rules after the call that it traces, under its caller's settings.
 """
 
 import ctypes
@@ -18,6 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from ..foundation.argument_forms import Array, Form
+from ..foundation.precision import own_settings
 from .code import Place, form_with_slopes
 from .kernel import GIVEN, Kernel, kernel_of, width_for
 from .xla_calls import Places, called_by_xla
@@ -31,6 +32,7 @@ def values(function, form: Form, arrays: tuple, instants):
 
 
 @functools.partial(values.defjvp, symbolic_zeros=True)
+@own_settings()
 def _values_jvp(function, form: Form, primals, tangents):
     arrays, instants = primals
     dots, of_instants = tangents
@@ -126,6 +128,7 @@ def _known(dots, instants, *arrays, kernel: _Hashed):
     return [jnp.asarray(part.reshape(batch + part.shape[1:])) for part in found]
 
 
+@own_settings()
 def _batched(operands, axes, *, kernel: _Hashed):
     (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = operands, axes
     size = next(part.shape[axis] for part, axis in zip(operands, axes, strict=True) if axis is not None)
@@ -150,6 +153,7 @@ def _batched(operands, axes, *, kernel: _Hashed):
 batching.primitive_batchers[kernel_p] = _batched
 
 
+@own_settings()
 def _second_derivative(primals, tangents, *, kernel: _Hashed):
     """Derivatives of what a kernel finds, tangents included."""
     (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = primals, tangents
@@ -196,6 +200,7 @@ def _arrays(like: Sequence[Array], numbers) -> list:
     return [part.reshape(array.shape) for array, part in zip(like, jnp.split(numbers, ends), strict=True)]
 
 
+@own_settings()
 def _lowered(dots, instants, *arrays, kernel: _Hashed):
     batch = _batch_of(kernel, arrays)
     shapes, lanes = kernel.kernel.shapes(batch, instants.shape[-1]), math.prod(batch)

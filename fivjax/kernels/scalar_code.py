@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from ..foundation.precision import own_settings
 from .cpp_arrays import View
 from .cpp_code import writer
 from .cpp_numbers import text_of
@@ -17,7 +18,7 @@ def scalar_source(function: Callable, **lengths: int) -> tuple[str, int]:
 
     **Raises:** `NotImplementedError` for a primitive of JAX that has no C++.
     """
-    with jax.enable_x64(True):
+    with own_settings():
         like = [jax.ShapeDtypeStruct((length,), np.float64) for length in lengths.values()]
         closed = jax.make_jaxpr(function)(*like)
         code = writer(dict.fromkeys(lengths, "double"))

@@ -110,6 +110,7 @@ def derivatives(
         >>> found = fj.derivatives(lambda run: run.displacement[-1, 0], scene, ["mu", "k1"], t1=0.4)  # doctest: +SLOW
     """
     arguments.instance("scene", scene, Scene, "a Scene")
+    arguments.known("scene", scene)
     if not callable(functional):
         raise TypeError(
             f"Argument `functional` must be a function of a Trajectory, but is {arguments.describe(functional)}."

@@ -49,6 +49,20 @@ def test_single_precision_input_does_not_become_single_precision_physics():
     assert friction.mu.dtype == np.float64 and float(friction.mu) == 0.25
 
 
+def test_settings_of_others_do_not_reach_in(paper_scene):
+    """Rejects errors about shapes, from code of fivjax that was traced under the caller's setting."""
+
+    def last(mu):
+        return fj.simulate(paper_scene.replace(mu=mu), 0.01, 5e-3).velocity[-1]
+
+    expected = last(0.25)
+    with jax.numpy_rank_promotion("raise"):
+        np.testing.assert_array_equal(last(0.25), expected)
+        np.testing.assert_allclose(jax.jit(last)(0.25), expected, rtol=1e-12)
+        assert np.all(np.isfinite(jax.jacfwd(last)(0.25)))
+        assert fj.cea.eigenvalues(paper_scene.replace(k1=99e3)).shape == (4,)
+
+
 @pytest.mark.slow
 def test_transformations_around_simulate_without_double_precision(paper_scene):
     """Rejects `jit` that ends in an error of the compiler, and `grad` that fails without the sentence that has the remedy."""

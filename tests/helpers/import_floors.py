@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[2] / "fivjax"
 DOOR = "fivjax"
 # Written with the public names, so above them, lowest first. Where the door offers a name from here, it imports it when somebody
 # uses the name: after all that stands below.
-ABOVE_THE_DOOR = ("paper", "reproduction", "cli")
+ABOVE_THE_DOOR = ("paper", "reproduction", "cli", "__main__")
 
 
 def modules(package: Path = PACKAGE) -> dict[str, Path]:

@@ -82,6 +82,27 @@ def test_slip_that_a_jump_of_the_load_begins(mode):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
+def test_second_derivatives_through_the_onset_of_slip():
+    """Wrong if the tangents of an event's instant are taken for constants."""
+    stiffness, force, end = 4.0, 2.0, 1.1
+
+    def simulated(values):
+        mu, belt = values
+        scene = fj.Scene(point_mass(stiffness), fj.Coulomb(mu), belt, load=fj.ConstantLoad(force))
+        run = fj.simulate(scene, end, end, FEW, y0=jnp.stack([0.0 * belt, 0.0 * belt, belt, 0.0 * belt]))
+        return run.displacement[-1, 0]
+
+    def closed(values):
+        mu, belt = values
+        held, rate = mu * force / stiffness, jnp.sqrt(stiffness)
+        return held + belt / rate * jnp.sin(rate * (end - held / belt))
+
+    with jax.enable_x64(True):
+        values = jnp.array([0.3, 0.5])
+        np.testing.assert_allclose(jax.hessian(simulated)(values), jax.hessian(closed)(values), rtol=1e-9)
+
+
 def test_a_start_that_sticks_by_the_belt_speed():
     """A faster belt takes a given start along by an impulse. The momentum of what the mass matrix couples to it stays as it is."""
     mass = np.array([[1.0, 0.4, 0.0], [0.4, 2.0, 0.0], [0.0, 0.0, 1.0]])
