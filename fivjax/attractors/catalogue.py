@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from ..section.return_maps import ReturnMaps
 from .approach import Approach, approaches
-from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, capturing_cycles, is_new, stable_cycles
+from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, capturing_cycles, cycle_through, stable_cycles
 from .motions import Motions, far_apart
 from .returning import captured_by_tubes
 from .tori import TUBES, Torus, holds_one_of, tori_from
@@ -39,6 +39,13 @@ class Attractors(NamedTuple):
     def none(cls) -> "Attractors":
         """Nothing is known yet."""
         return cls([], [], [])
+
+    def with_cycle(self, maps: ReturnMaps, cycle: StableCycle) -> StableCycle:
+        """The one of the cycles that this is, which is added if it is new."""
+        before = cycle_through(maps, cycle.points[0], self.cycles)
+        if before is None:
+            self.cycles.append(cycle)
+        return cycle if before is None else before
 
     def copy(self) -> "Attractors":
         return Attractors(*(list(own) for own in self))
@@ -74,8 +81,7 @@ class Catalogue(NamedTuple):
         """Adds those of these cycles of groups that are new, each with its approach."""
         added = []
         for g, cycle in new:
-            if is_new(self.maps, cycle, self.of_group[g].cycles):
-                self.of_group[g].cycles.append(cycle)
+            if self.of_group[g].with_cycle(self.maps, cycle) is cycle:
                 added.append((g, cycle))
         if not self.from_afar or not added:
             return
@@ -95,7 +101,11 @@ class Catalogue(NamedTuple):
         tori, locked = tori_from(self.maps, motions, cycles, tori, self.report, tubes)
         for row, torus in tori.items():
             known[row].tori.append(torus)
-        self._add([(int(motions.group[row]), cycle) for row, cycle in locked])
+        self._add([(int(motions.group[row]), cycle) for row, cycle, one in locked if one is None])
+        for row, cycle, one in locked:
+            if one is not None:
+                # What the tube captures comes to the cycle in the end.
+                known[row].approaches.append(Approach(known[row].with_cycle(self.maps, cycle), one))
 
     def add_tori_by_turns(self, motions: Motions, usable: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
         """The same from the usable motions, one of each group after the other, while there are some that none of the known

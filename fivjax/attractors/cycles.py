@@ -91,7 +91,7 @@ def stable_cycles(
             alike[kind].append(len(kept))
             kept.append(row)
             rows_of.append([near[row]])
-    before = [_cycle_through(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
+    before = [cycle_through(maps, closed.at.y[row], known.get(int(group[near[row]]), [])) for row in kept]
     largest = np.max(np.abs(np.linalg.eigvals(closed.jacobian[kept])), axis=1)
     found, stable, trials = [], [], []
     for k, row in enumerate(kept):
@@ -157,12 +157,7 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
     return found
 
 
-def is_new(maps: ReturnMaps, cycle: StableCycle, known: list[StableCycle]) -> bool:
-    """Whether a cycle is none of the known ones of its group."""
-    return _cycle_through(maps, cycle.points[0], known) is None
-
-
-def _cycle_through(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[StableCycle]) -> StableCycle | None:
+def cycle_through(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], cycles: list[StableCycle]) -> StableCycle | None:
     """The one of these cycles that has this state among its points."""
     return next((cycle for cycle in cycles if _passes(maps, y, cycle.points)), None)
 

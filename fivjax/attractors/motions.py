@@ -35,3 +35,16 @@ def far_apart(
             away = np.minimum(away, np.linalg.norm(states[rows] - states[mine[-1]], axis=1))
         picked += mine
     return np.array(picked, int)
+
+
+def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray | np.floating, "*m"]:
+    """The root mean square distance of points from their mean."""
+    away = weighted - np.mean(weighted, axis=0)
+    return np.sqrt(np.einsum("k...j,k...j->...", away, away) / len(away))
+
+
+def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*state"]:
+    """A mean whose weights vanish smoothly at both ends: of a quasi-periodic sequence it is much better than equal weights."""
+    x = (np.arange(len(values)) + 0.5) / len(values)
+    weights = np.exp(-1.0 / (x * (1 - x)))
+    return np.tensordot(weights / np.sum(weights), values, axes=1)

@@ -25,7 +25,8 @@ from .cycles import (
     stable_cycles,
 )
 from .divergence import growth_rates, parts_along
-from .motions import NOMINATED, Motions
+from .locked_tori import cycles_closed_in_on, cycles_repeated
+from .motions import NOMINATED, Motions, extent, smooth_mean
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
 from .tube import Tube, thin, tree_of
 
@@ -77,15 +78,16 @@ def tori_from(
     tori: list[list[Torus]],
     report,
     tubes=TUBES,
-) -> tuple[dict[int, Torus], list[tuple[int, StableCycle]]]:
-    """The tori that these motions are on, by row; and the cycles of locked ones, with their rows. `cycles` and `tori` are those
-    known of each row's group. Of the `tubes` the first that attracts counts.
+) -> tuple[dict[int, Torus], list[tuple[int, StableCycle, Tube | None]]]:
+    """The tori that these motions are on, by row; and the cycles of locked ones, with their rows, and with the torus' tube
+    where that captures. `cycles` and `tori` are those known of each row's group. Of the `tubes` the first that attracts counts.
     """
     group = motions.group
     traced = _trace(maps, motions, tori, max(TRACED, tubes[-1][1]))
     found: dict[int, Torus] = {}
-    locked = _cycles_repeated(maps, group, traced, cycles)
-    for row, _ in locked:
+    locked: list[tuple[int, StableCycle, Tube | None]] = []
+    for row, cycle in cycles_repeated(maps, group, _states_of(traced), cycles):
+        locked.append((row, cycle, None))
         del traced[row]
     around = _trace_around(maps, group, traced)
     # A tube that is wider says more, where everything in it comes back.
@@ -104,30 +106,18 @@ def tori_from(
                 del new[row], traced[row]
                 around.pop(row, None)
             found |= {row: Torus(one, traced[row].amplitude, traced[row].period) for row, one in new.items()}
-            locked += of_locked
+            locked += [(row, cycle, None) for row, cycle in of_locked]
+            for row, cycle in cycles_closed_in_on(maps, group, _states_of({row: traced[row] for row in new}), cycles):
+                del found[row]
+                locked.append((row, cycle, new[row]))
             for row in {*new, *(row for row, _ in of_locked)}:
                 del traced[row]
                 around.pop(row, None)
     return found, locked
 
 
-def _cycles_repeated(
-    maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: dict[int, Traced], cycles: list[list[StableCycle]]
-) -> list[tuple[int, StableCycle]]:
-    """The cycles of motions that have nearly come to one of many crossings by the end of what they trace, with their rows."""
-    rows = []
-    for row, one in traced.items():
-        back = np.linalg.norm(one.states[-1 - MOST_CROSSINGS : -1] - one.states[-1], axis=1)
-        # Hardly any motion on a torus comes back as close as this.
-        if np.min(back) <= 1e-4 * extent(one.states):
-            rows.append(row)
-    if not rows:
-        return []
-    own, last = group[rows], np.array([traced[row].states[-1] for row in rows]) / maps.weights
-    at = section_at(last, maps.normal, maps.sliding[own])
-    known = {int(group[row]): cycles[row] for row in rows}
-    near = stable_cycles(maps, Motions(own, at), known, Recurrence(MOST_CROSSINGS, settled=True))
-    return [(rows[k], cycle) for _, which, cycle in near for k in which]
+def _states_of(traced: dict[int, Traced]) -> dict[int, Float[np.ndarray, "k 2n"]]:
+    return {row: one.states for row, one in traced.items()}
 
 
 def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: int) -> dict[int, Traced]:
@@ -146,8 +136,8 @@ def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: i
         else:
             at, _, taken, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
             peaks, times = (
-                np.concatenate([earlier, latest[:, None]], axis=1)[:, -LONGER // AT_A_TIME :]
-                for earlier, latest in ((peaks, highest), (times, taken))
+                np.concatenate([earlier, latest[:, None]], axis=1)[:, -kept // AT_A_TIME :]
+                for earlier, latest, kept in ((peaks, highest, LONGER), (times, taken, LONGEST))
             )
         more *= maps.weights
         paths = np.concatenate([paths, more], axis=1)[:, -LONGEST:]
@@ -162,7 +152,8 @@ def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: i
             left &= goes_on(whole)
             for k in np.flatnonzero(left):
                 amplitude = _settled_amplitude(peaks[k])
-                if amplitude is not None and not drifting[k]:
+                settled = amplitude is not None and (length >= LONGEST or _is_settled(times[k]))
+                if settled and not drifting[k]:
                     traced[int(running[k])] = Traced(
                         paths[k, -LONGER:].copy(), amplitude, float(np.mean(times[k])) / AT_A_TIME
                     )
@@ -176,25 +167,18 @@ def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: i
     return traced
 
 
-def extent(weighted: Float[np.ndarray, "k *m state"]) -> Float[np.ndarray | np.floating, "*m"]:
-    """The root mean square distance of points from their mean."""
-    away = weighted - np.mean(weighted, axis=0)
-    return np.sqrt(np.einsum("k...j,k...j->...", away, away) / len(away))
-
-
-def smooth_mean(values: Float[np.ndarray, "k *state"]) -> Float[np.ndarray, "*state"]:
-    """A mean whose weights vanish smoothly at both ends: of a quasi-periodic sequence it is much better than equal weights."""
-    x = (np.arange(len(values)) + 0.5) / len(values)
-    weights = np.exp(-1.0 / (x * (1 - x)))
-    return np.tensordot(weights / np.sum(weights), values, axes=1)
-
-
 def _settled_amplitude(peaks: Float[np.ndarray, " k"]) -> float | None:
     """The largest of the later half of successive peaks (m/s): the amplitude, if that of the earlier half differs little. What
     shrinks slowly beats more than it shrinks in a short time, and may seem to stand still; and the highest beats may be rare.
     """
     earlier, later = np.max(peaks[: len(peaks) // 2]), np.max(peaks[len(peaks) // 2 :])
     return float(later) if abs(later / earlier - 1) <= 7.5e-4 else None
+
+
+def _is_settled(times: Float[np.ndarray, " k"]) -> bool:
+    """Whether successive times of equally many returns have settled to their mean: slow beats may be of different lengths."""
+    earlier, later = np.mean(times[: len(times) // 2]), np.mean(times[len(times) // 2 :])
+    return bool(abs(later / earlier - 1) <= 5e-4)
 
 
 def _growth(paths: Float[np.ndarray, "k *m 2n"]) -> Float[np.ndarray, "*m"]:

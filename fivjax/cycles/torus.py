@@ -14,7 +14,8 @@ What a torus is accepted by is in `attractors.tori`; here it is only described.
 import numpy as np
 from jaxtyping import Float
 
-from ..attractors.tori import Torus, smooth_mean
+from ..attractors.motions import smooth_mean
+from ..attractors.tori import Torus
 from ..contact import Contact
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state

@@ -9,21 +9,19 @@ import pytest
 import fivjax as fj
 from fivjax.attractors import tube
 from fivjax.attractors.catalogue import Catalogue
-from fivjax.attractors.cycles import CROSSINGS, StableCycle, is_new, stable_cycles
-from fivjax.attractors.motions import Motions
+from fivjax.attractors.cycles import CROSSINGS, StableCycle, cycle_through, stable_cycles
+from fivjax.attractors.locked_tori import cycles_closed_in_on, cycles_repeated
+from fivjax.attractors.motions import Motions, smooth_mean
 from fivjax.attractors.returning import captured_by_tubes
 from fivjax.attractors.tori import (
     LONGER,
     TRACED,
     Torus,
-    Traced,
-    _cycles_repeated,
     _in_clusters,
     _on_one_torus,
     goes_on,
     holds_one_of,
     is_drifting,
-    smooth_mean,
 )
 from fivjax.attractors.tube import Tube
 from fivjax.contact import Status
@@ -508,18 +506,28 @@ class Locked:
         return np.ones(len(group))
 
 
-def test_a_cycle_of_many_crossings_that_attracts_weakly_counts_for_a_motion_that_repeats_it():
-    """Other motions are better said to be on a torus. The cycle is where 13 times the angle is no longer turned back or on."""
+@pytest.mark.parametrize(("start", "found_by"), [(0.003, cycles_repeated), (0.05, cycles_closed_in_on)])
+def test_a_cycle_of_many_crossings_that_attracts_weakly_counts_for_a_motion_that_comes_to_it(start, found_by):
+    """The motion repeats it, or is still on its way. The cycle is where 13 times the angle is no longer turned back or on."""
     maps, at = Locked(), Section(np.zeros((1, 6)), np.ones(1, np.int32), np.ones(1))
-    at.y[0, :2] = 4 + 0.5 * np.cos(0.003), 0.5 * np.sin(0.003)
+    at.y[0, :2] = 4 + 0.5 * np.cos(start), 0.5 * np.sin(start)
     _, states = maps.path(np.zeros(1, int), at, TRACED)
-    found = _cycles_repeated(maps, np.zeros(1, int), {0: Traced(states[0], 1.0, 1.0)}, [[]])  # type: ignore[arg-type]
+    found = found_by(maps, np.zeros(1, int), {0: states[0]}, [[]])  # type: ignore[arg-type]
     assert [row for row, _ in found] == [0]
     (_, cycle), angle = found[0], 2 * np.pi * np.arange(13) / 13
     circle_13 = np.stack([4 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)], axis=-1)
     apart = np.linalg.norm(cycle.points[:, None, :2] - circle_13, axis=2)
     assert np.all(np.sort(np.argmin(apart, axis=1)) == np.arange(13)) and np.min(apart, axis=1).max() < 1e-9
     assert cycle.multiplier == pytest.approx((1 - 1e-3) ** 13, abs=1e-6)
+
+
+def test_a_torus_that_is_not_locked_closes_in_on_nothing():
+    turns = 2 * np.pi * GOLDEN * np.arange(TRACED)
+    states = np.stack(
+        [4 + 0.5 * np.cos(turns), 0.5 * np.sin(turns) + 0.1 * np.cos(turns), *np.zeros((4, TRACED))], axis=-1
+    )
+    for found_by in (cycles_repeated, cycles_closed_in_on):
+        assert found_by(Locked(), np.zeros(1, int), {0: states}, [[]]) == []  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
@@ -531,8 +539,8 @@ def test_a_cycle_is_known_if_one_of_its_points_is_met_to_a_millionth_of_its_size
     length = size * np.hypot(0.3, 0.4)
     for away, new in ((0.0, False), (0.9e-6, False), (1.1e-6, True)):
         moved = points[1:] + np.array([[0.0, away * length]])
-        assert is_new(maps, one._replace(points=moved), [one]) is new  # type: ignore[arg-type]
-    assert is_new(maps, one, [])  # type: ignore[arg-type]
+        assert (cycle_through(maps, moved[0], [one]) is None) is new  # type: ignore[arg-type]
+    assert cycle_through(maps, one.points[0], []) is None
 
 
 @pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
