@@ -43,7 +43,7 @@ def cycles_closed_in_on(
         closes_in = np.median(apart[-third:]) <= 0.9 * np.median(apart[:third])
         if closes_in and np.min(back) <= 1e-3 * extent(states):
             rows.append(row)
-    return _cycles_at_the_end(maps, group, traced, rows, cycles)
+    return _cycles_at_the_end(maps, group, traced, rows, cycles, 4096)
 
 
 def _cycles_at_the_end(
@@ -52,12 +52,15 @@ def _cycles_at_the_end(
     traced: States,
     rows: list[int],
     cycles: list[list[StableCycle]],
+    onward: int = 0,
 ) -> list[tuple[int, StableCycle]]:
-    """The cycles near the last states that these motions trace, each with a row."""
+    """The cycles near the last states that these motions trace, or near where they are so many returns later; each with a row."""
     if not rows:
         return []
     own, last = group[rows], np.array([traced[row][-1] for row in rows]) / maps.weights
     at = section_at(last, maps.normal, maps.sliding[own])
+    if onward:
+        at = maps.returns(own, at, onward).at
     known = {int(group[row]): cycles[row] for row in rows}
     near = stable_cycles(maps, Motions(own, at), known, Recurrence(MOST_CROSSINGS, settled=True))
     return [(rows[k], cycle) for _, which, cycle in near for k in which]
