@@ -54,7 +54,7 @@ def _cycles_at_the_end(
     cycles: list[list[StableCycle]],
     onward: int = 0,
 ) -> list[tuple[int, StableCycle]]:
-    """The cycles near the last states that these motions trace, or near where they are so many returns later; each with a row."""
+    """The cycles near the last states that these motions trace, or near where they are so many returns later, with rows."""
     if not rows:
         return []
     own, last = group[rows], np.array([traced[row][-1] for row in rows]) / maps.weights
