@@ -135,7 +135,7 @@ def _batched(operands, axes, *, kernel: _Hashed):
     if of_dots is not None:
         raise NotImplementedError("Directions of a kernel's tangents are not batched.")
     arrays = [
-        jnp.broadcast_to(array, (size, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
+        jnp.broadcast_to(array, (size, *jnp.shape(array))) if axis is None else jnp.moveaxis(array, axis, 0)
         for array, axis in zip(arrays, of_arrays, strict=True)
     ]
     batch = _batch_of(kernel, arrays)
@@ -156,7 +156,7 @@ batching.primitive_batchers[kernel_p] = _batched
 @own_settings()
 def _second_derivative(primals, tangents, *, kernel: _Hashed):
     """Derivatives of what a kernel finds, tangents included."""
-    (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = primals, tangents
+    (dots, instants, *arrays), (of_dots, of_instants, *of_arrays) = map(jnp.asarray, primals), tangents
     if not isinstance(of_dots, ad.Zero) or not isinstance(of_instants, ad.Zero):
         raise NotImplementedError("A kernel has no derivative with respect to its instants and its directions.")
     # What does not move takes no width.
