@@ -52,7 +52,7 @@ def cycle_derivatives(
 
     **Arguments:** `cycle`, from `limit_cycle` or `saddle_cycle`; `wrt`, names of parameters of its scene; `multipliers`,
     whether to differentiate the multipliers of the section's return map, too (largest first). This takes second derivatives,
-    which need minutes to compile; `progress` as in `limit_cycle`.
+    which take half a minute to compile once; `progress` as in `limit_cycle`.
 
     **Returns:** `CycleDerivatives`.
 

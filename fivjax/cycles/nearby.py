@@ -77,7 +77,7 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
     **Arguments:** `scene`, with as many coordinates as `cycle.scene`; `cycle`, a periodic one, from `limit_cycle`,
     `saddle_cycle` or `cycle_at`; `stages`, the number of equal steps in which the parameters go from those of `cycle.scene` to
     those of `scene`: more where Newton's method does not find the cycle in one; `multipliers`, whether to compute them, too.
-    Their derivatives are second derivatives of the motion, which take long to compile.
+    Their derivatives are second derivatives of the motion, which take half a minute to compile once.
 
     **Returns:** `NearbyCycle`. Outside transformations its arrays are NumPy's.
 
