@@ -22,8 +22,10 @@ class Tradeoff:
     """time after which states are compared (s)"""
     trajectories: int = 256
     """number of trajectories in the batch whose cost is measured"""
+    only: tuple[str, ...] = ()
+    """the methods whose names begin so, such as event-exact Tsit5; all unless given, which takes minutes"""
     boundary: bool = True
-    """compare p_crit and verdicts, too, which takes minutes"""
+    """compare p_crit and verdicts, too, which takes minutes more"""
     refine: int = 0
     """the most halvings for which refined maps are compared with the whole one"""
     out: Path = Path("tradeoff")
@@ -32,11 +34,19 @@ class Tradeoff:
     scene: tyro.conf.OmitArgPrefixes[SceneOptions] = dataclasses.field(default_factory=lambda: SceneOptions(p=1.3))
 
     def run(self) -> None:
-        from ..kicks.tradeoff_study import table
+        from ..kicks.tradeoff_study import default_methods, table
 
+        methods = default_methods()
+        for one in self.only:
+            if not any(name.startswith(one) for name in methods):
+                raise ValueError(
+                    f"Option `--only` must name beginnings of methods, but no name begins with {one!r}. There are: "
+                    f"{'; '.join(methods)}."
+                )
         data, picture = output_paths(self.out, self.overwrite, ".nc", ".png")
         dataset = fj.tradeoff(
             self.scene.scene(),
+            methods={name: one for name, one in methods.items() if name.startswith(self.only or "")},
             t1=self.t1,
             trajectories=self.trajectories,
             boundary=self.boundary,

@@ -120,6 +120,7 @@ def test_calibrate(folder, capsys, arguments, fragments):
     ("arguments", "fragments"),
     [
         (["tradeoff", "--t1", "0"], ["`t1`", "positive"]),
+        (["tradeoff", "--only", "nix"], ["`--only`", "'nix'", "event-exact"]),
         (["tradeoff", "--trajectories", "0"], ["`trajectories`", "at least 1"]),
         (["tradeoff", "--mu", "-1"], ["`mu`", "non-negative"]),
         (["tradeoff", "--belt-speed", "0"], ["`belt_speed`", "zero"]),
