@@ -18,7 +18,7 @@ from ..foundation.compiling import compiled
 from ..foundation.forking import refuse_if_forked
 from ..foundation.precision import is_known, known_to_numpy
 from .code import with_slopes
-from .kernel import kernel_of, width_for
+from .kernel import any_kernel_of, kernel_of, width_for
 from .primitive import is_real, values
 
 # The instants of a function without rows.
@@ -55,7 +55,9 @@ class KernelFunction:
         if known:
             found = self.of_many(form, _rows(common, each), np.asarray(instants))
             return found if own else jax.tree.map(lambda leaf: leaf[0], found)
-        return kernel_of(self, form).results(*values(self, form, tuple(common), instants))
+        found = values(self, form, tuple(common), instants)
+        # Where tangents were asked for, the kernel without them is not made.
+        return any_kernel_of(self, form).results(*found)
 
     def derived(self, args: tuple, directions, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):
         """The results for known values, as a call gives them, and the derivatives of real ones along directions.

@@ -114,6 +114,8 @@ def _told(places: Places) -> list[int]:
 
 
 _KERNELS: dict = {}
+# One of them for each function and form, with tangents or without.
+_ANY: dict = {}
 _making = threading.RLock()
 
 
@@ -126,7 +128,14 @@ def kernel_of(function, form: Form, wide: tuple[bool, ...] = (), width: int = 0,
         with _making:
             if key not in _KERNELS:
                 _KERNELS[key] = Kernel(function, form, wide, width, shared)
+                _ANY.setdefault((function, form.kept), _KERNELS[key])
     return _KERNELS[key]
+
+
+def any_kernel_of(function, form: Form) -> Kernel:
+    """A kernel of a function for arguments of a form, with tangents if there is one: for the structure of what is found."""
+    found = _ANY.get((function, form.kept))
+    return kernel_of(function, form) if found is None else found
 
 
 def _body(source: str, widths: tuple[int, ...], width: int) -> str:
