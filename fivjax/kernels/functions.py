@@ -57,7 +57,7 @@ class KernelFunction:
             return found if own else jax.tree.map(lambda leaf: leaf[0], found)
         found = values(self, form, tuple(common), instants)
         # Where tangents were asked for, the kernel without them is not made.
-        return any_kernel_of(self, form).results(*found)
+        return any_kernel_of(self, form).traced_results(*found)
 
     def derived(self, args: tuple, directions, instants=NO_ROWS, *, own: tuple = (), by_kernel: bool = True):
         """The results for known values, as a call gives them, and the derivatives of real ones along directions.

@@ -46,6 +46,8 @@ class Kernel:
         self.text = text(kept_value(written, own, form, wide, shared))
         places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
         body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)
+        # One program, as everything about a kernel that is traced.
+        self.traced_results = jax.jit(self.results)
         self.of_lanes = LaneFunction(body, [f"{name}_" for name in places], [f"{name}_" for name in sizes])
 
     def launched(self, given, instants, dots=None, pool: Executor | None = None, groups: tuple | None = None):

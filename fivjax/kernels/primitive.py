@@ -42,27 +42,33 @@ def _values_jvp(function, form: Form, primals, tangents):
     if not any(wide):
         ends, rows = values(function, form, arrays, instants)
         return (ends, rows), (jnp.zeros_like(ends), jnp.zeros_like(rows))
-    moving = jnp.concatenate([jnp.ravel(dot) for dot, is_wide in zip(dots, wide, strict=True) if is_wide])
-    total, start, ends, rows, of_ends, of_rows = len(moving), 0, None, None, 0.0, 0.0
-    while start < total:
-        left = total - start
-        width = width_for(left, sum(array.size for array in form.arrays))
-        # One direction for each number that is perturbed.
-        directions = np.eye(total)[:, start : start + width]
-        directions = np.pad(directions, ((0, 0), (0, width - directions.shape[1])))
-        ends, rows, end_dots, row_dots = _bind(function, form, arrays, instants, wide, width, directions)
-        part = moving[start : start + width]
-        of_ends = of_ends + end_dots[..., : len(part)] @ part
-        of_rows = of_rows + row_dots[..., : len(part)] @ part
-        start += width
-    code, count = kernel_of(function, form, wide, width).text, instants.shape[-1]
-    return (ends, rows), (
+    moving = [dot for dot, is_wide in zip(dots, wide, strict=True) if is_wide]
+    total = sum(map(jnp.size, moving))
+    width = width_for(total, sum(array.size for array in form.arrays))
+    # One direction for each number that is perturbed; the last ones only fill the kernel's width.
+    directions = np.eye(total, -(-total // width) * width)
+    of_parts = [
+        _bind(function, form, arrays, instants, wide, width, directions[:, start : start + width])
+        for start in range(0, total, width)
+    ]
+    kernel, (ends, rows, *_) = _Hashed(kernel_of(function, form, wide, width)), of_parts[0]
+    slopes = [own for _, _, *own in of_parts]
+    return (ends, rows), _along(kernel, ends.shape[-1], rows.shape[-1], instants.shape[-1], slopes, moving)
+
+
+# One program: outside of others each operation would be one of its own.
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _along(kernel: "_Hashed", ends: int, rows: int, count: int, parts: list, moving: list):
+    """The tangents of so many numbers at the end and in rows, from those by each number that is perturbed."""
+    code, along = kernel.kernel.text, jnp.concatenate([jnp.ravel(dot) for dot in moving])
+    of_ends, of_rows = (jnp.concatenate(own, axis=-1)[..., : len(along)] @ along for own in zip(*parts, strict=True))
+    return (
         _spread(ends, of_ends, code.ends, code.end_dots, 1),
         _spread(rows, of_rows, code.rows, code.row_dots, count),
     )
 
 
-def _spread(values, dots, places: Sequence[Place], dot_places: Sequence[Place], repeated: int):
+def _spread(size: int, dots, places: Sequence[Place], dot_places: Sequence[Place], repeated: int):
     """Tangents of all numbers, from those of the real ones; each array is there so many times."""
     real, parts = iter(dot_places), []
     for place in places:
@@ -71,7 +77,7 @@ def _spread(values, dots, places: Sequence[Place], dot_places: Sequence[Place], 
             parts.append(dots[own.start * repeated : (own.start + own.size) * repeated])
         else:
             parts.append(jnp.zeros(place.size * repeated))
-    return jnp.concatenate(parts) if parts else jnp.zeros_like(values)
+    return jnp.concatenate(parts) if parts else jnp.zeros(size)
 
 
 def is_real(array) -> bool:
@@ -125,7 +131,7 @@ def _known(dots, instants, *arrays, kernel: _Hashed):
     found = kernel.kernel.launched(
         _in_rows(arrays, math.prod(batch), np), instants.reshape(-1, instants.shape[-1]), dots[None]
     )
-    return [jnp.asarray(part.reshape(batch + part.shape[1:])) for part in found]
+    return [jax.device_put(part.reshape(batch + part.shape[1:])) for part in found]
 
 
 @own_settings()

@@ -203,8 +203,7 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
         array([ 0.000217, -0.000988,  0.      ])
     """
     arguments.instance("scene", scene, Scene, "a Scene")
-    if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
-        raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
+    refuse_belt_at_rest(scene)
     q, normal_force = _steady_sliding(scene, scene.load.force)
     if is_known(q):
         normal_force = np.asarray(normal_force)
@@ -219,6 +218,12 @@ def sliding_equilibrium(scene: Scene) -> Float[Array, " n"]:
                 f"Change the load, its direction or the friction."
             )
     return q
+
+
+def refuse_belt_at_rest(scene: Scene) -> None:
+    """Refuse a belt that is known to be at rest."""
+    if is_known(scene.belt_speed) and np.any(np.asarray(scene.belt_speed) == 0):
+        raise ValueError("Argument `belt_speed` must not be zero for steady sliding. Give `y0` to start elsewhere.")
 
 
 def steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:

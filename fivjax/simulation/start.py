@@ -1,5 +1,6 @@
 """The state that a run starts from."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,8 +8,16 @@ from ..contact import State
 from ..foundation import arguments
 from ..foundation.precision import is_known, real
 from ..model.contact_coordinates import to_contact_coordinates
-from ..model.scene import Scene, scene_in_contact_coordinates, sliding_equilibrium, steady_sliding
+from ..model.scene import Scene, refuse_belt_at_rest, scene_in_contact_coordinates, sliding_equilibrium, steady_sliding
 from ..model.sliding import contact_coordinates
+
+
+def refuse_without_equilibrium(scene: Scene) -> None:
+    """Refuse a scene without sliding equilibrium, as far as its values are known."""
+    if all(map(is_known, jax.tree.leaves(scene))):
+        sliding_equilibrium(scene)
+    else:
+        refuse_belt_at_rest(scene)
 
 
 def start_state(scene: Scene, y0) -> State | np.ndarray:

@@ -36,7 +36,7 @@ from .ending import ENDING, Ending
 from .energy import Energy
 from .motion import rows_by_kernel
 from .rows import rows_at, rows_in_parts, with_step_as_array
-from .start import start_in_contact_coordinates, start_state
+from .start import refuse_without_equilibrium, start_in_contact_coordinates, start_state
 from .stretches import MODES
 
 if TYPE_CHECKING:
@@ -230,7 +230,6 @@ def simulate(
             f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
         )
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
-    y0 = start_state(scene, None) if given is None else given
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)
     most = steps + MOST_ADVANCES
@@ -238,14 +237,19 @@ def simulate(
     saved = np.append(np.minimum(float(dt_save) * np.arange(rows), float(t1)), float(t1))
     stepper = with_step_as_array(method)
     if has_kernel(scene, method):
+        # A kernel finds the equilibrium itself.
+        if given is None:
+            refuse_without_equilibrium(scene)
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             ending, found = rows_by_kernel(scene, method, given, saved, most, bool(energy))
             tick(len(saved) - 1)
     # Runs with known values are not differentiated.
-    elif all(map(is_known, jax.tree.leaves((scene, method, y0)))):
+    elif all(map(is_known, jax.tree.leaves((scene, method, given)))):
+        y0 = start_state(scene, None) if given is None else given
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
     else:
+        y0 = start_state(scene, None) if given is None else given
         modes = None if derivatives == "none" else derivatives
         found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
     if "grown" in found:
