@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from itertools import compress
 
 import jax
 import numpy as np
@@ -85,16 +86,10 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int 
         return tuple(tuple(jax.tree.leaves(part)) for part in found)
 
     def with_tangents(arrays, dots, instants):
-        def of(some):
-            remaining = iter(some)
-            whole = [next(remaining) if is_wide else array for array, is_wide in zip(arrays, wide, strict=True)]
-            return values(whole, instants)
+        found, moved = jvp_along(lambda arrays: values(arrays, instants), arrays, wide, dots)
+        return found, tuple(tuple(jax.tree.leaves(part)) for part in moved)
 
-        some = [array for array, is_wide in zip(arrays, wide, strict=True) if is_wide]
-        found, moved = jax.jvp(of, (some,), (dots,))
-        return found, tuple(tuple(dot for dot in dots if dot.dtype != jax.dtypes.float0) for dots in moved)
-
-    moving = [array for array, is_wide in zip(like, wide, strict=False) if is_wide]
+    moving = list(compress(like, wide))
     with own_settings():
         if moving:
             traced, shapes = jax.make_jaxpr(with_tangents, return_shape=True)(like, moving, instants)
@@ -113,21 +108,26 @@ def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int 
     return structures[-1], source, *map(tuple, places)
 
 
+def jvp_along(function: Callable, arrays: Sequence, wide: Sequence[bool], dots: Sequence) -> tuple:
+    """What a function finds of a list of arrays, and the tangents of that along those of the arrays that are `wide`: None where
+    a result is no real number.
+    """
+
+    def of(some):
+        remaining = iter(some)
+        return function([next(remaining) if is_wide else array for array, is_wide in zip(arrays, wide, strict=True)])
+
+    found, moved = jax.jvp(of, (list(compress(arrays, wide)),), (list(dots),))
+    return found, jax.tree.map(lambda dot: None if dot.dtype == jax.dtypes.float0 else dot, moved)
+
+
 def with_slopes(function: Callable, args: tuple, instants) -> tuple:
     """The results of a function, each with its derivative along a direction: `args` are the function's own and the parts of the
     direction, one for each array of these, None where it is zero.
     """
-    form, arrays = Form.of(args[0])
-    wide, dots = [dot is not None for dot in args[1]], [dot for dot in args[1] if dot is not None]
-
-    def of(some):
-        remaining = iter(some)
-        whole = [next(remaining) if is_wide else array for array, is_wide in zip(arrays, wide, strict=True)]
-        return function(form.args(whole), instants)
-
-    found, moved = jax.jvp(of, ([array for array, is_wide in zip(arrays, wide, strict=True) if is_wide],), (dots,))
-    real = jax.tree.map(lambda dot: None if dot.dtype == jax.dtypes.float0 else dot, moved)
-    return tuple(zip(found, real, strict=True))
+    (form, arrays), wide = Form.of(args[0]), [dot is not None for dot in args[1]]
+    found = jvp_along(lambda arrays: function(form.args(arrays), instants), arrays, wide, list(compress(args[1], wide)))
+    return tuple(zip(*found, strict=True))
 
 
 def form_with_slopes(form: Form, wide: Sequence[bool]) -> Form:

@@ -8,6 +8,7 @@ transformations it is a primitive (`primitive`). Where no kernel may serve, XLA 
 import functools
 from collections.abc import Callable
 from concurrent.futures import Executor
+from itertools import compress
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from ..foundation.argument_forms import Form
 from ..foundation.compiling import compiled
 from ..foundation.forking import refuse_if_forked
 from ..foundation.precision import is_known, known_to_numpy
-from .code import with_slopes
+from .code import jvp_along, with_slopes
 from .kernel import any_kernel_of, kernel_of, width_for
 from .primitive import is_real, values
 
@@ -160,20 +161,11 @@ class KernelFunction:
 
     def _with_slopes(self, form: Form, arrays, dots, instants):
         real = list(map(is_real, arrays))
-        moving = [array for array, moves in zip(arrays, real, strict=True) if moves]
 
-        def of(moving):
-            left = iter(moving)
-            whole = [next(left) if moves else array for array, moves in zip(arrays, real, strict=True)]
-            found = self.differentiated(form.args(whole), instants)
-            return jax.tree.map(lambda leaf: leaf if is_real(leaf) else None, found), found
+        def of(dots):
+            return jvp_along(lambda arrays: self.differentiated(form.args(arrays), instants), arrays, real, dots)
 
-        def along(dots):
-            _, slopes, found = jax.jvp(of, (moving,), (dots,), has_aux=True)
-            return found, slopes
-
-        dots = [dot for dot, moves in zip(dots, real, strict=True) if moves]
-        return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(dots)
+        return jax.vmap(of, in_axes=-1, out_axes=(None, -1))(list(compress(dots, real)))
 
 
 def _parts(args: tuple, own: tuple) -> tuple[Form, list, list]:

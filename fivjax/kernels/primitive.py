@@ -9,6 +9,7 @@ import functools
 import hashlib
 import math
 from collections.abc import Sequence
+from itertools import compress
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jax.interpreters import ad, batching, mlir
 
 from ..foundation.argument_forms import Array, Form
 from ..foundation.precision import own_settings
-from .code import Place, form_with_slopes
+from .code import Place, form_with_slopes, jvp_along
 from .kernel import GIVEN, Kernel, kernel_of, width_for
 from .xla_calls import Places, called_by_xla
 
@@ -42,7 +43,7 @@ def _values_jvp(function, form: Form, primals, tangents):
     if not any(wide):
         ends, rows = values(function, form, arrays, instants)
         return (ends, rows), (jnp.zeros_like(ends), jnp.zeros_like(rows))
-    moving = [dot for dot, is_wide in zip(dots, wide, strict=True) if is_wide]
+    moving = list(compress(dots, wide))
     total = sum(map(jnp.size, moving))
     width = width_for(total, sum(array.size for array in form.arrays))
     # One direction for each number that is perturbed; the last ones only fill the kernel's width.
@@ -53,15 +54,15 @@ def _values_jvp(function, form: Form, primals, tangents):
     ]
     kernel, (ends, rows, *_) = _Hashed(kernel_of(function, form, wide, width)), of_parts[0]
     slopes = [own for _, _, *own in of_parts]
-    return (ends, rows), _along(kernel, ends.shape[-1], rows.shape[-1], instants.shape[-1], slopes, moving)
+    return (ends, rows), _tangents(kernel, ends.shape[-1], rows.shape[-1], instants.shape[-1], slopes, moving)
 
 
 # One program: outside of others each operation would be one of its own.
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _along(kernel: "_Hashed", ends: int, rows: int, count: int, parts: list, moving: list):
+def _tangents(kernel: "_Hashed", ends: int, rows: int, count: int, parts: list, moving: list):
     """The tangents of so many numbers at the end and in rows, from those by each number that is perturbed."""
-    code, along = kernel.kernel.text, jnp.concatenate([jnp.ravel(dot) for dot in moving])
-    of_ends, of_rows = (jnp.concatenate(own, axis=-1)[..., : len(along)] @ along for own in zip(*parts, strict=True))
+    code, ways = kernel.kernel.text, jnp.concatenate([jnp.ravel(dot) for dot in moving])
+    of_ends, of_rows = (jnp.concatenate(own, axis=-1)[..., : len(ways)] @ ways for own in zip(*parts, strict=True))
     return (
         _spread(ends, of_ends, code.ends, code.end_dots, 1),
         _spread(rows, of_rows, code.rows, code.row_dots, count),
@@ -167,14 +168,9 @@ def _second_derivative(primals, tangents, *, kernel: _Hashed):
         raise NotImplementedError("A kernel has no derivative with respect to its instants and its directions.")
     # What does not move takes no width.
     moves = [not isinstance(tangent, ad.Zero) and is_real(tangent) for tangent in of_arrays]
-
-    def of(some):
-        remaining = iter(some)
-        whole = [next(remaining) if moving else still for still, moving in zip(arrays, moves, strict=True)]
-        return _with_slopes(kernel, dots, instants, *whole)
-
-    some, along = ([part for part, moving in zip(parts, moves, strict=True) if moving] for parts in (arrays, of_arrays))
-    return kernel_p.bind(*primals, kernel=kernel), jax.jvp(of, (some,), (along,))[1]
+    dotted = list(compress(of_arrays, moves))
+    _, slopes = jvp_along(lambda arrays: _with_slopes(kernel, dots, instants, *arrays), arrays, moves, dotted)
+    return kernel_p.bind(*primals, kernel=kernel), slopes
 
 
 ad.primitive_jvps[kernel_p] = _second_derivative
@@ -186,7 +182,7 @@ def _with_slopes(kernel: _Hashed, dots, instants, *arrays) -> list:
     if _batch_of(kernel, arrays):
         axes = None, 0 if instants.ndim > 1 else None, *(0 for _ in arrays)
         return jax.vmap(functools.partial(_with_slopes, kernel), axes)(dots, instants, *arrays)
-    wide = [array for array, moves in zip(own.form.arrays, own.wide, strict=True) if moves]
+    wide = list(compress(own.form.arrays, own.wide))
     function, form = own.function.with_slopes, form_with_slopes(own.form, own.wide)
     ends, rows = jax.vmap(lambda dot: values(function, form, (*arrays, *_arrays(wide, dot)), instants), 1, 1)(dots)
     found, slopes, count = [], [], instants.shape[-1]

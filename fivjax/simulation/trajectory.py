@@ -243,15 +243,15 @@ def simulate(
         with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
             ending, found = rows_by_kernel(scene, method, given, saved, most, bool(energy))
             tick(len(saved) - 1)
-    # Runs with known values are not differentiated.
-    elif all(map(is_known, jax.tree.leaves((scene, method, given)))):
-        y0 = start_state(scene, None) if given is None else given
-        with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
-            found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
     else:
         y0 = start_state(scene, None) if given is None else given
-        modes = None if derivatives == "none" else derivatives
-        found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
+        # Runs with known values are not differentiated.
+        if all(map(is_known, jax.tree.leaves((scene, method, y0)))):
+            with following("simulate", shown=progress, total=len(saved) - 1, unit=" rows"):
+                found = rows_in_parts(scene, stepper, y0, saved, most, bool(energy))
+        else:
+            modes = None if derivatives == "none" else derivatives
+            found = rows_at(scene, stepper, y0, saved, most, bool(energy), modes)
     if "grown" in found:
         ending = _ending(scene, stepper, found, found.pop("grown"), most)
     settings = (
