@@ -19,22 +19,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
 from ..foundation.carried import depending_on
-from ..foundation.compiling import compiled
-from ..foundation.polynomial import value_and_rate
+from ..foundation.numpy_evaluation import by_numpy
 from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
-from ..steppers.base import AbstractStepper, rates
-from ..steppers.core import left_after, next_part
-from ..steppers.event_exact import EventExact
+from ..steppers.base import AbstractStepper
 from ..steppers.kernel_scope import has_kernel
+from .event_margins import DECISIONS, DECISIONS_OF_SEVERAL, LOOKS, Look, look_along, margin_from_cone
 
-# Instants within one advance at which the guards are evaluated; between two of them, derivatives tell a guard's course.
-LOOKS = 32
 GUARDS = {
     (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
     (Status.STICK, 1): "the friction force reaching the other edge of the friction cone",
@@ -42,22 +38,10 @@ GUARDS = {
     (Status.SLIDE, 1): "the slip running out",
     (Status.DETACH, 0): "the gap closing",
 }
-# The decisions that follow an event, and how to describe one that is nearly a tie.
-DECISIONS = (
-    "an impact at the edge of the friction cone, where it either ends slip or does not",
-    "the slip running out at the edge of the friction cone, where the contact either sticks or slips back",
-    "sliding that begins without a normal force",
-)
 OF_START = (
     "a slip that starts at zero, which a parameter changes",
     "a start that sticks, whose slip a parameter changes, at the edge of the friction cone of sliding",
     "a start without slip at the edge of the friction cone",
-)
-# The first two for several contacts, which are decided together.
-DECISIONS_OF_SEVERAL = (
-    "impulses of several contacts at the edge of a friction cone, or of none",
-    "an event of one contact that decides by a hair what another does",
-    DECISIONS[2],
 )
 
 
@@ -78,14 +62,14 @@ def closest_call(
 
     `slips_move`: which contacts' slips at the start change with a parameter.
     """
-    mechanics, by_kernel = Mechanics(scene), has_kernel(scene, method)
-    jumps = [float(jump) for jump in scene.load.jumps if 0 < float(jump) < t1]
-    ends = [*jumps, t1]
-    y, contact, t = y0, physics.status_from_forces(mechanics, scene.load(jnp.asarray(0.5 * ends[0])), y0), 0.0
-    seen = _Seen(mechanics, np.broadcast_to(slips_move, len(mechanics.places)))
-    seen.begin(*map(np.atleast_1d, _start(mechanics, contact, scene.load(jnp.asarray(0.5 * ends[0])), y0)))
-    for end in ends:
-        load = scene.load(jnp.asarray(0.5 * (t + end)))
+    by_kernel = has_kernel(scene, method)
+    ends = [*(float(jump) for jump in np.asarray(scene.load.jumps) if 0 < jump < t1), t1]
+    # The load is the same until each of these ends, at which it jumps.
+    loads = _loads(scene, 0.5 * (np.array([0.0, *ends[:-1]]) + ends))
+    mechanics, contact, start = _start(scene, loads[0], y0)
+    y, t = y0, 0.0
+    seen = _Seen(mechanics, start, np.broadcast_to(slips_move, len(mechanics.places)))
+    for end, load in zip(ends, loads, strict=True):
         begins = True
         for look in _looks_until(_Asked(method), mechanics, contact, load, y, end - t, by_kernel):
             arrives = bool(look.left == 0)
@@ -129,10 +113,10 @@ def _follow(args, over: Float[Array, " k"]):
         y, contact, left = now
         goes_on = left > over
 
-        def look() -> _Look:
-            return _look(asked.method, mechanics, contact, load, y, left)
+        def look() -> Look:
+            return look_along(asked.method, mechanics, contact, load, y, left)
 
-        def none() -> _Look:
+        def none() -> Look:
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))
 
         found = jax.lax.cond(goes_on, look, none)
@@ -145,36 +129,23 @@ def _follow(args, over: Float[Array, " k"]):
 _looks = KernelFunction(_follow)
 
 
-class _Look(eqx.Module):
-    """One advance, with the guards of each contact at equally spaced instants."""
+class _Start(eqx.Module):
+    """How the contacts start, and which are affected at once by an event of each of them."""
 
-    y: Float[Array, " state"]
-    contact: Contact
-    h: Float[Array, ""]
-    left: Float[Array, ""]  # of the time that was given, s
-    turned: Bool[Array, " c"]  # whether the contact has reversed its slip
-    ended: Bool[Array, " c"]  # whether one of the contact's guards ran out
-    guards: Float[Array, "l c 2"]
-    turns: Bool[Array, "l c 2"]  # whether the guard has a minimum close to this instant
-    lowest: Float[Array, "l c 2"]  # that value
-    slope: Float[Array, "c 2"]  # of the guards at the end, per s, and per s²
-    bend: Float[Array, "c 2"]
-    size: Float[Array, "c 2"]  # of the terms that the guards are sums of
-    # Relative margins of the decisions at the end; infinite for those that were not needed.
-    decisions: Float[Array, "3"]
+    status: Int[Array, " c"]
+    slip: Float[Array, " c"]  # m/s
+    # Relative margins: by which the friction of sliding would hold the contact, and from the edge of the cone without slip.
+    held: Float[Array, " c"]
+    at_rest: Float[Array, " c"]
+    coupled: Bool[Array, "c c"]
 
 
 class _Seen:
     """The distances found on a trajectory so far."""
 
-    def __init__(self, mechanics: Mechanics, slips_move: Bool[np.ndarray, " c"]):
+    def __init__(self, mechanics: Mechanics, start: _Start, slips_move: Bool[np.ndarray, " c"]):
         self.mechanics, self.several, self.slips_move = mechanics, mechanics.several, slips_move
-        count = len(mechanics.places)
-        self.coupled = np.ones((1, 1), bool)
-        if self.several:
-            self.coupled = np.asarray(
-                jax.vmap(lambda one: physics.affected_by(mechanics, one))(jnp.eye(count, dtype=bool))
-            )
+        count, self.coupled = len(mechanics.places), start.coupled
         # The largest size of each guard, by contact, status and number.
         self.largest: dict[tuple[int, int, int], float] = {}
         # Distances by guard, in its own unit, and decisions, which are relative already.
@@ -184,17 +155,17 @@ class _Seen:
         # Contacts on which another's event has just acted while their own status lasted, and their guards before it.
         self.struck = np.zeros(count, bool)
         self.before = np.zeros((count, 2))
+        self._begin(start)
 
-    def begin(self, status: np.ndarray, slip: np.ndarray, held: np.ndarray, at_rest: np.ndarray) -> None:
-        """Add the start, from `_start`."""
-        slides, sticks = (self.slips_move & (status == of) for of in (Status.SLIDE, Status.STICK))
-        if np.any(slides & (slip == 0)):
+    def _begin(self, start: _Start) -> None:
+        slides, sticks = (self.slips_move & (start.status == of) for of in (Status.SLIDE, Status.STICK))
+        if np.any(slides & (start.slip == 0)):
             self.decisions.append((0.0, 0.0, OF_START[0]))
-        self.decisions += [(max(float(margin), 0.0), 0.0, OF_START[1]) for margin in held[sticks]]
-        without_slip = (status != Status.DETACH) & (slip == 0)
-        self.decisions += [(float(margin), 0.0, OF_START[2]) for margin in at_rest[without_slip]]
+        self.decisions += [(max(float(margin), 0.0), 0.0, OF_START[1]) for margin in start.held[sticks]]
+        without_slip = (start.status != Status.DETACH) & (start.slip == 0)
+        self.decisions += [(float(margin), 0.0, OF_START[2]) for margin in start.at_rest[without_slip]]
 
-    def add(self, status: np.ndarray, look: _Look, t: float, begins: bool, arrives: bool) -> bool:
+    def add(self, status: np.ndarray, look: Look, t: float, begins: bool, arrives: bool) -> bool:
         """Add an advance, which `begins` at the start or at a jump of the load. Returns whether it ended in an event."""
         after = np.atleast_1d(look.contact.status)
         at = t + float(look.h)
@@ -230,7 +201,7 @@ class _Seen:
         self.struck, self.before = felt & (after == status), look.guards[-1]
         return bool(fired)
 
-    def _of_contact(self, i: int, status: int, look: _Look, t: float, begins: bool) -> list[int]:
+    def _of_contact(self, i: int, status: int, look: Look, t: float, begins: bool) -> list[int]:
         """Add the distances of the guards of one contact inside an advance. Returns the guards that count."""
         # A guard that is a rounding error all the time does not count: with zero friction the friction cone has no width.
         relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
@@ -249,7 +220,7 @@ class _Seen:
                 self.calls.append((key, abs(float(guard[0])), t))
         return relevant
 
-    def _fires(self, i: int, status: int, after: int, look: _Look) -> bool:
+    def _fires(self, i: int, status: int, after: int, look: Look) -> bool:
         """Whether an event of this contact ended the advance."""
         if self.several:
             return bool(look.ended[i])
@@ -269,131 +240,25 @@ class _Seen:
         return ClosestCall(self.events, *nearest, self.landed)
 
 
-@compiled
-def _start(mechanics: Mechanics, contact: Contact, load, y):
-    """The status of each contact, its slip (m/s), and two relative margins: by which the friction of sliding would hold it, and
-    from the edge of the friction cone without slip.
-    """
+@by_numpy
+def _loads(scene: Scene, instants: Float[Array, " k"]) -> Float[Array, " k"]:
+    return jax.vmap(scene.load)(instants)
+
+
+@by_numpy
+def _start(scene: Scene, load, y) -> tuple[Mechanics, Contact, _Start]:
+    mechanics = Mechanics(scene)
+    contact = physics.status_from_forces(mechanics, load, y)
     tangential, normal = physics.contact_forces(mechanics, contact, load, y)
     slip = physics.relative_velocity(mechanics, y)
     held, need = mechanics.friction(jnp.zeros_like(slip)) * normal, jnp.abs(tangential)
+    coupled = jnp.ones((1, 1), bool)
     if mechanics.several:
         at_rest = physics.clearness_of_modes(mechanics, load, y, contact)
+        coupled = jax.vmap(lambda one: physics.affected_by(mechanics, one))(jnp.eye(len(slip), dtype=bool))
     else:
         holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, y))
-        at_rest = _margin(mechanics.friction.static, *holding)
-    return contact.status, slip, (held - need) / jnp.where(held + need > 0, held + need, 1.0), at_rest
-
-
-def _look(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y, h) -> _Look:
-    # Just before the end, where the status is still the same.
-    shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
-    if isinstance(method, EventExact):
-        part, is_last = next_part(h, method.dt)
-        after, series, unit = method.with_series(mechanics, contact, load, y, part)
-        inside = jax.lax.map(lambda share: value_and_rate(series, unit, share * after.h)[0], shares)
-    else:
-        after, is_last = method.advance(mechanics, contact, load, y, h), jnp.ones((), bool)
-        inside = jax.vmap(lambda share: method.advance(mechanics, contact, load, y, share * after.h).y)(shares)
-    states = jnp.concatenate([y[None], inside])
-
-    def along(function):
-        return lambda state: jax.jvp(function, (state,), (rates(mechanics, contact, load, state),))[1]
-
-    # With an axis over the contacts, even if there is only one.
-    orders = [lambda state: physics.guards(mechanics, contact, load, state).reshape(-1, 2)]
-    for _ in range(3):
-        orders.append(along(orders[-1]))
-    # A loop, which a kernel keeps as one.
-    value, slope, bend, third = jax.lax.map(lambda state: tuple(order(state) for order in orders), states)
-    # Where the slope is zero, by a parabola; at most half an interval to either side, and not beyond the ends.
-    to_turn = -slope / jnp.where(bend > 0, bend, 1.0)
-    spacing = after.h / LOOKS
-    near = (bend > 0) & (jnp.abs(to_turn) <= 0.5 * spacing * (1 + 1e-6))
-    look = jnp.arange(LOOKS + 1)[:, None, None]
-    near = near & ((look > 0) | (to_turn > 0)) & ((look < LOOKS) | (to_turn < 0))
-    # A guard that starts at zero, because the status has just begun, has no minimum at its start.
-    begins = jnp.abs(value[0]) <= 1e-9 * jnp.max(jnp.abs(value), axis=0)
-    near = near & ~(begins & (look <= 1))
-    lowest = value + to_turn * (slope + to_turn * (bend / 2 + to_turn * third / 6))
-    turned = (contact.status == Status.SLIDE) & (after.contact.direction != contact.direction)
-    turned = jnp.atleast_1d(turned & (after.contact.status == Status.SLIDE))
-    ended = jnp.any(after.ended.reshape(-1, 2), axis=-1)
-    size, _ = physics.magnitudes(mechanics, contact, load, jnp.max(jnp.abs(states), axis=0))
-    if mechanics.several:
-        decisions = _decisions_of_several(mechanics, contact, load, after)
-    else:
-        decisions = _decisions(mechanics, contact, load, states[-1], after.contact, after.y)
-    return _Look(
-        after.y,
-        after.contact,
-        after.h,
-        left_after(after, h, is_last),
-        turned,
-        ended,
-        value,
-        near,
-        lowest,
-        slope[-1],
-        bend[-1],
-        size.reshape(-1, 2),
-        decisions,
-    )
-
-
-def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: Contact, after) -> Float[Array, "3"]:
-    """Relative margins of the decisions after an event, in the order of `DECISIONS`: the friction cone at an impact, the
-    friction cone where a contact comes to rest on the belt, and the normal force where it goes on to slide."""
-    n = before.shape[0] // 2
-    landed = (contact.status == Status.DETACH) & (following.status != Status.DETACH)
-    # In an impact, impulses take the place of forces, and changes of velocity that of accelerations.
-    demanded = jnp.zeros(n).at[mechanics.tangential].set(physics.relative_velocity(mechanics, before))
-    demanded = demanded.at[mechanics.normal].set((1 + mechanics.restitution) * before[n + mechanics.normal])
-    dragged = mechanics.friction(jnp.abs(physics.relative_velocity(mechanics, before)))
-    at_impact = _margin(dragged, *physics.sticking_forces(mechanics, demanded))
-    by_impulse = landed & (mechanics.impact_law == "coulomb")
-    came_to_rest = (contact.status != Status.STICK) & (physics.relative_velocity(mechanics, after) == 0)
-    holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, after))
-    at_rest = _margin(mechanics.friction.static, *holding)
-    pressed = physics.guards(mechanics, following, load, after)[0]
-    terms, _ = physics.magnitudes(mechanics, following, load, jnp.abs(after))
-    slides = (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
-    return jnp.stack(
-        [
-            jnp.where(by_impulse, at_impact, jnp.inf),
-            jnp.where(came_to_rest & (following.status != Status.DETACH), at_rest, jnp.inf),
-            jnp.where(slides, jnp.abs(pressed) / jnp.where(terms[0] > 0, terms[0], 1.0), jnp.inf),
-        ]
-    )
-
-
-def _decisions_of_several(mechanics: Mechanics, contact: Contact, load, after) -> Float[Array, "3"]:
-    """The same for several contacts: margins by which the states of the contacts affected by the event are admissible."""
-    own = jnp.any(after.ended, axis=-1)
-    feels = physics.affected_by(mechanics, own)
-    touched = (contact.status == Status.DETACH) & after.ended[:, 0]
-    reached = physics.affected_by(mechanics, touched)
-    struck = reached & (mechanics.impact_law == "coulomb")
-    stopped = physics.stopped(mechanics, contact, after.end, after.ended)
-    at_impact = physics.clearness_of_impact(mechanics, stopped, reached)
-    following = after.contact
-    at_rest = physics.clearness_of_modes(mechanics, load, after.y, following)
-    # A mode that follows sticking, or sliding that lost its normal force, begins with zero margin.
-    lifted = (contact.status == Status.SLIDE) & after.ended[:, 0]
-    asked = feels & ~(own & ((contact.status == Status.STICK) | lifted))
-    begins = own & (following.status == Status.SLIDE) & (contact.status != Status.SLIDE)
-    pressed = physics.guards(mechanics, following, load, after.y)[:, 0]
-    terms, _ = physics.magnitudes(mechanics, following, load, jnp.abs(after.y))
-    pressing = jnp.abs(pressed) / jnp.where(terms[:, 0] > 0, terms[:, 0], 1.0)
-    return jnp.stack(
-        [
-            jnp.min(jnp.where(which, margin, jnp.inf))
-            for which, margin in ((struck, at_impact), (asked, at_rest), (begins, pressing))
-        ]
-    )
-
-
-def _margin(mu, tangential, normal) -> Float[Array, ""]:
-    """The relative distance of a force from the edge of the friction cone; infinite without friction or without force."""
-    held, need = mu * jnp.abs(normal), jnp.abs(tangential)
-    return jnp.where(held + need > 0, jnp.abs(held - need) / jnp.where(held + need > 0, held + need, 1.0), jnp.inf)
+        at_rest = margin_from_cone(mechanics.friction.static, *holding)
+    held = (held - need) / jnp.where(held + need > 0, held + need, 1.0)
+    status, slip, held, at_rest = map(jnp.atleast_1d, (contact.status, slip, held, at_rest))
+    return mechanics, contact, _Start(status, slip, held, at_rest, coupled)
