@@ -44,9 +44,12 @@ def is_real(family: Family, place: Place) -> bool:
 
 
 def _is_real(real: Real | None, place: Place) -> bool:
-    return real is not None and real.has_the_modes_of(place.phases) and not risen_to_zero(place)
+    found = None if real is None else real.phases
+    return found is not None and found.has_the_modes_of(place.phases) and not risen_to_zero(place)
 
 
 def risen_to_zero(place: Place) -> list[int]:
-    """The phases at whose computed end the guard rises: it has passed zero before, where the real motion has its event."""
-    return np.flatnonzero(~(place.images.guard_h < 0)).tolist()
+    """The phases at whose computed end the guard rises: it has passed zero before, where the real motion has its event. In the
+    last rebounds of a chain it neither rises nor falls, to rounding.
+    """
+    return [k for k in place.phases.lasting() if not place.images.guard_h[k] < 0]

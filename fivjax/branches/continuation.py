@@ -14,7 +14,7 @@ import numpy as np
 
 from ..attractors.closing import closed_at
 from ..contact import Contact, Status
-from ..cycles.around import seen_around
+from ..cycles.around import middle_of_longest, seen_around
 from ..cycles.cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
 from ..cycles.own_coordinates import cycle_in_own_coordinates, in_own_coordinates
 from ..cycles.saddle import saddle_cycle
@@ -81,8 +81,9 @@ def continue_cycle(
     - `sliding_stable`, whether steady sliding is stable there;
     - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
     - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
-    - `special`: the kind of a special point, else empty: "fold", "period doubling", "Neimark–Sacker", or how the contact
-      modes change there ("grazing of slip: stick inserted"). Special points are computed to rounding;
+    - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
+      end the slip there, say), "period doubling", "Neimark–Sacker", or how the contact modes change there ("grazing of slip:
+      stick inserted"). Special points are computed to rounding;
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
@@ -125,8 +126,11 @@ def continue_cycle(
             f"cycle is periodic, or give a `LimitCycle` as `start`."
         )
     stepper = EventExact()
-    around = seen_around(final, stepper, point_of(cycle), cycle.period)
-    phases = phases_around(around.segments)
+    segments = seen_around(final, stepper, point_of(cycle), cycle.period).segments
+    if np.any(segments.ended):
+        # The point on the section may be where an event ends: a landing can make the tangential velocity jump through zero.
+        segments = seen_around(final, stepper, middle_of_longest(segments), cycle.period).segments
+    phases = phases_around(segments)
     assert phases is not None
     family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, stepper)
     curve = Curve(family, phases)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..foundation.progress import stage
 from .branch_points import Point, seen
 from .meeting_sliding import where_sliding_is_met
-from .mode_changes import change_of_modes
+from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import Curve, Family, Place
 from .special_points import between
@@ -32,13 +32,13 @@ class Followed(NamedTuple):
 
 def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[float, float], most: int) -> Followed:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
-    curve, here = start.curve, start
-    tangent = curve.tangent(here.place, None)
+    here, tangent = start, start.curve.tangent(start.place, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
     points: list[Point] = []
     step = FIRST
     while len(points) < most:
         stage(f"following, {len(points)} cycles so far")
+        curve = here.curve
         ahead = _ahead(curve, here.place, tangent, step)
         if ahead is None:
             return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))
@@ -62,7 +62,6 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             if onward is None:
                 return Followed(points, _at(family, points[-1], f"{special.name}: no cycle goes on beyond"))
             here, tangent, step = onward
-            curve = here.curve
             continue
         passed = _specials(family, curve, here.place, tangent, following)
         points += [point for point in passed if bounds[0] <= point.place.parameter <= bounds[1]]
@@ -82,7 +81,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             return Followed(points, _at(family, last, "the branch is back where it began"))
         easy = following.iterations <= 3
         step = min(step * ((SOON if step < FIRST else LATER) if easy else 0.7), LONGEST)
-        here, tangent = last, turned
+        here, tangent = with_own_rebounds(family, last, turned)
     return Followed(points, _at(family, here, f"`points` = {most} points are computed"))
 
 

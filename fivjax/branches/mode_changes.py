@@ -36,14 +36,14 @@ def change_of_modes(family: Family, here: Point, tangent: Float[np.ndarray, " m"
             high, ahead = middle, place
     if ahead is None:
         return None
-    gone = [k for k in range(len(ahead.phases.h)) if ahead.phases.h[k] <= 0]
+    gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0]
     if gone:
         return _removed(family, curve, valid, tangent, gone[0], step)
     if turned_back := _missed(curve, here, tangent, low, high, ahead):
         return turned_back, None
     return (
         _inserted(family, curve, valid, ahead, tangent, step)
-        or _removed(family, curve, valid, tangent, int(np.argmin(valid.phases.h)), step)
+        or _removed(family, curve, valid, tangent, min(valid.phases.lasting(), key=lambda k: valid.phases.h[k]), step)
         or _grazes(curve, ahead, step)
     )
 
@@ -161,6 +161,27 @@ def _shorter(family: Family, valid: Place, phase: int):
         return None
     guess = without(phases, change._replace(phase=phase), kept)
     return None if guess is None else (guess, change)
+
+
+def with_own_rebounds(
+    family: Family, here: Point, tangent: Float[np.ndarray, " m"]
+) -> tuple[Point, Float[np.ndarray, " m"]]:
+    """The point and tangent with as many rebounds as the real motion has before it rests: their number changes along a branch,
+    and no cycle changes with it.
+    """
+    phases = None if here.real is None else here.real.phases
+    if phases is None or len(phases.modes) == len(here.curve.modes) or len(phases.modes) > MOST_PHASES:
+        return here, tangent
+    curve = Curve(family, phases)
+    place = curve.corrected(curve.unknowns(phases, here.place.parameter))
+    if place is None or not is_real(family, place):
+        return here, tangent
+    onward = curve.tangent(place, None)
+    before, after = (
+        np.array([np.sum(one[k:-1]), one[-1]])
+        for one, k in ((tangent, len(here.curve.of_state)), (onward, len(curve.of_state)))
+    )
+    return seen(family, curve, place), onward * (1.0 if before @ after >= 0 else -1.0)
 
 
 def _near(curve: Curve, found: Place, guess: Place, step: float) -> bool:

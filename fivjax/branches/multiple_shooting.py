@@ -35,6 +35,8 @@ from ..steppers.kernel_scope import has_kernel
 AT_SECTION = 2
 # Instants of each phase at which its guards are evaluated.
 LOOKS = 48
+# A contact bounces ever less high until it rests. Rebounds shorter than these shares of the period are none to speak of.
+SHORTEST_REBOUNDS = (1e-7, 3e-7)
 # The smallest number of phases that is compiled: few cycles have more.
 LEAST = 16
 
@@ -58,6 +60,20 @@ class Phases(NamedTuple):
     def period(self) -> float:
         """The sum of the durations, in s."""
         return float(np.sum(self.h))
+
+    def has_the_modes_of(self, other: "Phases") -> bool:
+        """Whether both go through the same modes, but for the last rebounds of a chain, of which rounding tells the number."""
+        # A rebound may be as long as one of these limits, but not as long as both.
+        return any(
+            same_modes(*(tuple(one.modes[k] for k in one.lasting(shortest)) for one in (self, other)))
+            for shortest in SHORTEST_REBOUNDS
+        )
+
+    def lasting(self, shortest: float = SHORTEST_REBOUNDS[0]) -> list[int]:
+        """The phases that are no rebounds shorter than this share of the period."""
+        flies = [mode.status == Status.DETACH for mode in self.modes]
+        least = shortest * self.period
+        return [k for k, h in enumerate(self.h) if not (flies[k] and flies[k - 1] and h < least)]
 
 
 class Images(NamedTuple):
@@ -172,6 +188,8 @@ def _image_of_phase(args, numbers):
     guards = jnp.append(physics.guards(mechanics, contact, none, end), -end[velocity])
     ended = jnp.arange(2) == ends.ending
     _, after = physics.transition(mechanics, contact, none, end, ended, none)
+    # What follows a landing begins on the belt: a rebound of a microsecond is far lower than what Newton's method misses.
+    after = jnp.where(ends.status == Status.DETACH, after.at[mechanics.normal].set(0.0), after)
     after = jnp.where(
         ends.ending == AT_SECTION, end.at[velocity].set(0.0), physics.on_constraint(mechanics, following, after)
     )

@@ -124,15 +124,17 @@ class Curve:
 def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
     """The multiplicity of the root that the guard which ends a phase has at the phase's own start.
 
-    A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after lift-off a triple
-    one. A duration of zero would always solve their equations, so these roots are divided out.
+    A slip speed after a reversal of slip has a simple root there, after sticking a double one; a gap after an impact a simple
+    one, after lift-off a triple one. A duration of zero would always solve their equations, so these roots are divided out.
     """
     before, own = modes[k - 1], modes[k]
     if own.status == Status.SLIDE and own.ending == 1:
         if before.status == Status.SLIDE and before.ending == 1:
             return 1
         return 2 if before.status == Status.STICK and len(modes) > 1 else 0
-    return 3 if own.status == Status.DETACH and before.status != Status.DETACH else 0
+    if own.status == Status.DETACH:
+        return 1 if before.status == Status.DETACH else 3
+    return 0
 
 
 def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +159,9 @@ def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
 def _without_roots_at_start(found: Images, phases: Phases) -> Images:
     power = np.array([roots_at_start(phases.modes, k) for k in range(len(phases.modes))])
     h = phases.h / phases.period
-    h = np.where(np.abs(h) < 1e-9, 1e-9, h)
+    # Below these a guard is a rounding error; that of a rebound, which begins on the belt, has smaller ones.
+    least = np.where([mode.status == Status.DETACH for mode in phases.modes] & (power == 1), 1e-13, 1e-9)
+    h = np.where(np.abs(h) < least, least, h)
     share = h**-power
     return found._replace(
         guard=found.guard * share,

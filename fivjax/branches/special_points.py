@@ -12,6 +12,8 @@ from .multiple_shooting import AT_SECTION, Mode, Phases, same_modes
 from .pseudo_arclength import Curve, Place, multipliers_of
 
 FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
+# Where the derivative of the return map jumps: an impact, say, begins to end the slip.
+CORNER = "non-smooth fold"
 MEETS_SLIDING = "amplitude meets the sliding equilibrium"
 # Points at which the return map has a derivative.
 SMOOTH = ("", FOLD, DOUBLING, TORUS, MEETS_SLIDING)
@@ -19,6 +21,8 @@ SMOOTH = ("", FOLD, DOUBLING, TORUS, MEETS_SLIDING)
 REAL = 1e-9
 # How far from the unit circle a multiplier may be found where it passes it.
 ON_CIRCLE = 1e-6
+# At a fold a multiplier is one, to rounding; at one that is not smooth it is so on neither side.
+NEAR_ONE = 1e-4
 # A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability limit.
 LEVEL = 1e-8
 
@@ -63,7 +67,8 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
 
         s, at = root(place, turning, 0.0, length)
         if at is not None:
-            found.append((s, Special(FOLD, curve, at, turns=True)))
+            smooth = np.min(np.abs(multipliers_of(at.images) - 1)) <= NEAR_ONE
+            found.append((s, Special(FOLD, curve, at, turns=True) if smooth else Special(CORNER, curve, at)))
     before, after = multipliers_of(a.images), multipliers_of(b.images)
     for name, test in ((DOUBLING, doubling), (TORUS, pairing)):
         values = test(before), test(after)

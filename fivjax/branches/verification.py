@@ -12,7 +12,7 @@ from ..model.scene import Scene
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import AT_SECTION, LOOKS, Mode, Phases, inside, phases_around, same_modes
+from .multiple_shooting import AT_SECTION, LOOKS, Mode, Phases, inside, phases_around
 
 # The most crossings of the section in one period.
 MOST_CROSSINGS = 24
@@ -26,10 +26,6 @@ class Real(NamedTuple):
     start: Point  # its first state, in the middle of the longest phase
     seen: Seen
     phases: Phases | None
-
-    def has_the_modes_of(self, phases: Phases) -> bool:
-        """Whether it goes through the same modes as these phases."""
-        return self.phases is not None and same_modes(self.phases.modes, phases.modes)
 
 
 def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | None:

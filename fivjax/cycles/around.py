@@ -150,18 +150,23 @@ def word(segments: Round) -> tuple[Phase, ...]:
 def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
-    The matrix is computed from the middle of the longest segment that does not stick, in the coordinates that the contact mode
-    leaves free: sticking leaves fewer free, so that multipliers of 0 would be missing.
+    The matrix is computed in the coordinates that the contact mode leaves free: sticking leaves fewer free, so that multipliers
+    of 0 would be missing.
     """
+    start = middle_of_longest(segments)
+    matrix = _monodromy(scene, stepper, start, period)
+    free = free_coordinates(scene, start.contact.status)
+    values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
+    return values[np.argsort(-np.abs(values), kind="stable")]
+
+
+def middle_of_longest(segments: Round) -> Point:
+    """The middle of the longest segment that does not stick: far from events, so that none is met twice or missed."""
     stuck = segments.contact.status == Status.STICK
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
     middle = polyval(0.5 * segments.h[longest] / segments.unit[longest], segments.series[longest])
-    start = Point(middle, jax.tree.map(lambda leaf: leaf[longest], segments.contact))
-    matrix = _monodromy(scene, stepper, start, period)
-    free = free_coordinates(scene, segments.contact.status[longest])
-    values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
-    return values[np.argsort(-np.abs(values), kind="stable")]
+    return Point(middle, jax.tree.map(lambda leaf: leaf[longest], segments.contact))
 
 
 def _monodromy(scene: Scene, stepper: EventExact, start: Point, period: float) -> Float[np.ndarray, "state state"]:
