@@ -47,6 +47,11 @@ class Attractors(NamedTuple):
             self.cycles.append(cycle)
         return cycle if before is None else before
 
+    def add_torus(self, torus: Torus) -> None:
+        """Adds a torus, unless it lies in what a known one captures: two motions on the same one may have been tried at once."""
+        if not any(np.all(one.tube.holds(torus.tube.states)) for one in self.tori):
+            self.tori.append(torus)
+
     def copy(self) -> "Attractors":
         return Attractors(*(list(own) for own in self))
 
@@ -100,7 +105,7 @@ class Catalogue(NamedTuple):
         cycles, tori = [one.cycles for one in known], [one.tori for one in known]
         tori, locked = tori_from(self.maps, motions, cycles, tori, self.report, tubes)
         for row, torus in tori.items():
-            known[row].tori.append(torus)
+            known[row].add_torus(torus)
         self._add([(int(motions.group[row]), cycle) for row, cycle, one in locked if one is None])
         for row, cycle, one in locked:
             if one is not None:

@@ -8,7 +8,7 @@ import pytest
 
 import fivjax as fj
 from fivjax.attractors import tube
-from fivjax.attractors.catalogue import Catalogue
+from fivjax.attractors.catalogue import Attractors, Catalogue
 from fivjax.attractors.cycles import CROSSINGS, StableCycle, cycle_through, stable_cycles
 from fivjax.attractors.locked_tori import cycles_closed_in_on, cycles_repeated
 from fivjax.attractors.motions import Motions, smooth_mean
@@ -130,6 +130,15 @@ def test_a_torus_captures_what_stays_in_half_its_tube():
     )  # type: ignore[arg-type]
     assert found == {1: other, 2: torus}
     assert captured_by_tubes(maps, Motions(np.zeros(6, int), at), states, []) == {}  # type: ignore[arg-type]
+
+
+def test_motions_on_one_torus_that_are_tried_at_once_make_one():
+    """Other states of the same curve lie in the first one's tube; those of a curve beside it do not."""
+    known, states = Attractors.none(), wound(returns=1025)
+    for own in (states[:512], states[513:], 1.1 * states[:512]):
+        known.add_torus(Torus(Tube(own, tube.RADIUS), 1.0, 0.1))
+    assert [len(torus.tube.states) for torus in known.tori] == [512, 512]
+    np.testing.assert_array_equal(known.tori[1].tube.states, 1.1 * states[:512])
 
 
 def circle(radius=0.5, count=STATES):
