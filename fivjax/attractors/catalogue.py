@@ -48,7 +48,7 @@ class Attractors(NamedTuple):
         return cycle if before is None else before
 
     def add_torus(self, torus: Torus) -> None:
-        """Adds a torus, unless it lies in what a known one captures: two motions on the same one may have been tried at once."""
+        """Adds a torus unless a known one captures all of it: two motions on the same one may have been tried at once."""
         if not any(np.all(one.tube.holds(torus.tube.states)) for one in self.tori):
             self.tori.append(torus)
 

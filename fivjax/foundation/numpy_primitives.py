@@ -1,7 +1,8 @@
 """JAX's primitives by NumPy, for values that are known; and which places of arrays the indexing ones read and write."""
 
-import functools
+import enum
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -76,19 +77,53 @@ WITH_PARAMETERS: dict[str, Callable] = {
 def function_of(equation) -> Callable[[list[np.ndarray]], Sequence[np.ndarray]]:
     """A primitive's results from its operands; what NumPy does not have is left to JAX, which compiles a program for it."""
     primitive, params = equation.primitive, equation.params
-    name = primitive.name
-    if (plain := PLAIN.get(name)) is not None:
-        return lambda operands: (plain(*operands),)
-    by_numpy = WITH_PARAMETERS.get(name)
+    by_numpy = function_named(primitive.name, plain_parameters(params))
 
     def applied(operands):
-        if by_numpy is not None and (found := by_numpy(*operands, params)) is not None:
-            return (found,)
+        if by_numpy is not None and (found := by_numpy(operands)) is not None:
+            return found
         with jax.enable_x64(True):
             found = primitive.bind(*map(jnp.asarray, operands), **params)
         return list(map(np.asarray, found)) if primitive.multiple_results else (np.asarray(found),)
 
     return applied
+
+
+def function_named(name: str, params: dict) -> Callable[[list[np.ndarray]], tuple | None] | None:
+    """The results of the primitive with this name and these `plain_parameters`; None where NumPy has no such function, or no
+    such case of it.
+    """
+    if (plain := PLAIN.get(name)) is not None:
+        return lambda operands: (plain(*operands),)
+    if (rule := WITH_PARAMETERS.get(name)) is None:
+        return None
+    if "dimension_numbers" in params and isinstance(params["dimension_numbers"], dict):
+        params = {**params, "dimension_numbers": SimpleNamespace(**params["dimension_numbers"])}
+    return lambda operands: None if (found := rule(*operands, params)) is None else (found,)
+
+
+def plain_parameters(params) -> dict:
+    """A primitive's parameters, as far as they are numbers, text, and lists and named tuples of such."""
+    plain = {name: _plain(value) for name, value in params.items()}
+    return {name: value for name, value in plain.items() if value is not NotImplemented}
+
+
+def _plain(value):
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, np.dtype):
+        return value.name
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, tuple | list):
+        parts = [_plain(part) for part in value]
+        if any(part is NotImplemented for part in parts):
+            return NotImplemented
+        names = getattr(value, "_fields", None)
+        return parts if names is None else dict(zip(names, parts, strict=True))
+    return NotImplemented
 
 
 def gathered_places(shape: tuple[int, ...], places, params) -> Int[np.ndarray, "..."] | None:
@@ -137,7 +172,7 @@ def scattered_places(shape: tuple[int, ...], places, update_shape: tuple[int, ..
 def _window(shape, start, sizes, mode) -> tuple[slice, ...] | None:
     """A part of an array; None outside of it, where `mode` does not move it inside."""
     last = [own - size for own, size in zip(shape, sizes, strict=True)]
-    if mode == jax.lax.GatherScatterMode.CLIP:
+    if getattr(mode, "name", mode) == jax.lax.GatherScatterMode.CLIP.name:
         start = [min(max(own, 0), most) for own, most in zip(start, last, strict=True)]
     if not all(0 <= own <= most for own, most in zip(start, last, strict=True)):
         return None
@@ -145,13 +180,13 @@ def _window(shape, start, sizes, mode) -> tuple[slice, ...] | None:
 
 
 def _gathered(array, places, params):
-    found = _gathered_before(array.shape, places.dtype, places.shape, places.tobytes(), tuple(params.items()))
+    # Mostly the same places are read again and again.
+    known, key = params.setdefault("known", {}), (array.shape, places.shape, places.tobytes())
+    if key not in known:
+        known.clear()
+        known[key] = gathered_places(array.shape, places, params)
+    found = known[key]
     return None if found is None else array.ravel()[found]
-
-
-@functools.lru_cache
-def _gathered_before(shape, kind, of_places, places: bytes, params):
-    return gathered_places(shape, np.frombuffer(places, kind).reshape(of_places), dict(params))
 
 
 def _scattered(array, places, update, params, added: bool):

@@ -258,7 +258,9 @@ def steady_slip_speeds(scene: Scene) -> Float[Array, "*contacts"]:
     return speed if count == 1 else jnp.broadcast_to(speed, count)
 
 
-_steady_sliding = by_numpy(steady_sliding)
+@by_numpy
+def _steady_sliding(scene: Scene, force: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, "*contacts"]]:
+    return steady_sliding(scene, force)
 
 
 @by_numpy

@@ -1,5 +1,6 @@
 """Functions of known values by NumPy: the same as by XLA, bit for bit where linear systems are solved."""
 
+import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,9 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fivjax.foundation import numpy_evaluation
 from fivjax.foundation.blocks import in_threads
 from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
+from fivjax.foundation.numpy_plans import Plan, plan_of
+from fivjax.section.about_sliding import sliding_state
 
 RANDOM = np.random.default_rng(3)
 
@@ -47,6 +51,57 @@ def test_in_a_batch_each_leaves_its_loop_by_itself():
     with jax.enable_x64(True):
         left, count = by_numpy(jax.vmap(halvings))(np.array([0.5, 3.0, 40.0]))
     assert left.tolist() == [0.5, 0.75, 0.625] and count.tolist() == [0, 2, 6]
+
+
+def of_many_kinds(x, k):
+    """Loops of all kinds, a branch, indices, and a linear system."""
+    table = jnp.arange(12.0).reshape(4, 3) + x
+    total, rows = jax.lax.scan(lambda total, row: (total + row.sum(), row * total), x, table, reverse=True)
+    count = jax.lax.while_loop(lambda n: n * n < 50 + k, lambda n: n + 1, k)
+    chosen = jax.lax.cond(k > 2, lambda row: -row, lambda row: row / 2, table[k])
+    solved = solve(jnp.eye(3) * 3 + table[:3] / 9, chosen)
+    return total, rows.at[k, 1].add(x), count * 3, solved, jnp.max(table, axis=1), table[::2].astype(int)
+
+
+def test_a_plan_is_text_and_gives_the_same():
+    with jax.enable_x64(True):
+        traced = jax.make_jaxpr(of_many_kinds)(0.0, 0)
+        plan = json.loads(json.dumps(plan_of(traced)))
+        for x, k in ((0.5, 1), (-2.0, 3)):
+            expected = jax.jit(of_many_kinds)(x, k)
+            found = Plan(plan)([np.asarray(x), np.asarray(k)])
+            for own, other in zip(found, expected, strict=True):
+                assert own.dtype == other.dtype
+                np.testing.assert_allclose(own, other, rtol=1e-14)
+
+
+def test_what_numpy_does_not_have_is_left_to_jax():
+    """As a part of the function, which is then no text; and for indices outside of their array."""
+    with jax.enable_x64(True):
+        plan = plan_of(jax.make_jaxpr(lambda x: jax.scipy.special.erf(x) + 1)(0.5))
+        with pytest.raises(TypeError, match="serializable"):
+            json.dumps(plan)
+        assert Plan(plan)([np.asarray(0.5)])[0] == pytest.approx(1.5204998778)
+        beyond = by_numpy(lambda x, k: x.at[k].get(mode="fill", fill_value=-1.0))
+        assert (
+            float(beyond(np.arange(3.0), np.asarray(5))) == -1.0 and float(beyond(np.arange(3.0), np.asarray(1))) == 1.0
+        )
+
+
+def test_a_function_is_kept_only_under_its_own_name(monkeypatch, paper_scene):
+    """Functions that others make of it have its name, too."""
+    kept = []
+    monkeypatch.setattr(numpy_evaluation, "kept_value", lambda make, form: kept.append(make.__name__) or make(form))
+    with jax.enable_x64(True):
+        by_numpy(jax.vmap(solve, in_axes=(None, 0)))(np.eye(3), np.ones((2, 3)))
+        by_numpy(solve)(np.eye(2), np.ones(2))
+        assert kept == []
+        by_numpy(sliding_state.__wrapped__)(paper_scene, np.asarray(100.0))
+        assert kept == []
+        itself = by_numpy(sliding_state.__wrapped__)
+        monkeypatch.setattr("fivjax.section.about_sliding.sliding_state", itself)
+        itself(paper_scene, np.asarray(100.0))
+        assert kept == ["sliding_state"]
 
 
 def test_what_is_known_is_not_changed_by_later_calls():
