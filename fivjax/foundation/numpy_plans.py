@@ -12,7 +12,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .jaxprs import of_scan, solution, within
 from .linear_solve import eliminated, is_elimination
-from .numpy_primitives import function_named, function_of, plain_parameters
+from .numpy_primitives import function_named, function_of, has_case, plain_parameters
 
 ELIMINATION = "elimination"
 
@@ -52,13 +52,22 @@ class Plan:
         for place, kind, shape, content in plan["constants"]:
             self.values[place] = np.frombuffer(bytes.fromhex(content), kind).reshape(shape)
         self.steps = [_Step.of(*step) for step in plan["steps"]]
+        # After each step, the places that nobody reads any more: memory that is used again is faster than new memory.
+        read, self.over = set(self.ends), []
+        for step in reversed(self.steps):
+            over = {*step.reads, *step.writes} - read
+            read |= over
+            self.over.append([own for own in over if self.values[own] is None])
+        self.over.reverse()
 
     def __call__(self, given) -> list:
         values = self.values.copy()
         for own, value in zip(self.given, given, strict=True):
             values[own] = value
-        for step in self.steps:
+        for step, over in zip(self.steps, self.over, strict=True):
             step.taken(values)
+            for own in over:
+                values[own] = None
         return [values[own] for own in self.ends]
 
 
@@ -147,11 +156,8 @@ def _named(equation) -> tuple[Any, dict]:
         return ELIMINATION, {}
     if name in LOOPS:
         return name, PARTS[name](params)
-    params, applied = plain_parameters(params), function_named(name, plain_parameters(params))
-    # Of which cases NumPy has a function depends on shapes and types, but for indices.
-    with np.errstate(all="ignore"):
-        has = applied is not None and applied([np.zeros(own.aval.shape, own.aval.dtype) for own in equation.invars])
-    return (name, params) if has else (equation, {})
+    params = plain_parameters(params)
+    return (name, params) if has_case(name, params, [own.aval for own in equation.invars]) else (equation, {})
 
 
 def _function(equation, params: dict) -> Callable:

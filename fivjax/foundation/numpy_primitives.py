@@ -58,6 +58,7 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "dynamic_slice": lambda a, *rest: _sliced(a, rest[:-1], rest[-1]["slice_sizes"]),
     "concatenate": lambda *a: np.concatenate(a[:-1], a[-1]["dimension"]),
     "stack": lambda *a: np.stack(a[:-1], a[-1]["axis"]),
+    "pad": lambda a, filling, p: _padded(a, filling, p["padding_config"]),
     "broadcast_in_dim": lambda a, p: _broadcast(a, p["shape"], p["broadcast_dimensions"]),
     "reduce_sum": lambda a, p: np.sum(a, axis=tuple(p["axes"])),
     "reduce_max": lambda a, p: np.max(a, axis=tuple(p["axes"])) if a.size else None,
@@ -72,6 +73,8 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "scatter": lambda a, places, update, p: _scattered(a, places, update, p, False),
     "scatter-add": lambda a, places, update, p: _scattered(a, places, update, p, True),
 }
+# Those of them for which it depends on shapes and types whether there is such a case. (For `gather` it depends on indices.)
+SOME_CASES = ("div", "bitcast_convert_type", "pad", "reduce_max", "reduce_min")
 
 
 def function_of(equation) -> Callable[[list[np.ndarray]], Sequence[np.ndarray]]:
@@ -100,6 +103,15 @@ def function_named(name: str, params: dict) -> Callable[[list[np.ndarray]], tupl
     if "dimension_numbers" in params and isinstance(params["dimension_numbers"], dict):
         params = {**params, "dimension_numbers": SimpleNamespace(**params["dimension_numbers"])}
     return lambda operands: None if (found := rule(*operands, params)) is None else (found,)
+
+
+def has_case(name: str, params: dict, avals) -> bool:
+    """Whether NumPy has this function for operands of these shapes and types."""
+    if name in SOME_CASES:
+        applied = function_named(name, params)
+        with np.errstate(all="ignore"):
+            return applied is not None and applied([np.ones(own.shape, own.dtype) for own in avals]) is not None
+    return name in PLAIN or name in WITH_PARAMETERS
 
 
 def plain_parameters(params) -> dict:
@@ -218,5 +230,30 @@ def _selected(which, cases):
 
 
 def _product(left, right, numbers):
-    (along_left, along_right), batch = numbers
-    return None if any(batch) else np.tensordot(left, right, (along_left, along_right))
+    (along_left, along_right), (batch_left, batch_right) = numbers
+    if not batch_left:
+        return np.tensordot(left, right, (along_left, along_right))
+    # As products of matrices: each has what is summed over as one axis, and what is left as another.
+    free = [
+        [axis for axis in range(side.ndim) if axis not in (*batch, *along)]
+        for side, batch, along in ((left, batch_left, along_left), (right, batch_right, along_right))
+    ]
+    left = np.transpose(left, (*batch_left, *free[0], *along_left))
+    right = np.transpose(right, (*batch_right, *along_right, *free[1]))
+    batch, count = left.shape[: len(batch_left)], left.ndim - len(along_left)
+    kept, rest = left.shape[len(batch) : count], right.shape[len(batch) + len(along_right) :]
+    summed = int(np.prod(left.shape[count:]))
+    found = left.reshape(*batch, -1, summed) @ right.reshape(*batch, summed, -1)
+    return found.reshape(*batch, *kept, *rest)
+
+
+def _padded(array, filling, config):
+    if any(low < 0 or high < 0 for low, high, _ in config):
+        return None
+    steps = [inside + 1 for _, _, inside in config]
+    ends = [
+        low + max((size - 1) * step + 1, 0) for size, step, (low, _, _) in zip(array.shape, steps, config, strict=True)
+    ]
+    found = np.full([end + high for end, (_, high, _) in zip(ends, config, strict=True)], filling, array.dtype)
+    found[tuple(slice(low, end, step) for (low, _, _), end, step in zip(config, ends, steps, strict=True))] = array
+    return found

@@ -4,6 +4,7 @@ Trajectories that differ only in their kick or their initial state make a *group
 matrices of their stepper, the same proofs and the same attractors.
 """
 
+import functools
 from collections.abc import Sequence
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ..contact import Mechanics
 from ..foundation.flattened import Flattened, flatten
-from ..foundation.kept_programs import kept
+from ..foundation.numpy_evaluation import by_numpy
 from ..kernels.warp_library import is_installed
 from ..linear.linearisation import linear_sliding
 from ..model.friction import Coulomb
@@ -119,12 +120,12 @@ def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tupl
 
 def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
     """`Shared` of each row of `distinct`, as one array."""
-    # So many groups are worked out at a time, so that one size is compiled.
+    # So many groups are worked out at a time.
     size, parts = 64, []
     for start in range(0, len(distinct), size):
-        # Padded with copies, so that one size is compiled.
+        # Padded with copies, so that there is one size.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = jax.tree.map(np.asarray, _prepare(task.scene, task.method, task.names, distinct[rows]))
+        part = _prepare(task.scene, task.method, task.names, distinct[rows])
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
     modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
@@ -139,7 +140,8 @@ def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
     return Flattened(numbers, form)
 
 
-@kept
+# By NumPy, because XLA would compile it for longer than a map takes; and always so, because all maps are rounded alike.
+@functools.partial(by_numpy, always=True)
 def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
