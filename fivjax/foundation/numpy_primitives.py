@@ -73,6 +73,10 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "scatter": lambda a, places, update, p: _scattered(a, places, update, p, False),
     "scatter-add": lambda a, places, update, p: _scattered(a, places, update, p, True),
 }
+# The same with several results.
+SEVERAL: dict[str, Callable] = {
+    "split": lambda a, p: np.split(a, np.cumsum(p["sizes"])[:-1], p["axis"]),
+}
 # Those of them for which it depends on shapes and types whether there is such a case. (For `gather` it depends on indices.)
 SOME_CASES = ("div", "bitcast_convert_type", "pad", "reduce_max", "reduce_min")
 
@@ -98,6 +102,8 @@ def function_named(name: str, params: dict) -> Callable[[list[np.ndarray]], tupl
     """
     if (plain := PLAIN.get(name)) is not None:
         return lambda operands: (plain(*operands),)
+    if (several := SEVERAL.get(name)) is not None:
+        return lambda operands: tuple(several(*operands, params))
     if (rule := WITH_PARAMETERS.get(name)) is None:
         return None
     if "dimension_numbers" in params and isinstance(params["dimension_numbers"], dict):
@@ -111,7 +117,7 @@ def has_case(name: str, params: dict, avals) -> bool:
         applied = function_named(name, params)
         with np.errstate(all="ignore"):
             return applied is not None and applied([np.ones(own.shape, own.dtype) for own in avals]) is not None
-    return name in PLAIN or name in WITH_PARAMETERS
+    return any(name in those for those in (PLAIN, WITH_PARAMETERS, SEVERAL))
 
 
 def plain_parameters(params) -> dict:

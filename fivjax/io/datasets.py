@@ -21,7 +21,6 @@ from .files import check_writable as check_writable
 from .files import replace_whole
 from .files import save_figure as save_figure
 from .files import save_text as save_text
-from .hdf5_files import read_netcdf
 from .reading_limits import unreadable
 
 if TYPE_CHECKING:
@@ -116,6 +115,9 @@ def open(path: str | Path) -> "xr.Dataset":
         True
     """
     import xarray as xr
+
+    # With SciPy's sparse matrices.
+    from .hdf5_files import read_netcdf
 
     path = arguments.path("path", path)
     if not path.is_file():

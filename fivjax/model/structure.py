@@ -47,7 +47,7 @@ class FromParameters(eqx.Module):
 
     @property
     def matrices(self) -> Matrices:
-        """Worked out anew each time, compiled as a whole."""
+        """Worked out anew each time."""
         return self._at(self.values)
 
     @property
@@ -76,10 +76,11 @@ class FromParameters(eqx.Module):
                 "The matrices of this structure follow from its parameters. Change these with `replace`, or take "
                 "`structure.as_matrices()` to change a matrix itself."
             )
-        return _matrices(self.matrices_of, parameters)
+        return jax.tree.map(jnp.asarray, _matrices(self.matrices_of, parameters))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+# Always rounded alike: the same parameters make the same matrices.
+@functools.partial(by_numpy, always=True)
 def _matrices(matrices_of: Callable[..., tuple], parameters: dict[str, Float[Array, "..."]]) -> Matrices:
     def matrices(parameters):
         return Matrices(*map(jnp.asarray, matrices_of(**parameters)))
