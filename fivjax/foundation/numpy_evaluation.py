@@ -4,6 +4,7 @@ XLA takes longer to compile such a function than NumPy takes for a hundred calls
 processes (`numpy_plans`), because to trace the function takes longer still than to compute it.
 """
 
+import contextlib
 import functools
 import json
 import sys
@@ -22,8 +23,8 @@ from .numpy_plans import NoSuchCase, Plan, plan_of
 from .plain_trees import NotPlain, from_text, structure_to_text
 from .precision import own_settings
 
-# Calls after which it is compiled, and results that are kept in case they are asked for again.
-REPAID, LATEST = 100, 16
+# Calls after which it is compiled, and results that are kept in case they are asked for again: few where they may be large.
+REPAID, LATEST, FEW = 100, 16, 2
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -32,7 +33,7 @@ R = TypeVar("R")
 def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R]:
     """`compiled`, but the first calls with known values are computed by NumPy; results are then arrays of NumPy.
 
-    With `always`, so are later calls, none of whose results is kept: where it matters that all are rounded alike.
+    With `always`, so are later calls: where it matters that all are rounded alike.
     """
     otherwise = compiled(function)
     plans: dict = {}
@@ -46,22 +47,18 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
         if transformed((args, kwargs)):
             return otherwise(*args, **kwargs)
         form, arrays = Form.of((args, kwargs))
-        key = None if always else (form, *(np.asarray(array).tobytes() for array in arrays))
-        if key in latest:
-            return jax.tree.map(_copied, latest[key])
-        if not always:
+        key = form, *(np.asarray(array).tobytes() for array in arrays)
+        if (found := latest.get(key)) is None:
             calls[form] += 1
-            if calls[form] > REPAID:
+            if calls[form] > REPAID and not always:
                 return otherwise(*args, **kwargs)
-        try:
-            found = computed(form, arrays)
-        except NoSuchCase:
-            return otherwise(*args, **kwargs)
-        if always:
-            return found
-        latest[key] = found
-        if len(latest) > LATEST:
-            latest.popitem(last=False)
+            try:
+                latest[key] = found = computed(form, arrays)
+            except NoSuchCase:
+                return otherwise(*args, **kwargs)
+            with contextlib.suppress(KeyError):  # where threads leave out the same
+                while len(latest) > (FEW if always else LATEST):
+                    latest.popitem(last=False)
         return jax.tree.map(_copied, found)
 
     def computed(form: Form, arrays: list) -> R:
