@@ -192,6 +192,7 @@ def test_contact_laws_hold(case):
     assert np.all(run.N[off] == 0.0)
 
 
+@pytest.mark.slow
 def test_exponential_law_contains_the_constant_one():
     t = np.linspace(0.0, 0.4, 401)
     same = paper_model(belt_speed=1.0, p=1.4, mu_static=0.227, mu_dynamic=0.227, decay=0.5)
@@ -227,6 +228,7 @@ def test_refusals():
 
 
 # ------------------------------------------------------------------------------------- verdicts
+# The dearest are slow: they are asked when the oracle changes.
 
 
 @pytest.mark.parametrize(
@@ -265,6 +267,7 @@ def test_small_kick_slides_and_large_friction_does_not():
     assert verdict(paper_model(mu=0.05, p=7.0)).kind == "sliding"
 
 
+@pytest.mark.slow
 def test_sliding_verdict_against_simulate():
     model = paper_model(belt_speed=1.0, p=1.10)
     answer = verdict(model)
@@ -286,6 +289,7 @@ def test_periodic_verdict_against_simulate():
     assert len(run.events) > 5
 
 
+@pytest.mark.slow
 def test_quasi_periodic_verdict_against_simulate():
     answer = verdict(paper_model(belt_speed=10.0, p=1.3))
     _, q, v = answer.section
@@ -307,6 +311,7 @@ def test_unstable_orbit_at_the_boundary_is_not_taken_for_a_limit_cycle():
     assert b.amplitude == pytest.approx(2.7132675e-3, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_threshold_scales_with_the_belt_speed_where_only_sticking_acts():
     # the motion is linear in (p - 1, belt_speed) as long as the contact does not open
     crossing = 0.10720580743
@@ -316,6 +321,7 @@ def test_threshold_scales_with_the_belt_speed_where_only_sticking_acts():
             assert verdict(paper_model(belt_speed=speed, p=p)).kind == kind
 
 
+@pytest.mark.slow
 def test_verdicts_of_an_exponential_law():
     damped = paper_model(belt_speed=20.0, p=1.5, c1=20.0, c2=20.0, mu_static=0.2, mu_dynamic=0.1, decay=0.5)
     assert verdict(damped).kind == "sliding"

@@ -78,7 +78,13 @@ def test_a_kick_at_the_start_by_its_instant():
     expected = of_oracle(t1, 1e-6, "start", p=1.3, belt_speed=0.2)
     assert found.exist and found.events > 0
     np.testing.assert_allclose(found["start"], expected, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(by_xla(scene, "start", None, t1), found["start"], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_kick_at_the_start_by_its_instant_without_kernels():
+    scene = cases.paper(start=0.0, p=1.3, belt_speed=0.2)
+    found = by_kernel(scene, "start", None, 0.06)
+    np.testing.assert_allclose(by_xla(scene, "start", None, 0.06), found["start"], rtol=1e-9)
 
 
 LOADS = {
@@ -106,12 +112,18 @@ def test_a_jump_at_the_start_of_a_motion(start, load):
     made, name = LOADS[load]
     scene, t1 = fj.Scene(point_mass(stiffness), fj.Coulomb(0.3), 0.6, made(p)), 0.3
     np.testing.assert_allclose(by_kernel(scene, name, y0, t1)[name], expected(t1), rtol=1e-9, atol=1e-12)
-    # XLA compiles each anew.
-    if (start, load) in (("slides", "own"), ("stuck", "kick")):
-        np.testing.assert_allclose(by_xla(scene, name, y0, t1), expected(t1), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("derivatives", ["forward", "xla"])
+# XLA compiles each anew.
+@pytest.mark.parametrize(("start", "load"), [("stuck", "kick"), pytest.param("slides", "own", marks=pytest.mark.slow)])
+def test_a_jump_at_the_start_of_a_motion_without_kernels(start, load):
+    stiffness, y0, p, expected = STARTS[start]
+    made, name = LOADS[load]
+    scene = fj.Scene(point_mass(stiffness), fj.Coulomb(0.3), 0.6, made(p))
+    np.testing.assert_allclose(by_xla(scene, name, y0, 0.3), expected(0.3), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("derivatives", ["forward", pytest.param("xla", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("jump", [0.0, 0.15])
 def test_the_work_of_a_load_by_the_instant_of_its_jump(jump, derivatives):
     """A mass falls by F, then p F: the work is its gain of speed. The jump is at the start, or on a saved row."""
@@ -197,7 +209,7 @@ def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it()
     np.testing.assert_allclose(found, one_sided(end, 1e-5), atol=1e-6)
 
 
-@pytest.mark.parametrize(("law", "exist"), [("coulomb", True), ("reset", False)])
+@pytest.mark.parametrize(("law", "exist"), [("coulomb", True), pytest.param("reset", False, marks=pytest.mark.slow)])
 def test_restitution_at_zero_for_several_contacts(law, exist):
     """Zero for impacts with friction; where it would be more, it is not worked out, and said not to exist."""
     mass = np.eye(4) + 0.1 * (np.eye(4, k=2) + np.eye(4, k=-2))
