@@ -79,7 +79,7 @@ class Calibrate:
     """what a sample is: the value at its instant, or the mean over the time between samples"""
     filter: Annotated[str | None, tyro.conf.arg(metavar="CUTOFF:ORDER")] = None
     """anti-alias filter in front of the sampler: a Butterworth low-pass of this cut-off (Hz) and order, such as `400:4`"""
-    y0: tuple[float, ...] | None = None
+    y0: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT …")] = None
     """kick: state at the simulation's start, displacements (m) then velocities (m/s); steady sliding unless given"""
     column: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN=CHANNEL …")] = ()
     """channels of columns, such as `Acc_X=acceleration0`; by their names unless given"""
@@ -91,7 +91,7 @@ class Calibrate:
     """sampling rate, where the file has no time base (Hz)"""
     full_scale: float = 1.0
     """value of the largest sample of a .wav, in the channel's unit"""
-    offset: tuple[float, float] | None = None
+    offset: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """kick: range for the time of the first sample in the simulation (s), 0 to 0.5 unless given, or 0 with --y0"""
     bound: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LOW:HIGH …")] = ()
     """bounds of free parameters, such as `mu=0.05:0.5`"""

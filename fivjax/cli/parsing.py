@@ -1,6 +1,7 @@
 """Parsing of options of the form `NAME=…`; each error shows the right form."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import tyro
@@ -40,9 +41,27 @@ def axis(text: str, *, least: int = 1) -> tuple[str, np.ndarray]:
     return name, np.linspace(low, high, points)
 
 
-def numbers() -> tyro.constructors.ConstructorRegistry:
-    """How numbers are read from options, so that a word in place of one is answered by a sentence."""
+def options() -> tyro.constructors.ConstructorRegistry:
+    """How options are read: a word in place of a number is answered by a sentence, and what need not be given is named as what
+    it is.
+    """
     registry = tyro.constructors.ConstructorRegistry()
+
+    def shown(value) -> list[str]:
+        return ["none" if value is None else str(value)]
+
+    @registry.primitive_rule
+    def optional(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+        kind = {str | None: str, Path | None: Path}.get(info.type)
+        if kind is None:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="PATH" if kind is Path else "TEXT",
+            instance_from_str=lambda words: kind(words[0]),
+            is_instance=lambda value: value is None or isinstance(value, kind),
+            str_from_instance=shown,
+        )
 
     @registry.primitive_rule
     def rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
@@ -62,7 +81,7 @@ def numbers() -> tyro.constructors.ConstructorRegistry:
             metavar=kind.__name__.upper(),
             instance_from_str=read,
             is_instance=lambda value: value is None or isinstance(value, int | float),
-            str_from_instance=lambda value: [str(value)],
+            str_from_instance=shown,
         )
 
     return registry

@@ -1,7 +1,7 @@
-"""Plans of traced functions: which of NumPy's functions are computed of what, one after the other.
+"""Plans of traced functions: the steps by which NumPy computes them, each with the places of what it reads and writes.
 
-A plan is made once and looked up in each call: to look equations up takes longer than to compute them. It is a dictionary of
-numbers, text and lists, so that it can be kept, but for equations that are left to JAX.
+A plan is made once, because it takes longer to look an equation up than to compute it. It is plain (numbers, text, lists), so
+that it can be kept for later processes. Only an equation that NumPy has no function for is left to JAX, as it is.
 """
 
 from collections.abc import Callable
