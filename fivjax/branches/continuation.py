@@ -21,7 +21,6 @@ from ..cycles.saddle import saddle_cycle
 from ..cycles.search import NoLimitCycle, limit_cycle
 from ..foundation import arguments
 from ..foundation.digits import apart
-from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
@@ -216,7 +215,7 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
     for point in points:
         scene = family.at(point.place.parameter)
         slides.append(bool(sliding_rates(scene)[0].real < 0))
-        rest = np.asarray(_equilibrium(scene))
+        rest = sliding_state(scene, scene.load.final)
         at = None if point.real is None else on_section(scene, family.stepper, point.place.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
         status.append(-1 if at is None else int(at.contact.status))
@@ -247,11 +246,6 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
         of, values = slopes
         dataset = dataset.assign_coords(of=of).assign(d_special=(("point", "of"), values))
     return dataset
-
-
-@kept
-def _equilibrium(scene: Scene):
-    return sliding_state(scene, scene.load.final)
 
 
 def word_of(phases: Phases) -> str:

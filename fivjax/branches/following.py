@@ -19,6 +19,9 @@ FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
 SOON, LATER = 3.0, 1.5
 # The angle between the tangents at neighbouring points has at least this cosine.
 STRAIGHT = 0.99
+# Cycles of one parameter whose periods and sizes differ by no more than this share are the same, but for rebounds that are none
+# to speak of.
+SAME = 1e-7
 # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
 SMALL = 0.02
 
@@ -60,13 +63,17 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
                 points += [one for one in passed if np.linalg.norm(one.place.u - special.place.u) > 1e-6]
             points.append(seen(family, special.curve, special.place, special))
             if onward is None:
-                return Followed(points, _at(family, points[-1], f"{special.name}: no cycle goes on beyond"))
+                return Followed(points, _at(family, points[-1], f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
             continue
         passed = _specials(family, curve, here.place, tangent, following)
         points += [point for point in passed if bounds[0] <= point.place.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
             return _to_bound(family, points, here, following.u - here.place.u, following, bounds)
+        if (turned_at := _met_before(points, last)) is not None:
+            # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
+            why = "the branch would come back on itself, and nothing else was found to go on"
+            return Followed(points[: turned_at + 1], _at(family, points[turned_at], why))
         points.append(last)
         if _smallness(curve, following) < SMALL:
             end = where_sliding_is_met(family, last)
@@ -138,6 +145,31 @@ def _smallness(curve: Curve, place: Place) -> float:
     """
     pure = len(place.phases.modes) == 1 and place.phases.modes[0].ending == AT_SECTION
     return float(np.linalg.norm(place.u[: len(curve.of_state)])) if pure else np.inf
+
+
+def _met_before(points: list[Point], last: Point) -> int | None:
+    """Where a branch has turned back, if its latest cycle is one that it has come along before: the last point until then."""
+    if last.real is None:
+        return None
+    parameters = np.array([point.place.parameter for point in points])
+    value, period = last.place.parameter, last.place.phases.period
+    for k in np.flatnonzero((parameters[:-1] - value) * (parameters[1:] - value) <= 0)[:-1]:
+        near = points[k]
+        one, other = near.place.phases.period, points[k + 1].place.phases.period
+        if (
+            not min(one, other) - abs(one - other) - SAME * period
+            <= period
+            <= max(one, other) + abs(one - other) + SAME * period
+        ):
+            continue
+        before = near.curve.at_parameter(near.place.u, value)
+        if before is None or abs(before.phases.period - period) > SAME * period:
+            continue
+        states = [np.linalg.norm(near.curve.weights * one.phases.y, axis=1) for one in (before, last.place)]
+        if abs(np.max(states[0]) - np.max(states[1])) <= 10 * SAME * np.max(states[0]):
+            turn = parameters[k:] - value
+            return int(k + np.argmax(np.abs(turn)))
+    return None
 
 
 def _closes(start: Point, here: Point, last: Point) -> bool:

@@ -12,7 +12,7 @@ from ..attractors.closing import close_near
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..linear.spectrum import eigenvalues
+from ..linear.linearisation import sliding_rates
 from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
 from ..section.return_maps import ReturnMaps, Section
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
@@ -85,7 +85,7 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
 
 
 def _refuse_unstable_sliding(scene: Scene) -> None:
-    rates = np.asarray(eigenvalues(scene))
+    rates = sliding_rates(scene)
     if np.max(rates.real) > UNSTABLE * np.max(np.abs(rates)):
         raise NoLimitCycle(
             f"Steady sliding is unstable: small deviations grow at {np.max(rates.real):.3g} 1/s, so that no boundary lies "

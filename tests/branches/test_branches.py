@@ -249,7 +249,7 @@ def test_a_branch_ends_where_its_event_would_be_missed():
     a family of cycles by matrix exponentials; beyond, solutions of the cycle's equations are no motions.
     """
     branch = fj.continue_cycle(with_static_friction(1.0), "mu", (0.05, 0.255))
-    assert branch.begins == "At mu = 0.228218444915 grazing of slip: no cycle goes on beyond."
+    assert branch.begins == "At mu = 0.228218444915 grazing of slip: no cycle was found to go on beyond."
     assert branch.special.values[0] == "grazing of slip"
     assert float(branch.parameter[0]) == pytest.approx(0.228218444915, abs=2e-12)
     for i in range(1, 8):
@@ -261,7 +261,7 @@ def test_a_branch_ends_where_its_event_would_be_missed():
 def test_a_branch_with_ever_shorter_impacts_ends():
     """Beyond a change of modes the motion had 16,384 phases, and their equations would have been a matrix of 98 GiB."""
     branch = fj.continue_cycle(with_static_friction(1.0), "mu_static", (0.21, 0.6))
-    assert branch.ends == "At mu_static = 0.55396671036 stick removed: no cycle goes on beyond."
+    assert branch.ends == "At mu_static = 0.55396671036 stick removed: no cycle was found to go on beyond."
 
 
 @pytest.mark.slow
