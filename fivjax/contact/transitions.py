@@ -157,7 +157,7 @@ def status_from_forces(
     status = jnp.where(
         open_,
         Status.DETACH,
-        jnp.where(sticks, Status.STICK, jnp.where(sliding_normal_force > 0, Status.SLIDE, Status.DETACH)),
+        jnp.where(sticks, Status.STICK, jnp.where(sliding_normal_force >= 0, Status.SLIDE, Status.DETACH)),
     )
     return Contact(status=status.astype(jnp.int32), direction=direction)
 

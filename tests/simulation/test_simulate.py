@@ -262,3 +262,13 @@ def test_one_program_serves_runs_of_any_length_however_often_they_save(paper_sce
             run = fj.simulate(paper_scene, t1, dt_save, method and fj.WhereSwitched(diffrax.Tsit5(), dt=dt_save / 4))
             assert len(run.t) == round(t1 / dt_save) + 1 and run.t[-1] == t1
         assert compilations == []
+
+
+def test_an_undeformed_structure_at_rest_is_pressed_a_moment_later():
+    """No force is in the contact when the load is put on: it neither lifts off nor lands without end."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.22), belt_speed=1.0, load=fj.Pulse(100.0, p=1.2))
+    run = fj.simulate(scene, 0.05, 0.05, y0=np.zeros(6))
+    model = oracle.paper_model(mu=0.22, belt_speed=1.0, p=1.2)
+    expected = oracle.propagate(model, 0.05, y0=(np.zeros(3), np.zeros(3)))
+    np.testing.assert_allclose(run.displacement[-1], expected.q[-1], atol=1e-9 * np.abs(expected.q[-1]).max())
+    np.testing.assert_allclose(run.velocity[-1], expected.v[-1], atol=1e-9 * np.abs(expected.v[-1]).max())
