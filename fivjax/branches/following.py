@@ -155,20 +155,16 @@ def _met_before(points: list[Point], last: Point) -> int | None:
     value, period = last.place.parameter, last.place.phases.period
     for k in np.flatnonzero((parameters[:-1] - value) * (parameters[1:] - value) <= 0)[:-1]:
         near = points[k]
+        # Between these two points, or nearly so: elsewhere the cycle need not be computed.
         one, other = near.place.phases.period, points[k + 1].place.phases.period
-        if (
-            not min(one, other) - abs(one - other) - SAME * period
-            <= period
-            <= max(one, other) + abs(one - other) + SAME * period
-        ):
+        if abs(period - 0.5 * (one + other)) > 1.5 * abs(one - other) + SAME * period:
             continue
         before = near.curve.at_parameter(near.place.u, value)
         if before is None or abs(before.phases.period - period) > SAME * period:
             continue
-        states = [np.linalg.norm(near.curve.weights * one.phases.y, axis=1) for one in (before, last.place)]
-        if abs(np.max(states[0]) - np.max(states[1])) <= 10 * SAME * np.max(states[0]):
-            turn = parameters[k:] - value
-            return int(k + np.argmax(np.abs(turn)))
+        size, own = (np.max(np.linalg.norm(near.curve.weights * at.phases.y, axis=1)) for at in (before, last.place))
+        if abs(size - own) <= 10 * SAME * size:
+            return int(k + np.argmax(np.abs(parameters[k:] - value)))
     return None
 
 

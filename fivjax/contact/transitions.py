@@ -136,9 +136,9 @@ def status_from_forces(
 ) -> Contact:
     """The status of a state on its constraints, found from the forces that each status would need.
 
-    Gap open or opening: detached. Slipping: sliding if pressed, else detached. At rest on the belt: sticking if the force that
-    this needs lies in the friction cone, else sliding the way it is pushed, else detached. With several contacts, all are found
-    at once (`contact_problem`).
+    Gap open or opening: detached. Slipping: sliding if pressed, or if no force is in the contact yet, else detached. At rest on
+    the belt: sticking if the force that this needs lies in the friction cone, else sliding the way it is pushed, else detached.
+    With several contacts, all are found at once (`contact_problem`).
     """
     if mechanics.several:
         return modes_from_forces(mechanics, load, y)
