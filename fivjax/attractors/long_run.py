@@ -22,6 +22,8 @@ from .tube import HOME
 
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
 TIMES, ONWARD = 4, 8192
+# Returns after which motions without events are asked again and again whether they slide for ever.
+SLID_ON = (HOME, 512, 512, 1024)
 # Which motions are certain to slide for ever.
 Slides = Callable[[Motions], Bool[np.ndarray, " r"]]
 
@@ -54,7 +56,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
         attractor |= {int(rows[row]): one for row, one in captured.items()}
         rows = np.delete(rows, list(captured))
         if len(rows):
-            found = _long_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
+            found = _slow_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
             chaotic[rows], quiet[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
             time[rows] += found.time
@@ -81,6 +83,54 @@ class _Underway(NamedTuple):
         self.motions.at.put(rows, at)
         self.time[rows] += time
         self.events[rows] += events
+
+
+def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
+    """The same of motions that nothing has captured by now: those without events are most likely slow to fade."""
+    run = _Underway(motions, *np.zeros((2, len(motions.group))))
+    attractor: dict[int, Captor] = {}
+    chaotic, quiet = np.zeros((2, len(motions.group)), bool)
+    if slides is not None:
+        quiet = _slide_on(catalogue, run, attractor, slides)
+    rows = np.delete(np.arange(len(quiet)), [*np.flatnonzero(quiet), *attractor])
+    if len(rows):
+        found = _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides)
+        chaotic[rows], quiet[rows] = found.chaotic, found.without_events
+        run.move(rows, found.at, found.time, found.events)
+        attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
+    return Fates(chaotic, attractor, quiet, run.motions.at, run.time, run.events.astype(int))
+
+
+def _slide_on(
+    catalogue: Catalogue, run: _Underway, attractor: dict[int, Captor], slides: Slides
+) -> Bool[np.ndarray, " m"]:
+    """Which of these motions slide for ever: while they have no events they are followed until that is certain, or they do not
+    move any more; or until they are captured, by an `attractor`.
+    """
+    maps, rows = catalogue.maps, np.arange(len(run.time))
+    certain = np.zeros(len(rows), bool)
+
+    def left(rows) -> Int[np.ndarray, " r"]:
+        """Those of the rows of which it is not known by now."""
+        if not len(rows):
+            return rows
+        motions = run.motions.rows(rows)
+        certain[rows] = ended = ~maps.moves(motions.group, motions.at.y) | slides(motions)
+        captured = catalogue.captures(motions, ~ended)
+        attractor.update((int(rows[row]), one) for row, one in captured.items())
+        ended[list(captured)] = True
+        return rows[~ended]
+
+    for returns in SLID_ON:
+        if not len(rows):
+            return certain
+        later = maps.returns(*run.motions.rows(rows), returns)
+        run.move(rows, later.at, later.time, later.events)
+        rows = left(rows[(later.events == 0) & np.all(np.isfinite(later.at.y), axis=1)])
+    asked = np.zeros(len(certain), bool)
+    asked[rows] = True
+    left(np.flatnonzero(_creep(catalogue, run, asked, slides)))
+    return certain
 
 
 def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:

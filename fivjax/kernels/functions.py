@@ -12,14 +12,14 @@ from itertools import compress
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..foundation.argument_forms import Form
 from ..foundation.compiling import compiled
 from ..foundation.forking import refuse_if_forked
 from ..foundation.precision import is_known, known_to_numpy
 from .code import jvp_along, with_slopes
-from .kernel import any_kernel_of, kernel_of, width_for
+from .kernel import Groups, any_kernel_of, kernel_of, width_for
 from .primitive import is_real, values
 
 # The instants of a function without rows.
@@ -97,17 +97,12 @@ class KernelFunction:
         return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
 
     def of_groups(
-        self,
-        form: Form,
-        shared: int,
-        table: Float[np.ndarray, "groups numbers"],
-        group: Int[np.ndarray, " lanes"],
-        given: Float[np.ndarray, "lanes numbers"],
-        pool: Executor | None = None,
+        self, form: Form, shared: int, groups: Groups, given, pool: Executor | None = None, on_gpus: bool = True
     ):
-        """The same where so many of the first arrays are `shared` by the trajectories of a group: it has a row of the table."""
+        """The same where so many of the first arrays are `shared` by the trajectories of `groups`, on GPUs only if wanted."""
         kernel = kernel_of(self, form, shared=shared)
-        return kernel.results(*kernel.launched(given, np.atleast_2d(NO_ROWS), pool=pool, groups=(table, group))[:2])
+        ends, rows, *_ = kernel.launched(given, np.atleast_2d(NO_ROWS), pool=pool, groups=groups, on_gpus=on_gpus)
+        return kernel.results(ends, rows)
 
     def derived_of_many(
         self, form: Form, given, instants, wide: tuple[bool, ...], directions, pool: Executor | None = None

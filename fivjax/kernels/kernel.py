@@ -1,17 +1,20 @@
 """Kernels built from code of JAX functions (`code`), and how they are launched."""
 
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Executor
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..foundation.argument_forms import Form
 from ..foundation.blocks import workers
 from ..foundation.kept_programs import kept_value
 from .code import text, written
 from .lane_functions import AT_A_TIME, LaneFunction
-from .warp_library import gpus_for
+from .warp_library import gpus_for, warp
 from .xla_calls import Places
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
@@ -28,7 +31,20 @@ SIZES = ("numbers", "step", "count")
 # Where trajectories share numbers in groups: where these are, and the group of each; they are told the length of a group's row.
 OF_GROUPS = ("shared", "groups")
 _SHARED = "const double* shared = (const double*)shared_ + (long long)each_ * ((const int*)groups_)[lane];\n"
+
 _NO_DOTS = np.zeros((1, 1, 1))
+
+
+class Groups(NamedTuple):
+    """Numbers that trajectories share in groups."""
+
+    table: Float[np.ndarray, "groups numbers"]
+    of_lane: Int[np.ndarray, " lanes"]  # the row of each trajectory
+
+    @classmethod
+    def of(cls, table, of_lane) -> "Groups":
+        """These arrays as a kernel reads them."""
+        return cls(np.ascontiguousarray(table, float), np.ascontiguousarray(of_lane, np.int32))
 
 
 def width_for(directions: int, numbers: int) -> int:
@@ -50,33 +66,48 @@ class Kernel:
         self.traced_results = jax.jit(self.results)
         self.of_lanes = LaneFunction(body, [f"{name}_" for name in places], [f"{name}_" for name in sizes])
 
-    def launched(self, given, instants, dots=None, pool: Executor | None = None, groups: tuple | None = None):
-        """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both. `groups` are
-        the rows of numbers that are shared, and which of these each trajectory has.
+    def launched(
+        self,
+        given,
+        instants,
+        dots=None,
+        pool: Executor | None = None,
+        groups: Groups | None = None,
+        on_gpus: bool = True,
+    ):
+        """What the kernel finds for each row of numbers: values at the end and in rows, and the tangents of both. Many go to
+        GPUs, where there are any, unless that is not wanted.
         """
         # Tangents that do not depend on what is perturbed are not written: they are zero.
         found = tuple(np.zeros(shape) for shape in self.shapes(given.shape[:-1], instants.shape[-1]))
         rows = [np.ascontiguousarray(part) for part in (given, _NO_DOTS if dots is None else dots, instants)]
         # Several tangents side by side are a type of the compiler for CPUs.
-        if groups is None and self.width <= 1 and (devices := gpus_for(len(given))):
-
-            def told(_, arrays) -> list[int]:
-                return _told([(array.ptr or 0, array.shape) for array in arrays])
-
-            self.of_lanes.on_gpus(devices, rows, found, told)
+        if on_gpus and self.width <= 1 and (devices := gpus_for(len(given))):
+            self._launch_on(devices, rows, found, groups)
         else:
             self.launch([(array.ctypes.data, array.shape) for array in (*rows, *found)], pool, groups)
         return found
 
-    def launch(self, places: Places, pool: Executor | None = None, groups: tuple | None = None) -> None:
+    def _launch_on(self, devices: Sequence[str], rows: list[np.ndarray], found, groups: Groups | None) -> None:
+        tables = []  # one on each device, until kernels have ended
+
+        def told(device: str, arrays) -> list[int]:
+            places, shared = [(array.ptr or 0, array.shape) for array in arrays], []
+            if groups is not None:
+                tables.append(warp().array(groups.table, device=device))
+                shared = [(tables[-1].ptr, tables[-1].shape), places.pop(len(rows))]
+            return _told(places, shared)
+
+        of_lanes = [] if groups is None else [groups.of_lane]
+        self.of_lanes.on_gpus(devices, [*rows, *of_lanes], found, told)
+
+    def launch(self, places: Places, pool: Executor | None = None, groups: Groups | None = None) -> None:
         """The same on the CPU for arrays at these places, in as many threads as there are cores."""
-        lanes, told = places[len(GIVEN)][1][0], _told(places)
-        if groups is not None:
-            table, group = np.ascontiguousarray(groups[0], float), np.ascontiguousarray(groups[1], np.int32)
-            told[len(places) : len(places)] = table.ctypes.data, group.ctypes.data
-            told.append(table.shape[1])
+        lanes = places[len(GIVEN)][1][0]
+        shared = [] if groups is None else [(array.ctypes.data, array.shape) for array in groups]
         alone = lanes == 1 or (pool is None and lanes < LEAST_IN_THREADS)
-        self.of_lanes.in_parts(told, lanes, 1 if alone else min(lanes, AT_A_TIME * workers()), pool)
+        parts = 1 if alone else min(lanes, AT_A_TIME * workers())
+        self.of_lanes.in_parts(_told(places, shared), lanes, parts, pool)
 
     def shapes(self, batch: tuple[int, ...], count: int) -> tuple[tuple[int, ...], ...]:
         """Those of what is found, for a batch of trajectories with so many instants."""
@@ -109,10 +140,11 @@ class Kernel:
         return tuple(map(jax.tree.unflatten, self.text.structures, parts))
 
 
-def _told(places: Places) -> list[int]:
-    """What a kernel is told of arrays at these places: where they are, and `SIZES`."""
+def _told(places: Places, shared: Places) -> list[int]:
+    """What a kernel is told of arrays at these places, and of `Groups`: where they are, and `SIZES`."""
     (_, (_, numbers)), _, (_, (rows, count)) = places[: len(GIVEN)]
-    return [*(address for address, _ in places), numbers, 0 if rows == 1 else count, count]
+    addresses = [address for address, _ in (*places, *shared)]
+    return [*addresses, numbers, 0 if rows == 1 else count, count, *(shape[1] for _, shape in shared[:1])]
 
 
 _KERNELS: dict = {}

@@ -107,7 +107,9 @@ def gpus() -> list[str]:
     """The GPUs that kernels run on: all of them, or none where JAX is told to use the CPU only."""
     if jax.config.jax_platforms == "cpu" or not has_driver():
         return []
-    return [device.alias for device in warp().get_cuda_devices()]
+    with ONE_AT_A_TIME:
+        # A device that one thread has begun to make ready has no stream yet for another.
+        return [device.alias for device in warp().get_cuda_devices() if device.context]
 
 
 def gpus_for(trajectories: int) -> list[str]:

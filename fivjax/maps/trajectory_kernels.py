@@ -12,7 +12,7 @@ from ..foundation.carried import depending_on
 from ..foundation.complex_pairs import in_pairs
 from ..foundation.flattened import Flattened, flatten
 from ..kernels.functions import KernelFunction
-from ..kernels.kernel import kernel_of
+from ..kernels.kernel import Groups, kernel_of
 from ..model.scene import Scene
 from ..section.by_kernel import in_parts, numbers_in_rows
 from ..steppers.base import AbstractStepper
@@ -89,7 +89,7 @@ class TrajectoryKernels:
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further by series, in place."""
         columns, now = trajectories.tree
-        after = self._of_each(_follow, group, (columns, now, np.full(len(group), steps, np.int32)))
+        after = self._of_each(_follow, group, (columns, now, np.full(len(group), steps, np.int32)), on_gpus=True)
         trajectories.numbers[:, columns.shape[-1] :] = numbers_in_rows(after)
 
     def conclude(
@@ -109,11 +109,12 @@ class TrajectoryKernels:
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
         return Form.of((self.of_task, self.first, *first))[0]
 
-    def _of_each(self, function: KernelFunction, group: np.ndarray, own: tuple):
-        """The results of a kernel for each trajectory, of its group's data and its own."""
-        form, given = self._form(own), numbers_in_rows(own)
-        parts = [
-            function.of_groups(form, self.shared, self.table, group[rows], given[rows], self.pool)[0]
-            for rows in in_parts(len(group), 8 * given.shape[1])
-        ]
+    def _of_each(self, function: KernelFunction, group: np.ndarray, own: tuple, on_gpus: bool = False):
+        """The results of a kernel for each trajectory, of its group's data and its own. What takes few steps is over on a CPU
+        before another kernel is compiled.
+        """
+        form, given, parts = self._form(own), numbers_in_rows(own), []
+        for rows in in_parts(len(group), 8 * given.shape[1]):
+            groups = Groups.of(self.table, group[rows])
+            parts.append(function.of_groups(form, self.shared, groups, given[rows], self.pool, on_gpus)[0])
         return jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]

@@ -268,9 +268,15 @@ def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
 
 
 @pytest.mark.slow
-def test_maps_and_motions_on_devices_are_those_of_threads(paper_scene, monkeypatch):
-    """Two stand-ins, each with its part of the lanes: Warp's own kernels on the CPU, with arrays of Warp's."""
+@pytest.mark.parametrize("falls", [False, True])
+def test_maps_and_motions_on_devices_are_those_of_threads(paper_scene, monkeypatch, falls):
+    """Two stand-ins, each with its part of the lanes: Warp's own kernels on the CPU, with arrays of Warp's. Under falling friction
+    trajectories have a kernel that reads the data of their group.
+    """
     scene, axes = paper_scene.replace(belt_speed=1.0), dict(mu=[0.19, 0.227], p=np.linspace(1.0, 4.0, 5))
+    if falls:
+        scene = fj.Scene(scene.structure, fj.ExponentialDecay(0.227, 0.15, 0.5), 1.0, scene.load)
+        axes = dict(mu_static=[0.16, 0.227], p=axes["p"])
     run = jax.vmap(lambda p: fj.simulate(scene.replace(p=p), 0.2, 0.02).velocity)
     with jax.enable_x64(True):
         expected = fj.bistability_map(scene, **axes, progress=False), run(jnp.asarray(axes["p"]))
