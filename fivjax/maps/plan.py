@@ -188,8 +188,10 @@ def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
 
 
 # The most trajectories of a job, with `Propagation` and with other steppers: a second or two of work, because an interrupt
-# loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs.
+# loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs. A long run has
+# jobs that are up to so many times as large, while there are so many of them: to follow more at once takes less of Python.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
+TIMES_AS_LARGE, JOBS = 8, 8
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
 GROUPS_IN_A_JOB = 512
 
@@ -216,7 +218,8 @@ def plan_of(
     followed = method if limits.energy else in_bulk(method, scene)
     of_group = trajectories.total / trajectories.group_count
     each = bytes_per_trajectory(scene, of_group)
-    jobs = trajectories.jobs(places, in_a_job(followed, each, of_group))
+    count = trajectories.total if places is None else len(places)
+    jobs = trajectories.jobs(places, in_a_job(followed, each, of_group, count))
     counts, later = np.zeros(trajectories.group_count, np.int64), []
     for number, own in enumerate(jobs):
         groups, here = np.unique(trajectories.groups(own), return_counts=True)
@@ -246,8 +249,11 @@ def plan_of(
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def in_a_job(method: AbstractStepper | Propagation, each: float, of_group: float) -> int:
-    """The most trajectories of a job, if each takes `each` bytes and so many, on average, are of one group."""
+def in_a_job(method: AbstractStepper | Propagation, each: float, of_group: float, count: int) -> int:
+    """The most trajectories of a job, of so many in the run, if each takes `each` bytes and so many, on average, are of one
+    group.
+    """
     by_time = IN_A_JOB if isinstance(method, Propagation) else IN_A_LONG_JOB
+    times = min(max(count // (JOBS * by_time), 1), TIMES_AS_LARGE)
     memory = 2.5e8  # of a job, bytes: trajectories in small groups take much
-    return max(1, min(by_time, int(memory // each), int(GROUPS_IN_A_JOB * of_group)))
+    return max(1, min(by_time * times, int(memory // each), int(GROUPS_IN_A_JOB * of_group)))

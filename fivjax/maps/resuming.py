@@ -48,7 +48,8 @@ def keeper_at(
         return Checkpoint(path, run, grid.total, energy)
     of_group = grid.total / grid.group_count
     each = bytes_per_trajectory(scene, of_group)
-    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group))
+    # As a short run has them, so that who comes back to a store finds it as it was, however much is asked for.
+    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group, 1))
     return Store(path, run, grid, tile, energy)
 
 
