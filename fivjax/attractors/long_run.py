@@ -92,7 +92,9 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     chaotic, quiet = np.zeros((2, len(motions.group)), bool)
     if slides is not None:
         quiet = _slide_on(catalogue, run, attractor, slides)
-    rows = np.delete(np.arange(len(quiet)), [*np.flatnonzero(quiet), *attractor])
+    left = ~quiet
+    left[list(attractor)] = False
+    rows = np.flatnonzero(left)
     if len(rows):
         found = _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides)
         chaotic[rows], quiet[rows] = found.chaotic, found.without_events
@@ -104,8 +106,8 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
 def _slide_on(
     catalogue: Catalogue, run: _Underway, attractor: dict[int, Captor], slides: Slides
 ) -> Bool[np.ndarray, " m"]:
-    """Which of these motions slide for ever: while they have no events they are followed until that is certain, or they do not
-    move any more; or until they are captured, by an `attractor`.
+    """Which of these motions are certain to slide for ever: while they have no events they are followed until that is so, or
+    until they are captured, by an `attractor`.
     """
     maps, rows = catalogue.maps, np.arange(len(run.time))
     certain = np.zeros(len(rows), bool)
@@ -115,7 +117,7 @@ def _slide_on(
         if not len(rows):
             return rows
         motions = run.motions.rows(rows)
-        certain[rows] = ended = ~maps.moves(motions.group, motions.at.y) | slides(motions)
+        certain[rows] = ended = slides(motions)
         captured = catalogue.captures(motions, ~ended)
         attractor.update((int(rows[row]), one) for row, one in captured.items())
         ended[list(captured)] = True

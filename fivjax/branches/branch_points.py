@@ -5,9 +5,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex
 
+from ..attractors.closing import close_near
+from ..cycles.around import middle_of_longest, seen_around
+from ..section.crossings import Point as SectionPoint
+from ..section.return_maps import ReturnMaps
+from .multiple_shooting import phases_around
 from .pseudo_arclength import Curve, Family, Place, multipliers_of
 from .special_points import Special
-from .verification import Real, real_motion
+from .verification import Real, crossings_of, on_section, real_motion
+
+# Distances at which a branch goes on beyond what cannot be followed, as shares of the parameter's scale; and how much a cycle
+# may differ there in period and size, in these shares: else it is of another branch.
+BEYOND, LIKENESS = (1e-3, 3e-3, 1e-2), 1.0
 
 
 class Point(NamedTuple):
@@ -36,6 +45,45 @@ def seen(family: Family, curve: Curve, place: Place, special: Special | None = N
     """A point of the branch from a computed cycle, with the real motion that starts on it."""
     real = real_motion(family.at(place.parameter), family.stepper, place.phases)
     return Point(curve, place, real, multipliers_of(place.images), special)
+
+
+def point_through(family: Family, parameter: float, start: SectionPoint, period: float) -> Point | None:
+    """The point of a branch that is the cycle through a state; None at a special point, where its equations are singular."""
+    scene = family.at(parameter)
+    segments = seen_around(scene, family.stepper, start, period).segments
+    if np.any(segments.ended):
+        # The point on the section may be where an event ends: a landing can make the tangential velocity jump through zero.
+        segments = seen_around(scene, family.stepper, middle_of_longest(segments), period).segments
+    phases = phases_around(segments)
+    if phases is None:
+        return None
+    curve = Curve(family, phases)
+    place = curve.at_parameter(curve.unknowns(phases, parameter), parameter)
+    return None if place is None else seen(family, curve, place)
+
+
+def beyond(family: Family, last: Point, sense: float) -> Point | None:
+    """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter, closed on the
+    section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
+    """
+    at, phases = last.place.parameter, last.place.phases
+    start = None if last.real is None else on_section(family.at(at), family.stepper, phases, last.real)
+    crossings = None if start is None else crossings_of(ReturnMaps.of(family.at(at)), start)
+    if start is None or crossings is None:
+        return None
+    for share in BEYOND:
+        parameter = at + sense * share * family.scale
+        closed = close_near(ReturnMaps.of(family.at(parameter)), start, crossings)
+        found = None if closed is None else point_through(family, parameter, closed.point, closed.period)
+        if found is not None and found.is_real and _are_alike(last, found, LIKENESS * share):
+            return found
+    return None
+
+
+def _are_alike(one: Point, other: Point, share: float) -> bool:
+    periods = one.place.phases.period, other.place.phases.period
+    sizes = [np.max(np.linalg.norm(at.curve.weights * at.place.phases.y, axis=1)) for at in (one, other)]
+    return all(abs(b / a - 1) <= share for a, b in (periods, sizes))
 
 
 def is_real(family: Family, place: Place) -> bool:

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..attractors.closing import closed_at
 from ..contact import Contact, Status
-from ..cycles.around import middle_of_longest, seen_around
 from ..cycles.cycle import MARGIN, LimitCycle, limit_cycle_of, point_of, under_final_load
 from ..cycles.own_coordinates import cycle_in_own_coordinates, in_own_coordinates
 from ..cycles.saddle import saddle_cycle
@@ -32,10 +31,10 @@ from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
 from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
-from .branch_points import Point, seen
+from .branch_points import Point, point_through
 from .following import follow_branch
-from .multiple_shooting import Mode, Phases, parameter_direction, phases_around
-from .pseudo_arclength import Curve, Family
+from .multiple_shooting import Mode, Phases, parameter_direction
+from .pseudo_arclength import Family
 from .special_derivatives import derivatives_of_special_points
 from .special_points import MEETS_SLIDING, SMOOTH
 from .verification import crossings_of, on_section
@@ -124,21 +123,12 @@ def continue_cycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
             f"cycle is periodic, or give a `LimitCycle` as `start`."
         )
-    stepper = EventExact()
-    segments = seen_around(final, stepper, point_of(cycle), cycle.period).segments
-    if np.any(segments.ended):
-        # The point on the section may be where an event ends: a landing can make the tangential velocity jump through zero.
-        segments = seen_around(final, stepper, middle_of_longest(segments), cycle.period).segments
-    phases = phases_around(segments)
-    assert phases is not None
-    family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, stepper)
-    curve = Curve(family, phases)
-    place = curve.at_parameter(curve.unknowns(phases, value), value)
-    if place is None:
+    family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, EventExact())
+    first = point_through(family, value, point_of(cycle), cycle.period)
+    if first is None:
         raise NoLimitCycle(
             "The cycle to start from lies at a special point, where its equations are singular. Start a little beside it."
         )
-    first = seen(family, curve, place)
     down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
     along = [*reversed(down.points), first, *up.points]
     if derivatives:

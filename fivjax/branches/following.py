@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..foundation.progress import stage
-from .branch_points import Point, seen
+from .branch_points import Point, beyond, seen
 from .meeting_sliding import where_sliding_is_met
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
@@ -61,9 +61,12 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
                 # The parameter may turn back just there.
                 passed = _specials(family, curve, here.place, tangent, special.place)
                 points += [one for one in passed if np.linalg.norm(one.place.u - special.place.u) > 1e-6]
-            points.append(seen(family, special.curve, special.place, special))
+            at_change = seen(family, special.curve, special.place, special)
+            if onward is not None or at_change.real is not None:
+                points.append(at_change)
+            onward = onward or _over_a_gap(family, points, start, bounds)
             if onward is None:
-                return Followed(points, _at(family, points[-1], f"{special.name}: no cycle was found to go on beyond"))
+                return Followed(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
             continue
         passed = _specials(family, curve, here.place, tangent, following)
@@ -72,8 +75,13 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             return _to_bound(family, points, here, following.u - here.place.u, following, bounds)
         if (turned_at := _met_before(points, last)) is not None:
             # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
-            why = "the branch would come back on itself, and nothing else was found to go on"
-            return Followed(points[: turned_at + 1], _at(family, points[turned_at], why))
+            points = points[: turned_at + 1]
+            onward = _over_a_gap(family, points, start, bounds)
+            if onward is None:
+                why = "the branch would come back on itself, and nothing else was found to go on"
+                return Followed(points, _at(family, points[-1], why))
+            here, tangent, step = onward
+            continue
         points.append(last)
         if _smallness(curve, following) < SMALL:
             end = where_sliding_is_met(family, last)
@@ -139,6 +147,23 @@ def _specials(family: Family, curve: Curve, a: Place, tangent, b: Place) -> list
     return [seen(family, curve, special.place, special) for special in between(curve, a, tangent, b)]
 
 
+def _over_a_gap(family: Family, points: list[Point], start: Point, bounds: tuple[float, float]):
+    """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The parameter
+    may turn back there, but not to where the branch has come from.
+    """
+    before, last = [start, start, *points][-2:]
+    onwards = 1.0 if last.place.parameter >= before.place.parameter else -1.0
+    for sense in (onwards, -onwards):
+        found = beyond(family, last, sense)
+        if found is None or not bounds[0] <= found.place.parameter <= bounds[1]:
+            continue
+        if _met_before([start, *points, found], found) is None:
+            points.append(found)
+            tangent = found.curve.tangent(found.place, None)
+            return found, tangent * np.sign(sense * tangent[-1]), FIRST
+    return None
+
+
 def _smallness(curve: Curve, place: Place) -> float:
     """The size of a cycle of pure sliding, relative to its size where the curve began; other cycles end before they are
     small.
@@ -153,7 +178,7 @@ def _met_before(points: list[Point], last: Point) -> int | None:
         return None
     parameters = np.array([point.place.parameter for point in points])
     value, period = last.place.parameter, last.place.phases.period
-    for k in np.flatnonzero((parameters[:-1] - value) * (parameters[1:] - value) <= 0)[:-1]:
+    for k in np.flatnonzero((parameters[:-2] - value) * (parameters[1:-1] - value) <= 0):
         near = points[k]
         # Between these two points, or nearly so: elsewhere the cycle need not be computed.
         one, other = near.place.phases.period, points[k + 1].place.phases.period

@@ -224,7 +224,9 @@ def _descended(scene: Scene, p: float, duration: float, shortest: float, longest
             break
         slope = here.d_p["duration"]
         d = float(np.clip(duration - np.sign(slope) * step, max(shortest, 1e-6), longest))
-        following = critical(d, here.p + slope * (d - duration)) if d != duration else None
+        # A tangent may lead to no kick at all; near a guess that is too far off nothing is found, and the step is shortened.
+        guess = max(here.p + slope * (d - duration), 1 + 0.25 * (here.p - 1))
+        following = critical(d, guess) if d != duration else None
         if following is None or following.p >= here.p:
             step *= 0.25
             if step < 1e-9 * longest:

@@ -128,6 +128,39 @@ def test_a_branch_goes_on_where_the_number_of_rebounds_before_rest_changes():
         np.testing.assert_allclose(run.q[-1], q, atol=1e-6 * np.max(np.abs(q)))
 
 
+def test_a_branch_goes_on_over_a_gap_where_a_rebound_grazes():
+    """With one rebound fewer the cycle is stable again: the parameter turns back at a fold, and again where the gap grazes zero."""
+    mass, load = np.diag([0.61, 0.1166, 0.1462, 0.8851]), [0.0, -0.5, 0.0, -1.0]
+    damping = [[0.704, 0, -0.0264, 0], [0, 0.161, 0, 0.0309], [-0.0264, 0, 0.168, -0.0582], [0, 0.0309, -0.0582, 0.922]]
+    stiffness = [[215468.0, 0, -10716, 0], [0, 51807, 0, 12538], [-10716, 0, 51406, -23596], [0, 12538, -23596, 271897]]
+    structure = fj.Structure(mass, damping, stiffness, load, tangential=0, normal=3)
+    scene = fj.Scene(structure, fj.Coulomb(0.467), 0.7095, fj.ConstantLoad(44.6), restitution=0.326)
+    branch = fj.continue_cycle(scene, "restitution", (0.326, 0.33), start=fj.limit_cycle(scene))
+    assert branch.ends == "The bound restitution = 0.33 is reached."
+    fold, back = (int(np.flatnonzero(branch.special == name)[0]) for name in ("fold", "grazing of the gap"))
+    at = branch.parameter.values
+    assert fold < back and at[back] < at[fold] and np.all(np.diff(at[: fold + 1]) >= 0)
+    rebounds = [word.count("detach") for word in branch.word.values]
+    assert rebounds[-1] == rebounds[0] - 1 and branch.stable[-1]
+    for i in (0, fold - 3, (fold + back) // 2, back + 1, len(at) - 1):
+        model = oracle.Model(
+            mass,
+            np.array(damping),
+            np.array(stiffness),
+            np.array(load),
+            0,
+            3,
+            oracle.Constant(0.467),
+            0.7095,
+            oracle.Load(44.6),
+            restitution=float(at[i]),
+        )
+        q, v = np.split(branch.state.values[i], 2)
+        run = oracle.propagate(model, float(branch.period[i]), y0=(q, v))
+        np.testing.assert_allclose(run.v[-1], v, atol=1e-5 * float(branch.amplitude[i]))
+        np.testing.assert_allclose(run.q[-1], q, atol=1e-5 * np.max(np.abs(q)))
+
+
 @pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
 def test_no_cycle_is_born_below_the_fold(branch):
     """An independent solver started on the fold's cycle: 1e-4 above it goes on for ever, 1e-4 below it fades."""
