@@ -148,8 +148,8 @@ def _specials(family: Family, curve: Curve, a: Place, tangent, b: Place) -> list
 
 
 def _over_a_gap(family: Family, points: list[Point], start: Point, bounds: tuple[float, float]):
-    """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The parameter
-    may turn back there, but not to where the branch has come from.
+    """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The
+    parameter may turn back there, but not to where the branch has come from.
     """
     before, last = [start, start, *points][-2:]
     onwards = 1.0 if last.place.parameter >= before.place.parameter else -1.0

@@ -135,7 +135,7 @@ def raise_critical_perturbation(
         return _Step(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
 
     here = first = at(np.zeros(len(names)))
-    if not np.all(np.isfinite([here.p, *here.slopes])):
+    if not here.is_known:
         raise ValueError(
             f"The scene has no critical kick with derivatives to start from: {here.why or 'a derivative does not exist'}. "
             "Change `p_range`, or the scene."
@@ -170,10 +170,10 @@ def raise_critical_perturbation(
             allowed = max(
                 (1 - KEPT * share * abs(promised) / max(missing, MET * target)) * missing, NEAR * by * first.p
             )
-            if np.all(np.isfinite([tried.p, *tried.slopes])) and abs(aim - tried.p) <= allowed:
+            if tried.is_known and abs(aim - tried.p) <= allowed:
                 following = tried
                 break
-            why = tried.why
+            why = tried.why or ("" if tried.is_known else "p_crit or one of its derivatives is not known")
             share *= 0.5
         if following is None:
             break
@@ -190,6 +190,11 @@ class _Step(NamedTuple):
     slopes: np.ndarray  # derivatives of p by r
     bracket: tuple[float, float]
     why: str  # why there is no p_crit with derivatives, if there is none
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there are a p_crit and its derivatives."""
+        return bool(np.all(np.isfinite([self.p, *self.slopes])))
 
 
 def _bracket(found) -> tuple[float, float]:
@@ -209,7 +214,11 @@ def _concluded(scene, first, last, target, names, start, taken, why, p_range, p_
         outcome, why = DesignOutcome.TARGET_REACHED, ""
     else:
         outcome = DesignOutcome.TARGET_NOT_REACHED
-        beyond = f"beyond, {why}" if why else "p_crit rises no further there, or more steps are needed"
+        beyond = (
+            f"beyond, {why}"
+            if why
+            else "p_crit rises less there than its derivatives promise, or more steps are needed"
+        )
         why = f"The search ended before the target: {beyond}. Widen `bounds`, or free other parameters."
     return RaisedCriticalKick(
         last.scene, first.p, last.p, target, first.bracket, (low, high), changes, outcome, why, taken

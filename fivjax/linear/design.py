@@ -33,7 +33,7 @@ class DesignOutcome(enum.StrEnum):
     """The outcome of a design."""
 
     TARGET_REACHED = "target reached"
-    TARGET_NOT_REACHED = "target not reached within the bounds"
+    TARGET_NOT_REACHED = "target not reached"
     IMPROVED = "improved"
     NOT_IMPROVED = "not improved"
 
