@@ -89,3 +89,17 @@ def test_near_a_hopf_point_verdicts_are_those_of_long_runs(near_hopf, share):
     late = followed["decided_at"].values > 500.0
     assert np.any(late)
     np.testing.assert_allclose(found["decided_at"].values[late], followed["decided_at"].values[late], rtol=0.3)
+
+
+@pytest.mark.slow
+def test_kicks_that_are_hardly_any_are_decided_where_sliding_grows_slowly():
+    """Below the size at which a motion counts as faded: it grows by 0.099 1/s, for a hundred seconds and more."""
+    friction = fj.ExponentialDecay(0.17, 0.14760887, 1.0)
+    scene = fj.Scene(fj.belt_oscillator(), friction, 1.0, fj.Pulse(100.0, p=1.2))
+    kicks = 1 + np.array([1e-9, 1e-8, 1e-7, 0.5])
+    m = fj.bistability_map(scene, p=kicks, progress=False)
+    assert np.all(m.verdict == fj.Verdict.LIMIT_CYCLE)
+    np.testing.assert_allclose(m.amplitude, m.amplitude[-1], rtol=1e-9)
+    growth = float(np.max(np.real(fj.cea.eigenvalues(scene))))
+    # No sooner than such a kick has grown to a ten-thousandth of one that doubles the load.
+    assert np.all(m.decided_at > np.log(1e-4 / (kicks - 1)) / growth)

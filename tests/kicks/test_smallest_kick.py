@@ -115,3 +115,34 @@ def test_the_independent_solver_agrees_on_both_sides_of_the_smallest_state():
         z = share * (found.values - rest)
         scenes.append({**reference.paper_scene(belt_speed=1.0), "deviation": (z[:3], z[3:])})
     assert list(reference.fate(scenes).fate) == ["slides", "sustained"]
+
+
+@pytest.mark.slow
+def test_where_the_tangent_leads_to_a_negative_kick_the_step_is_shortened():
+    """p_crit falls so steeply with the duration that a step along its tangent would end at no load at all."""
+    structure = fj.Structure(
+        np.diag([0.12698, 0.45353, 0.76419, 0.80993]),
+        [
+            [1.35384, -0.20822, -0.1424, 0.12326],
+            [-0.20822, 4.31883, 0, -0.57876],
+            [-0.1424, 0, 2.67399, 0],
+            [0.12326, -0.57876, 0, 4.79159],
+        ],
+        [
+            [101827, -16793, -11485, 9941],
+            [-16793, 322026, 0, -46679],
+            [-11485, 0, 171348, 0],
+            [9941, -46679, 0, 339486],
+        ],
+        [0.0, -0.5, 0.0, -1.0],
+        tangential=0,
+        normal=3,
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.417876), 0.76466, fj.Pulse(190.79, p=1.5, duration=0.0443916))
+    found = fj.smallest_kick(scene)
+    assert 1 < found.certified < found.p < 5
+    low, high = (
+        fj.bistability_map(scene.replace(duration=found.duration), p=[p], progress=False)
+        for p in (found.proved_low, found.proved_high)
+    )
+    assert low.verdict.item() == fj.Verdict.SLIDING and high.verdict.item() == fj.Verdict.LIMIT_CYCLE
