@@ -3,7 +3,8 @@ memory.
 
     python -m benchmarks.executors [overhead] [killed] [killed_dask] [size]
 
-`FIVJAX_POINTS` (default 320) squared is the number of trajectories of the large map, an eighth of it values of μ. Set
+`FIVJAX_POINTS` (default 320) squared is the number of trajectories of the large map, an eighth of it values of μ, and
+`FIVJAX_WORKERS` (default 2) that of processes. Set
 `JAX_COMPILATION_CACHE_DIR` to a folder: every worker is a new process.
 
 A line an executor: seconds, and the same as a share of those of threads in turn with it; after kills, cells lost and chunks written
@@ -31,7 +32,7 @@ import fivjax as fj
 from fivjax.maps.store import Store
 
 POINTS = int(os.environ.get("FIVJAX_POINTS", "320"))
-KILLS, EVERY, WORKERS = 20, 2.0, 2
+KILLS, EVERY, WORKERS = 20, 2.0, int(os.environ.get("FIVJAX_WORKERS", "2"))
 
 
 def the_map(points: int, **options):

@@ -22,6 +22,8 @@ STRAIGHT = 0.99
 # Cycles of one parameter whose periods and sizes differ by no more than this share are the same, but for rebounds that are none
 # to speak of.
 SAME = 1e-7
+# Gaps that a branch goes over: beyond one it may come back on itself, again and again.
+MOST_GAPS = 16
 # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
 SMALL = 0.02
 
@@ -38,7 +40,13 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
     here, tangent = start, start.curve.tangent(start.place, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
     points: list[Point] = []
-    step = FIRST
+    step, gaps = FIRST, 0
+
+    def over_a_gap():
+        nonlocal gaps
+        gaps += 1
+        return _over_a_gap(family, points, start, sense, bounds) if gaps <= MOST_GAPS else None
+
     while len(points) < most:
         stage(f"following, {len(points)} cycles so far")
         curve = here.curve
@@ -64,7 +72,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
             at_change = seen(family, special.curve, special.place, special)
             if onward is not None or at_change.real is not None:
                 points.append(at_change)
-            onward = onward or _over_a_gap(family, points, start, bounds)
+            onward = onward or over_a_gap()
             if onward is None:
                 return Followed(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
@@ -76,7 +84,7 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
         if (turned_at := _met_before(points, last)) is not None:
             # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
             points = points[: turned_at + 1]
-            onward = _over_a_gap(family, points, start, bounds)
+            onward = over_a_gap()
             if onward is None:
                 why = "the branch would come back on itself, and nothing else was found to go on"
                 return Followed(points, _at(family, points[-1], why))
@@ -147,20 +155,20 @@ def _specials(family: Family, curve: Curve, a: Place, tangent, b: Place) -> list
     return [seen(family, curve, special.place, special) for special in between(curve, a, tangent, b)]
 
 
-def _over_a_gap(family: Family, points: list[Point], start: Point, bounds: tuple[float, float]):
+def _over_a_gap(family: Family, points: list[Point], start: Point, sense: float, bounds: tuple[float, float]):
     """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The
     parameter may turn back there, but not to where the branch has come from.
     """
     before, last = [start, start, *points][-2:]
-    onwards = 1.0 if last.place.parameter >= before.place.parameter else -1.0
-    for sense in (onwards, -onwards):
-        found = beyond(family, last, sense)
+    onwards = np.sign(last.place.parameter - before.place.parameter) if points else sense
+    for way in (onwards, -onwards) if points else (sense,):
+        found = beyond(family, last, way)
         if found is None or not bounds[0] <= found.place.parameter <= bounds[1]:
             continue
         if _met_before([start, *points, found], found) is None:
             points.append(found)
             tangent = found.curve.tangent(found.place, None)
-            return found, tangent * np.sign(sense * tangent[-1]), FIRST
+            return found, tangent * np.sign(way * tangent[-1]), FIRST
     return None
 
 

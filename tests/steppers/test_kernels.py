@@ -259,7 +259,7 @@ def test_a_worker_without_warp_is_told_what_it_lacks(monkeypatch):
 
 def test_kernels_stay_on_the_cpu_where_jax_does(monkeypatch):
     monkeypatch.setattr(warp_library, "has_driver", lambda: True)
-    monkeypatch.setattr(warp(), "get_cuda_devices", lambda: [type("Device", (), {"alias": "cuda:0"})()])
+    monkeypatch.setattr(warp(), "get_cuda_devices", lambda: [type("Device", (), {"alias": "cuda:0", "context": 1})()])
     assert gpus_for(LEAST_ON_GPUS) == ["cuda:0"] or jax.config.jax_platforms == "cpu"
     assert gpus_for(LEAST_ON_GPUS - 1) == []
     with monkeypatch.context() as patch:
