@@ -61,7 +61,9 @@ def continue_cycle(
         branch = fj.continue_cycle(scene, "mu", (0.02, 0.3))
         unstable = fj.continue_cycle(scene, "mu", (0.02, 0.3), start=fj.saddle_cycle(scene))
 
-    The branch is followed both ways from the start, past folds, through stable and unstable cycles.
+    The branch is followed both ways from the start, past folds, through stable and unstable cycles. Where the next ones
+    cannot be followed, because a rebound grazes or a chain of them no longer rests, it goes on up to a hundredth of the bounds'
+    distance further, if the cycle there has nearly the same period and size.
 
     **Arguments:**
 

@@ -160,7 +160,7 @@ def _over_a_gap(family: Family, points: list[Point], start: Point, sense: float,
     parameter may turn back there, but not to where the branch has come from.
     """
     before, last = [start, start, *points][-2:]
-    onwards = np.sign(last.place.parameter - before.place.parameter) if points else sense
+    onwards = np.sign(last.place.parameter - before.place.parameter) or sense
     for way in (onwards, -onwards) if points else (sense,):
         found = beyond(family, last, way)
         if found is None or not bounds[0] <= found.place.parameter <= bounds[1]:
