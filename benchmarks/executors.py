@@ -4,8 +4,7 @@ memory.
     python -m benchmarks.executors [overhead] [killed] [killed_dask] [size]
 
 `FIVJAX_POINTS` (default 320) squared is the number of trajectories of the large map, an eighth of it values of μ, and
-`FIVJAX_WORKERS` (default 2) that of processes. Set
-`JAX_COMPILATION_CACHE_DIR` to a folder: every worker is a new process.
+`FIVJAX_WORKERS` (default 2) that of processes. Set `JAX_COMPILATION_CACHE_DIR` to a folder: every worker is a new process.
 
 A line an executor: seconds, and the same as a share of those of threads in turn with it; after kills, cells lost and chunks written
 twice. All bits should be the same, nothing lost, nothing twice.

@@ -87,9 +87,10 @@ class _Underway(NamedTuple):
 
 def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
     """The same of motions that nothing has captured by now: those without events are most likely slow to fade."""
-    run = _Underway(motions, *np.zeros((2, len(motions.group))))
+    count = len(motions.group)
     attractor: dict[int, Captor] = {}
-    chaotic, quiet = np.zeros((2, len(motions.group)), bool)
+    run = _Underway(motions, np.zeros(count), np.zeros(count, int))
+    chaotic, quiet = np.zeros((2, count), bool)
     if slides is not None:
         quiet = _slide_on(catalogue, run, attractor, slides)
     left = ~quiet
@@ -100,7 +101,7 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
         chaotic[rows], quiet[rows] = found.chaotic, found.without_events
         run.move(rows, found.at, found.time, found.events)
         attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
-    return Fates(chaotic, attractor, quiet, run.motions.at, run.time, run.events.astype(int))
+    return Fates(chaotic, attractor, quiet, run.motions.at, run.time, run.events)
 
 
 def _slide_on(

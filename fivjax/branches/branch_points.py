@@ -14,9 +14,9 @@ from .pseudo_arclength import Curve, Family, Place, multipliers_of
 from .special_points import Special
 from .verification import Real, crossings_of, on_section, real_motion
 
-# Distances at which a branch goes on beyond what cannot be followed, as shares of the parameter's scale; and how much a cycle
-# may differ there in period and size, in these shares: else it is of another branch.
-BEYOND, LIKENESS = (1e-3, 3e-3, 1e-2), 1.0
+# Distances at which a branch goes on beyond what cannot be followed, as shares of the parameter's scale. A cycle that differs
+# in period or size by a larger share is of another branch.
+BEYOND = (1e-3, 3e-3, 1e-2)
 
 
 class Point(NamedTuple):
@@ -66,23 +66,23 @@ def beyond(family: Family, last: Point, sense: float) -> Point | None:
     """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter, closed on the
     section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
     """
-    at, phases = last.place.parameter, last.place.phases
-    start = None if last.real is None else on_section(family.at(at), family.stepper, phases, last.real)
-    crossings = None if start is None else crossings_of(ReturnMaps.of(family.at(at)), start)
+    at, phases, scene = last.place.parameter, last.place.phases, family.at(last.place.parameter)
+    start = None if last.real is None else on_section(scene, family.stepper, phases, last.real)
+    crossings = None if start is None else crossings_of(ReturnMaps.of(scene), start)
     if start is None or crossings is None:
         return None
     for share in BEYOND:
         parameter = at + sense * share * family.scale
         closed = close_near(ReturnMaps.of(family.at(parameter)), start, crossings)
         found = None if closed is None else point_through(family, parameter, closed.point, closed.period)
-        if found is not None and found.is_real and _are_alike(last, found, LIKENESS * share):
+        if found is not None and found.is_real and _are_alike(last, found, share):
             return found
     return None
 
 
 def _are_alike(one: Point, other: Point, share: float) -> bool:
     periods = one.place.phases.period, other.place.phases.period
-    sizes = [np.max(np.linalg.norm(at.curve.weights * at.place.phases.y, axis=1)) for at in (one, other)]
+    sizes = [at.place.phases.size(at.curve.weights) for at in (one, other)]
     return all(abs(b / a - 1) <= share for a, b in (periods, sizes))
 
 

@@ -195,7 +195,7 @@ def _met_before(points: list[Point], last: Point) -> int | None:
         before = near.curve.at_parameter(near.place.u, value)
         if before is None or abs(before.phases.period - period) > SAME * period:
             continue
-        size, own = (np.max(np.linalg.norm(near.curve.weights * at.phases.y, axis=1)) for at in (before, last.place))
+        size, own = (at.phases.size(near.curve.weights) for at in (before, last.place))
         if abs(size - own) <= 10 * SAME * size:
             return int(k + np.argmax(np.abs(parameters[k:] - value)))
     return None

@@ -61,6 +61,10 @@ class Phases(NamedTuple):
         """The sum of the durations, in s."""
         return float(np.sum(self.h))
 
+    def size(self, weights: Float[np.ndarray, " state"]) -> float:
+        """The largest weighted deviation at which a phase begins."""
+        return float(np.max(np.linalg.norm(weights * self.y, axis=-1)))
+
     def has_the_modes_of(self, other: "Phases") -> bool:
         """Whether both go through the same modes, but for the last rebounds of a chain, of which rounding tells the number."""
         # A rebound may be as long as one of these limits, but not as long as both.

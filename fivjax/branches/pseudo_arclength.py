@@ -55,7 +55,7 @@ class Curve:
         """`phases`: a cycle of these modes, or a guess of one; its size and period are the units of the unknowns."""
         self.family, self.modes = family, phases.modes
         self.weights = np.asarray(family.scene.structure.weights)
-        self.size = float(np.max(np.linalg.norm(self.weights * phases.y, axis=-1)))
+        self.size = phases.size(self.weights)
         self.time = phases.period
         self.of_state = np.tile(self.size / self.weights, len(self.modes))
         self.scales = np.concatenate([self.of_state, np.full(len(self.modes), self.time), [family.scale]])

@@ -137,7 +137,7 @@ def raise_critical_perturbation(
     here = first = at(np.zeros(len(names)))
     if not here.is_known:
         raise ValueError(
-            f"The scene has no critical kick with derivatives to start from: {here.why or 'a derivative does not exist'}. "
+            f"The scene has no critical kick with derivatives to start from: {here.why}. "
             "Change `p_range`, or the scene."
         )
     target = (1 + by) * first.p
@@ -173,7 +173,7 @@ def raise_critical_perturbation(
             if tried.is_known and abs(aim - tried.p) <= allowed:
                 following = tried
                 break
-            why = tried.why or ("" if tried.is_known else "p_crit or one of its derivatives is not known")
+            why = tried.why
             share *= 0.5
         if following is None:
             break
@@ -189,12 +189,17 @@ class _Step(NamedTuple):
     p: float
     slopes: np.ndarray  # derivatives of p by r
     bracket: tuple[float, float]
-    why: str  # why there is no p_crit with derivatives, if there is none
+    why_none: str  # why there is no derivative, as far as that is known
 
     @property
     def is_known(self) -> bool:
         """Whether there are a p_crit and its derivatives."""
         return bool(np.all(np.isfinite([self.p, *self.slopes])))
+
+    @property
+    def why(self) -> str:
+        """Why they are not there; empty if they are."""
+        return "" if self.is_known else self.why_none or "p_crit or one of its derivatives does not exist"
 
 
 def _bracket(found) -> tuple[float, float]:

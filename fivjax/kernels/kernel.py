@@ -31,7 +31,6 @@ SIZES = ("numbers", "step", "count")
 # Where trajectories share numbers in groups: where these are, and the group of each; they are told the length of a group's row.
 OF_GROUPS = ("shared", "groups")
 _SHARED = "const double* shared = (const double*)shared_ + (long long)each_ * ((const int*)groups_)[lane];\n"
-
 _NO_DOTS = np.zeros((1, 1, 1))
 
 
