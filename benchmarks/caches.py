@@ -149,7 +149,7 @@ def calibrations(folder: Path) -> None:
     table.write_text(recordings.sample(), encoding="utf-8")
     environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    fit = [sys.executable, "-m", "fivjax.cli", "calibrate", str(table), "--free", "mu", "c1", "k1", "--starts", "1"]
+    fit = [sys.executable, "-m", "fivjax", "calibrate", str(table), "--free", "mu", "c1", "k1", "--starts", "1"]
 
     def begun(name: str) -> subprocess.Popen:
         command = [*fit, "--overwrite", "--out", str(folder / name)]

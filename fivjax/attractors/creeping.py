@@ -1,4 +1,4 @@
-"""Motions that creep along a line of states, taken further by leaps.
+r"""Motions that creep along a line of states, taken further by leaps.
 
 Near a Hopf point, past a fold, or about a cycle that attracts or repels weakly, all but one deviation decays soon, and the one
 that is left changes by a millionth in each return. What the motion does is then read off its drift: it is moved on along it by
@@ -8,6 +8,11 @@ a small share of its size, is left to settle on the line again, and its drift is
 distance $a$ from the nearest one $|g'/g|$ is about $1/a$, or $2/a$ from the pair that is born in a fold. A leap is no longer
 than `TRUSTED` times $|g/g'|$, by the drifts at the two latest places, so it covers a part of that distance; and it counts only
 if the drift at its end has the same direction, nearly the same speed, and the same contact events.
+
+**Growth and decay about the equilibrium.** A motion without events that does nothing but grow, or decay, leaps in proportion to
+its size: from rounding to its first event there are thirty e-folds. What is said above then holds of $\ln x$ and of the rate
+$g/x$. That depends on the size by its powers, $γ_0 + γ_2 x^2 + γ_4 x^4 + …$: it changes the faster, the larger $x$ is, which
+`POWER` allows for.
 """
 
 from collections.abc import Callable
@@ -23,6 +28,13 @@ from .motions import Motions
 OVER = 48
 # A leap is this share of the motion's size at most.
 LONGEST_LEAP = 0.05
+# The longest leaps of motions that grow about the equilibrium, or decay to it, in e-folds. Those that decay soon slide for
+# ever, and are asked after each leap.
+LONGEST_GROWTH, LONGEST_DECAY = np.log(4.0), 0.2
+# A rate of growth changes with size no faster than this power of it.
+POWER = 4.0
+# Its other deviations are no larger beside it than before, so that it settles so many times sooner.
+SOONER = 8
 # Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
 LEAST_DRIFTS = 4.0
 # A leap over which the drift changes e-fold, by its two latest places, is too long: this part of it is trusted.
@@ -36,7 +48,9 @@ class _Drift(NamedTuple):
     way: Float[np.ndarray, "m 2n"]  # weighted
     time: Float[np.ndarray, " m"]  # that it took, s
     events: Int[np.ndarray, " m"]  # contact events on it
-    steady: Bool[np.ndarray, " m"]  # whether it was the same over as many returns before
+    passed: Float[np.ndarray, " m"]  # the time of these and of as many returns before, s
+    met: Int[np.ndarray, " m"]  # and all events
+    steady: Bool[np.ndarray, " m"]  # whether the drift was the same before
 
     def rows(self, chosen) -> "_Drift":
         return _Drift(self.at.rows(chosen), *(part[chosen] for part in self[1:]))
@@ -61,28 +75,48 @@ def creep(
     time, events, creeps = np.zeros(len(group)), np.zeros(len(group), int), np.zeros(len(group), bool)
     share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), 128), np.zeros(len(group), int)
     rows, here = np.arange(len(group)), _measure_drift(maps, motions)
+    # Until they have been moved on: over the first drift.
+    unsaid = here.passed.copy(), here.met.copy()
     for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
         # A shorter drift is rounding.
-        going = here.steady & (length > 1e-11 * size) & (plainly[rows] < 48)
-        rows, here, length, size = rows[going], here.rows(going), length[going], size[going]
+        growth, grows = _growth(maps, here)
+        # What has faded is of interest only if it grows again.
+        lasts = maps.moves(group[rows], here.at.y) | (grows & (growth > 0))
+        going = here.steady & (length > 1e-11 * size) & (plainly[rows] < 48) & lasts
+        rows, here = rows[going], here.rows(going)
+        length, size, growth, grows = (part[going] for part in (length, size, growth, grows))
         if not len(rows):
             break
+        longest = np.where(grows, np.where(growth > 0, LONGEST_GROWTH, LONGEST_DECAY), LONGEST_LEAP)
         # The first leap is a short one, but worthwhile.
         first = np.clip(1.5 * LEAST_DRIFTS * length / size, 0.004, LONGEST_LEAP)
-        share[rows] = np.where(np.isnan(share[rows]), first, share[rows])
+        share[rows] = np.where(np.isnan(share[rows]), first, np.minimum(share[rows], longest))
         times = share[rows] * size / length
         plain = times < LEAST_DRIFTS
         times[plain] = 0.0
-        leapt = here.at._replace(y=here.at.y + times[:, None] * here.way / maps.weights)
-        settled = maps.returns(group[rows], leapt, np.where(plain, 512, settles[rows]))
+        moved = np.where(
+            grows[:, None], here.at.y * np.expm1(times * growth)[:, None], times[:, None] * here.way / maps.weights
+        )
+        leapt = here.at._replace(y=here.at.y + moved)
+        waits = np.where(grows, settles[rows] // SOONER, settles[rows])
+        settled = maps.returns(group[rows], leapt, np.where(plain, 512, waits))
         there = _measure_drift(maps, Motions(group[rows], settled.at))
+        growth_there, grows_there = _growth(maps, there)
         with np.errstate(divide="ignore", invalid="ignore"):
-            faster = np.linalg.norm(there.way, axis=1) / length
-            longer = np.fmin(np.minimum(2 * share[rows], LONGEST_LEAP), TRUSTED * share[rows] / np.abs(np.log(faster)))
+            faster = np.where(grows, growth_there / growth, np.linalg.norm(there.way, axis=1) / length)
+            change = np.abs(np.log(faster))
+            trusted = TRUSTED * share[rows] / change
+            of_power = np.log1p(TRUSTED * -np.expm1(-POWER * share[rows]) / change) / POWER
+            trusted = np.where(grows, np.minimum(trusted, of_power), trusted)
+            longer = np.fmin(np.minimum(2 * share[rows], longest), trusted)
             # As long as the mean of what both drifts say.
             skipped = 0.5 * times * (1 + 1 / faster)
-        kept = plain | (there.steady & _alike(here.way, there.way) & (there.events == here.events))
+        alike = np.where(grows, grows_there & (change <= np.log(1.5)), _alike(here.way, there.way))
+        # Nor has it come back to the line after something else.
+        expected = here.events * (waits / OVER)
+        alike &= np.abs(settled.events - expected) <= np.where(grows, 0.0, 2 + 0.05 * expected)
+        kept = plain | (there.steady & alike & (there.events == here.events))
         share[rows] = np.where(plain, np.nan, np.where(kept, longer, 0.5 * share[rows]))
         # What is left of other deviations is magnified by a leap, so the next drift shows whether the motion has settled.
         settles[rows] = np.where(kept, settles[rows], np.minimum(2 * settles[rows], 4096))
@@ -90,8 +124,10 @@ def creep(
         done = rows[kept]
         creeps[done] = True
         last.put(done, there.at.rows(kept))
-        time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.time)[kept]
-        events[done] += (times * here.events).astype(int)[kept] + settled.events[kept] + there.events[kept]
+        time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.passed)[kept] + unsaid[0][done]
+        events[done] += ((times * here.events).astype(int) + settled.events + there.met)[kept] + unsaid[1][done]
+        for one in unsaid:
+            one[done] = 0
         # From where they have got to; the others try a shorter leap.
         there.put(~kept, here.rows(~kept))
         left = ~kept
@@ -108,7 +144,18 @@ def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     end = maps.returns(group, middle.at, OVER)
     before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
     steady = _alike(before, way) & (middle.events == end.events)
-    return _Drift(end.at, way, end.time, end.events, steady)
+    passed, met = middle.time + end.time, middle.events + end.events
+    return _Drift(end.at, way, end.time, end.events, passed, met, steady)
+
+
+def _growth(maps: ReturnMaps, drift: _Drift) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """The logarithm of the growth of motions over a drift, and which are without events and do nothing but grow, or decay."""
+    end, way = maps.weights * drift.at.y, drift.way
+    middle, along = np.sum((end - way) ** 2, axis=1), np.sum(end * way, axis=1)
+    straight = np.abs(along) >= 0.99 * np.linalg.norm(end, axis=1) * np.linalg.norm(way, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        growth = 0.5 * np.log1p((2 * along - np.sum(way**2, axis=1)) / middle)
+    return growth, straight & (drift.events == 0)
 
 
 def _alike(one: Float[np.ndarray, "m 2n"], other: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:

@@ -56,10 +56,13 @@ def long_divergence(maps: ReturnMaps, motions: Motions, chaotic_from: float = PA
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
     for _ in range(MEASURED):
+        before = np.linalg.norm(maps.weights * at.y, axis=1)
         growth, taken, met, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
         events[running] += met
-        parted[running] += MEASURED_OVER * growth
+        # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parted[running] += MEASURED_OVER * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         last.put(running, at)
         # Not a number is neither.

@@ -181,9 +181,9 @@ def _creep(
 
     def arrived(rows, at: Section) -> Bool[np.ndarray, " r"]:
         motions = Motions(run.motions.group[asked_rows[rows]], at)
-        done = ~catalogue.maps.moves(motions.group, at.y)
+        done = np.zeros(len(rows), bool) if slides is None else slides(motions)
         done[list(catalogue.captures(motions, ~done))] = True
-        return done if slides is None else done | slides(motions)
+        return done
 
     creeping = np.zeros(len(asked), bool)
     if len(asked_rows):

@@ -56,8 +56,8 @@ def code_of(scene) -> dict[str, str]:
 
 def _of_law(law: AbstractFriction, speed):
     law = _rebuild(law)
-    own_series = type(law).next_term is not AbstractFriction.next_term
-    series = law.next_term([speed, speed, speed], [speed, speed]) if own_series else None
+    own_series = type(law).in_time is not AbstractFriction.in_time
+    series = law.in_time(speed, 2)([speed, speed, speed], [speed, speed]) if own_series else None
     # With the derivative: a law may define its own.
     return law.static, jax.jvp(law, (speed,), (jnp.ones_like(speed),)), law.variation(speed), series
 

@@ -42,17 +42,17 @@ def agreeing(
     eps = float(jnp.finfo(mu.dtype).eps)
     allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
 
-    def parted(x: Float[Array, ""]) -> Bool[Array, ""]:
-        speed, of_series = value_and_slope(u, x)[0], value_and_slope(mu, x)[0]
+    def parted(x: Float[Array, ""], speed: Float[Array, "*contacts"]) -> Bool[Array, ""]:
         # Also below zero, where sliding is over: a kink may lie on the last short way there.
+        of_series = value_and_slope(mu, x)[0]
         return jnp.any(sliding & ~(jnp.abs(of_series - law(speed)) <= allowed))
 
     equal = jnp.arange(1, PARTS + 1, dtype=mu.dtype) / PARTS
-    speeds = jax.vmap(lambda x: value_and_slope(u, x)[0])(equal)
-    ends = [equal[jnp.argmax(sign * speeds, axis=0)] for sign in (1, -1)]
-    turning = [_turning(u, x) for x in ends]
-    places = jnp.concatenate([equal, *map(jnp.ravel, turning)])
-    wrong = jax.vmap(parted)(places)
+    speeds, slopes = jax.vmap(lambda x: value_and_slope(u, x))(equal)
+    turning = _turning(u, equal, speeds, slopes)
+    at_turning = jax.vmap(lambda x: value_and_slope(u, x)[0])(turning)
+    places = jnp.concatenate([equal, turning])
+    wrong = jax.vmap(parted)(places, jnp.concatenate([speeds, at_turning]))
     high = jnp.min(jnp.where(wrong, places, jnp.inf))
     low = jnp.max(jnp.where(places < high, places, 0.0))
 
@@ -63,15 +63,29 @@ def agreeing(
     def halved(carry):
         low, high, count = carry
         middle = 0.5 * (low + high)
-        beyond = parted(middle)
+        beyond = parted(middle, value_and_slope(u, middle)[0])
         return jnp.where(beyond, low, middle), jnp.where(beyond, middle, high), count + 1
 
     _, high, _ = jax.lax.while_loop(going, halved, (low, high, jnp.zeros((), jnp.int32)))
     return jnp.clip(high, SHORTEST, 1.0)
 
 
-def _turning(u: Float[Array, "k *contacts"], x: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
-    """Nearly where slip is fastest or slowest, from the sample next to it."""
+def _turning(
+    u: Float[Array, "k *contacts"],
+    x: Float[Array, " p"],
+    speeds: Float[Array, "p *contacts"],
+    slopes: Float[Array, "p *contacts"],
+) -> Float[Array, " q"]:
+    """Nearly where slip is fastest and slowest, from samples of it and of its slope at these places."""
+    rising = jnp.array([1.0, -1.0], x.dtype).reshape(2, 1, *[1] * (u.ndim - 1))
+    best = jnp.argmax(rising * speeds, axis=1)  # [fastest or slowest, *contacts]
+    chosen = best[:, None] == jnp.arange(len(x)).reshape(1, -1, *[1] * (u.ndim - 1))
+    slope = jnp.sum(jnp.where(chosen, rising * slopes, 0.0), axis=1)
+    # Slip that only rises, or only falls, turns nowhere: the end of the step is looked at anyway, and at its beginning the
+    # series is the law.
+    at_end = (best == len(x) - 1) & (slope >= 0)
+    at_begin = (best == 0) & (rising[:, 0] * u[1] <= 0)
+    inside = ~(at_end | at_begin)
 
     def going(carry):
         _, change, count = carry
@@ -79,7 +93,8 @@ def _turning(u: Float[Array, "k *contacts"], x: Float[Array, "*contacts"]) -> Fl
 
     def nearer(carry):
         x, _, count = carry
-        further = extremum(u, x, 0.0, jnp.ones_like(x), 1)
+        further = jnp.where(inside, extremum(u, x, 0.0, jnp.ones_like(x), 1), x)
         return further, further - x, count + 1
 
-    return jax.lax.while_loop(going, nearer, (x, jnp.ones_like(x), jnp.zeros((), jnp.int32)))[0]
+    begin = x[best], jnp.where(inside, 1.0, 0.0).astype(x.dtype), jnp.zeros((), jnp.int32)
+    return jnp.ravel(jax.lax.while_loop(going, nearer, begin)[0])

@@ -8,6 +8,7 @@ from scipy.optimize import brentq
 
 import fivjax as fj
 from fivjax.attractors.creeping import creep
+from fivjax.attractors.divergence import long_divergence
 from fivjax.attractors.motions import Motions
 from fivjax.section.return_maps import Images, Section
 
@@ -17,7 +18,10 @@ class Line(SimpleNamespace):
 
     weights = np.ones(2)
 
-    def returns(self, group, at, crossings):
+    def moves(self, group, y):
+        return np.ones(len(group), bool)
+
+    def returns(self, group, at, crossings, kept=0):
         y, crossings = at.y.copy(), np.broadcast_to(crossings, len(at.y))
         for count in range(int(np.max(crossings))):
             moving = crossings > count
@@ -64,6 +68,60 @@ def test_how_long_a_slow_growth_takes(rate):
     """A deviation that grows or decays by the same factor in each return, to the tenfold or a tenth: ln 10 / |rate| returns."""
     creeps, x, time = on_line(lambda x: rate * x, np.ones(1), lambda x: np.abs(np.log(x)) >= np.log(10.0), np.inf, 0.0)
     assert creeps[0] and time[0] == pytest.approx(np.abs(np.log(x[0])) / abs(rate), rel=0.03)
+
+
+def test_growth_from_rounding_takes_few_returns():
+    """Ten decades at a rate of 1e-5: 2.3 million returns, of which some thousands are computed."""
+    line = Line(drift=lambda x: 1e-5 * x, coupling=0.0)
+    counted, returns = [], line.returns
+    line.returns = lambda group, at, crossings: (counted.append(np.max(crossings)), returns(group, at, crossings))[1]
+    at = Section(np.array([[1e-10, 0.0]]), np.ones(1, np.int32), np.ones(1))
+    creeps, last, time, _ = creep(line, Motions(np.zeros(1, int), at), lambda rows, at: at.y[:, 0] > 1.0)
+    assert creeps[0] and last.y[0, 0] > 1.0
+    assert time[0] == pytest.approx(np.log(last.y[0, 0] / 1e-10) / 1e-5, rel=1e-3)
+    assert sum(counted) < 10_000
+
+
+@pytest.mark.parametrize("start", [1e-9, 1e-4, 0.3])
+@pytest.mark.parametrize("apart", [None, 0.1, 0.01])
+def test_growth_stays_below_a_cycle_that_attracts(apart, start):
+    """That of a supercritical Hopf point, or of a pair of cycles born in a fold: what grows from below comes to it, not beyond."""
+
+    def drift(x):
+        beyond = 1.0 if apart is None else 1 - (x / (1 + apart)) ** 2
+        return 1e-5 * x * (1 - x**2) * beyond
+
+    creeps, x, _ = on_line(drift, np.array([start]), lambda x: np.zeros(len(x), bool), coupling=0.0)
+    assert creeps[0] and 0.9 < x[0] < 1.0
+
+
+def test_neighbours_of_a_motion_that_grows_are_not_chaotic():
+    """From rounding to a cycle the distance of neighbours grows by thirty e-folds, and so does their size."""
+    line = Line(drift=lambda x: 0.02 * x * (1 - x), coupling=0.0)
+    at = Section(np.array([[1e-14, 0.0]]), np.ones(1, np.int32), np.ones(1))
+    found = long_divergence(line, Motions(np.zeros(1, int), at))
+    assert not found.chaotic[0] and found.closing_in[0] and found.at.y[0, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_without_a_kick_what_grows_comes_to_what_kicks_come_to():
+    """Steady sliding is unstable under this friction; at the equilibrium itself only rounding is left, which grows."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.1738, 0.14, 0.5), 1.0, fj.Pulse(100.0, p=1.2))
+    m = fj.bistability_map(scene, p=[1.0, 1 + 1e-9, 1.5], progress=False)
+    assert np.all(m.verdict == fj.Verdict.LIMIT_CYCLE)
+    np.testing.assert_allclose(m.amplitude, m.amplitude[-1], rtol=1e-9)
+    growth = float(np.max(np.real(fj.cea.eigenvalues(scene))))
+    assert m.decided_at[0] > np.log(1e8) / growth
+
+
+def test_what_grows_bursts_and_grows_again_is_not_leapt_over():
+    """Without events for hundreds of periods at a time: by leaps the motion comes to its cycle when it does step by step."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.1875, 0.05, 0.05), 1.0, fj.Pulse(100.0, p=1.2))
+    p = [1.0645, 1.5806]
+    found = fj.bistability_map(scene, p=p, progress=False)
+    followed = fj.bistability_map(scene, p=p, progress=False, t_max=2e4, max_steps=10**9)
+    assert np.all(found.verdict == fj.Verdict.LIMIT_CYCLE)
+    np.testing.assert_allclose(found.amplitude, followed.amplitude, rtol=1e-9)
+    assert np.all(found.decided_at < 2 * followed.decided_at)
 
 
 @pytest.fixture(scope="module")

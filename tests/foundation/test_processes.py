@@ -162,7 +162,7 @@ def test_a_signal_ends_a_command_during_imports(tmp_path, module, number):
 @pytest.mark.parametrize("after", [3.0, 8.0, 15.0, 25.0])
 @pytest.mark.parametrize("workers", ["0", "2"])
 def test_a_signal_ends_a_map(tmp_path, number, after, workers):
-    command = [sys.executable, "-m", "fivjax.cli", "map", "--x", "mu=0.1:0.228:800", "--y", "p=1:4:800"]
+    command = [sys.executable, "-m", "fivjax", "map", "--x", "mu=0.1:0.228:1600", "--y", "p=1:4:1600"]
     running = subprocess.Popen(
         [*command, "--workers", workers], env=VARIABLES, cwd=tmp_path, stderr=subprocess.PIPE, text=True
     )
