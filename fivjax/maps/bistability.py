@@ -55,8 +55,8 @@ def bistability_map(
     - `t_max`: time after which a trajectory without a verdict is called undecided, in s. Unless given, it is 2,000
       periods of the slowest mode of sliding after the last jump of the load; where a cycle is known that attracts slowly,
       twelve of its time constants. After that a few of each group are followed on, for up to forty thousand crossings of the
-      section (`docs/verdicts.md`). Time in which a motion of one contact under constant friction grows slowly without contact
-      events does not count, because it is not stepped through.
+      section (`docs/verdicts.md`), and those that grow slowly without contact events by leaps. Of one contact under constant
+      friction such time does not count, because it is not stepped through.
     - `memory`: the memory that all jobs running at a time in this process may take, in bytes; at least one job always runs.
     - `max_steps`: steps after which a trajectory without a verdict is called a step failure.
     - `progress`: whether to show a progress bar; unless given, in terminals and notebooks.

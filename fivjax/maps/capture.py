@@ -138,7 +138,7 @@ class Capture:
     def at_last(self, pending: np.ndarray, now: Progress, late: np.ndarray, proving: bool) -> Late:
         """What becomes of trajectories whose time is over; unless that is to be proved, only which are chaotic."""
         chaotic, none = np.zeros(len(pending), bool), np.zeros(0, int)
-        asks = np.flatnonzero(late & self._may_be_captured(now))
+        asks = np.flatnonzero(late & self._may_be_captured(now, growing=True))
         if self.maps is None or not len(asks):
             return Late(chaotic, {}, none, now)
         motions = Motions(self.group[pending[asks]], section_of(now).rows(asks))
@@ -163,12 +163,14 @@ class Capture:
         now = later(now, asks[decided], found.time[decided], found.events[decided])
         return Late(chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding], now)
 
-    def _may_be_captured(self, now: Progress) -> Bool[np.ndarray, " m"]:
+    def _may_be_captured(self, now: Progress, growing: bool = False) -> Bool[np.ndarray, " m"]:
         """Which trajectories may be on an attractor: they have crossed the section under their final load, and under constant
-        friction they have had events, because sliding alone has no attractor but its equilibrium.
+        friction they have had events, because sliding alone has no attractor but its equilibrium. Those of several contacts may
+        still be `growing` towards their first event.
         """
-        crossed = np.all(np.isfinite(now.crossing), axis=1)
-        return crossed & (now.events > 0 if self.batch.task.scene.friction.constant else True)
+        scene, crossed = self.batch.task.scene, np.all(np.isfinite(now.crossing), axis=1)
+        without_events = not scene.friction.constant or (growing and len(scene.structure.contacts) > 1)
+        return crossed if without_events else crossed & (now.events > 0)
 
 
 def section_of(now: Progress) -> Section:
