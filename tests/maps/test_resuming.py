@@ -103,6 +103,27 @@ def test_other_code_under_the_same_name_is_refused(tmp_path, first, second, part
         kept(path, second())
 
 
+def of_speed(slip_speed):
+    return 1 - 0.05 * jnp.tanh(slip_speed)
+
+
+class Helped(fj.AbstractFriction):
+    """Its code is elsewhere."""
+
+    mu: float
+
+    def __call__(self, slip_speed):
+        return self.mu * of_speed(slip_speed)
+
+
+def test_what_a_law_calls_is_part_of_its_code(tmp_path, monkeypatch):
+    path = tmp_path / "map.part"
+    kept(path, scene(Helped(0.2)))
+    monkeypatch.setitem(globals(), "of_speed", lambda slip_speed: 1 - 0.1 * jnp.tanh(slip_speed))
+    with pytest.raises(ValueError, match="of another run: the code of its friction law"):
+        kept(path, scene(Helped(0.2)))
+
+
 def test_a_changed_stepper_of_a_users_own_is_refused(tmp_path):
     path = tmp_path / "map.part"
     kept(path, scene(), method=own_stepper(0.5))

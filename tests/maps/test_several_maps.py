@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 import fivjax as fj
 from fivjax.contact import Contact, Mechanics, Status, slides_uniquely
@@ -221,3 +222,18 @@ def test_nothing_is_proved_of_a_contact_slower_than_what_the_bounds_on_friction_
     y = np.zeros((len(shares), 12))
     y[:, 6 + scene.structure.contacts[place].tangential] = -3.0 * shares
     assert proofs(scene, y).tolist() == [True] * 3 + [False] * 3
+
+
+@pytest.mark.slow
+def test_growth_of_one_contact_beside_a_quiet_one_is_followed_to_its_cycle():
+    """For minutes no contact has an event; then the motion is that of the oscillator alone, whose growth is bounded."""
+    unstable, damped = fj.belt_oscillator(), fj.belt_oscillator(c1=200.0, c2=200.0)
+    *matrices, load_directions = zip(unstable.matrices, damped.matrices, strict=True)
+    contacts = [fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)]
+    pair = fj.Structure(*(block_diag(*own) for own in matrices), np.concatenate(load_directions), contacts=contacts)
+    friction, load = fj.Coulomb(1.00003 * float(fj.cea.critical_friction(unstable))), fj.Pulse(100.0, p=1.05)
+    both = fj.bistability_map(fj.Scene(pair, [friction, friction], [1.0, 1.3], load), p=[1.05], progress=False)
+    one = fj.bistability_map(fj.Scene(unstable, friction, 1.0, load), p=[1.05], progress=False)
+    assert both.verdict[0] == one.verdict[0] == fj.Verdict.LIMIT_CYCLE
+    assert float(both.amplitude[0]) == pytest.approx(float(one.amplitude[0]), rel=1e-6)
+    assert both.decided_at[0] > 40.0
