@@ -14,12 +14,10 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
-
-from ..foundation.standard_error import silent
 
 # Warp's modules are built by one thread at a time.
 ONE_AT_A_TIME = threading.RLock()
@@ -29,6 +27,20 @@ LEAST_ON_GPUS = 1024
 FLAGS = "FIVJAX_KERNEL_FLAGS"
 # The library of a CUDA driver, by the beginnings of what an operating system calls itself.
 DRIVERS = {"linux": "libcuda.so.1", "win": "nvcuda.dll"}
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Nothing reaches the process' standard error, to which a library writes past Python."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def is_installed() -> bool:

@@ -8,7 +8,6 @@ import pytest
 import fivjax as fj
 from fivjax.kicks import tradeoff_study
 from fivjax.kicks.tradeoff_study import recommend, table
-from fivjax.maps import refinement_study
 from tests.helpers import oracle
 from tests.helpers.catalogue import LOW_ORDER
 
@@ -98,8 +97,8 @@ def test_the_boundary_of_each_method(paper_scene):
 
 def test_refinement_is_compared_with_the_whole_map(monkeypatch):
     """Where nothing is left out it is right, and what it computes is told; a table of its own in the text."""
-    monkeypatch.setattr(refinement_study, "COARSEST", 6)
-    trade = refinement_study.refinement_trade(SCENE, 1)
+    monkeypatch.setattr(tradeoff_study, "COARSEST", 6)
+    trade = tradeoff_study.refinement_trade(SCENE, 1)
     assert trade["refined_computed"][0] == 1.0 and 0.3 < trade["refined_computed"][1] < 1.0
     assert trade["refined_wrong"][0] == 0.0 and trade["refined_wrong"][1] < 0.1
     assert np.all(trade["refined_seconds"] > 0)
