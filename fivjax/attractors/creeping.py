@@ -79,10 +79,10 @@ def creep(
     unsaid = here.passed.copy(), here.met.copy()
     for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
-        # A shorter drift is rounding.
         growth, grows = _growth(maps, here)
         # What has faded is of interest only if it grows again.
         lasts = maps.moves(group[rows], here.at.y) | (grows & (growth > 0))
+        # A shorter drift is rounding.
         going = here.steady & (length > 1e-11 * size) & (plainly[rows] < 48) & lasts
         rows, here = rows[going], here.rows(going)
         length, size, growth, grows = (part[going] for part in (length, size, growth, grows))
@@ -95,9 +95,8 @@ def creep(
         times = share[rows] * size / length
         plain = times < LEAST_DRIFTS
         times[plain] = 0.0
-        moved = np.where(
-            grows[:, None], here.at.y * np.expm1(times * growth)[:, None], times[:, None] * here.way / maps.weights
-        )
+        along = times[:, None] * here.way / maps.weights
+        moved = np.where(grows[:, None], here.at.y * np.expm1(times * growth)[:, None], along)
         leapt = here.at._replace(y=here.at.y + moved)
         waits = np.where(grows, settles[rows] // SOONER, settles[rows])
         settled = maps.returns(group[rows], leapt, np.where(plain, 512, waits))
@@ -106,10 +105,7 @@ def creep(
         with np.errstate(divide="ignore", invalid="ignore"):
             faster = np.where(grows, growth_there / growth, np.linalg.norm(there.way, axis=1) / length)
             change = np.abs(np.log(faster))
-            trusted = TRUSTED * share[rows] / change
-            of_power = np.log1p(TRUSTED * -np.expm1(-POWER * share[rows]) / change) / POWER
-            trusted = np.where(grows, np.minimum(trusted, of_power), trusted)
-            longer = np.fmin(np.minimum(2 * share[rows], longest), trusted)
+            longer = np.fmin(np.minimum(2 * share[rows], longest), _trusted(share[rows], change, grows))
             # As long as the mean of what both drifts say.
             skipped = 0.5 * times * (1 + 1 / faster)
         alike = np.where(grows, grows_there & (change <= np.log(1.5)), _alike(here.way, there.way))
@@ -148,12 +144,19 @@ def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     return _Drift(end.at, way, end.time, end.events, passed, met, steady)
 
 
+def _trusted(share: Float[np.ndarray, " m"], change: Float[np.ndarray, " m"], grows: Bool[np.ndarray, " m"]):
+    """How long the next leaps may be, if the logarithm of the drift, or of the growth, changed so much over the latest ones."""
+    by_distance = TRUSTED * share / change
+    by_power = np.log1p(-TRUSTED * np.expm1(-POWER * share) / change) / POWER
+    return np.where(grows, np.minimum(by_distance, by_power), by_distance)
+
+
 def _growth(maps: ReturnMaps, drift: _Drift) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """The logarithm of the growth of motions over a drift, and which are without events and do nothing but grow, or decay."""
     end, way = maps.weights * drift.at.y, drift.way
-    middle, along = np.sum((end - way) ** 2, axis=1), np.sum(end * way, axis=1)
-    straight = np.abs(along) >= 0.99 * np.linalg.norm(end, axis=1) * np.linalg.norm(way, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        middle, along = np.sum((end - way) ** 2, axis=1), np.sum(end * way, axis=1)
+        straight = np.abs(along) >= 0.99 * np.linalg.norm(end, axis=1) * np.linalg.norm(way, axis=1)
         growth = 0.5 * np.log1p((2 * along - np.sum(way**2, axis=1)) / middle)
     return growth, straight & (drift.events == 0)
 
