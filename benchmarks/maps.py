@@ -1,6 +1,6 @@
 """Trajectories, maps and critical perturbations: errors against the oracle, seconds, memory, and maps of ten million cells.
 
-    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [start] [memory] [large] [steps]
+    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [falling] [start] [memory] [large] [steps]
 
 Each word picks one study; without any, all run (half an hour on two cores). `docs/measurements.md` states the figures. The reference
 is `tests/helpers/oracle.py`.
@@ -165,6 +165,28 @@ def axes() -> None:
             )
 
 
+def falling() -> None:
+    """Warm maps under friction that falls with slip speed, across the Hopf point of sliding at 1 m/s, beside constant friction."""
+    laws = {
+        "constant, μ 0.15–0.2275": (fj.Coulomb(0.2), "mu", (0.15, 0.2275)),
+        "0.14 dynamic, 0.5 s/m, static 0.15–0.3": (fj.ExponentialDecay(0.2, 0.14, 0.5), "mu_static", (0.15, 0.3)),
+        "0.05 dynamic, 0.05 s/m, static 0.15–0.2275": (
+            fj.ExponentialDecay(0.2, 0.05, 0.05),
+            "mu_static",
+            (0.15, 0.2275),
+        ),
+    }
+    for points in (32, 64):
+        for what, (law, name, ends) in laws.items():
+            own = fj.Scene(fj.belt_oscillator(), law, 1.0, fj.Pulse(100.0, 1.2))
+            values = {name: np.linspace(*ends, points), "p": np.linspace(1.0, 2.0, points)}
+            for _ in range(2):
+                begin, cpu = time.perf_counter(), time.process_time()
+                m = fj.bistability_map(own, progress=False, **values)
+                wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
+            print(f"{points} × {points}, {what}: {wall:.1f} s, {cpu:.1f} CPU s; {m.attrs['counts']}", flush=True)
+
+
 def without_kernels(points: int):
     scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "maps.groups"))
     with mock.patch(scope, return_value=False), mock.patch(sharing, return_value=False):
@@ -279,6 +301,7 @@ if __name__ == "__main__":
         "refined": refined,
         "kernels": kernels,
         "axes": axes,
+        "falling": falling,
         "start": start,
         "memory": memory,
         "large": large,
