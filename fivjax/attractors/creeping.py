@@ -51,6 +51,8 @@ class _Drift(NamedTuple):
     passed: Float[np.ndarray, " m"]  # the time of these and of as many returns before, s
     met: Int[np.ndarray, " m"]  # and all events
     steady: Bool[np.ndarray, " m"]  # whether the drift was the same before
+    growth: Float[np.ndarray, " m"]  # the logarithm of that of the motions' size
+    grows: Bool[np.ndarray, " m"]  # which are without events and do nothing but grow, or decay
 
     def rows(self, chosen) -> "_Drift":
         return _Drift(self.at.rows(chosen), *(part[chosen] for part in self[1:]))
@@ -67,28 +69,26 @@ def creep(
     motions: Motions,
     arrived: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]],
 ) -> tuple[Bool[np.ndarray, " m"], Section, Float[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Which motions creep; and where they are, how much later (s), and after how many more contact events, when they have
+    """Which motions creep; and where these are, how much later (s), and after how many more contact events, when they have
     `arrived` (told by their rows and states), or creep no more.
     """
     group, at = motions
     last = Section(*(np.array(part) for part in at))
-    time, events, creeps = np.zeros(len(group)), np.zeros(len(group), int), np.zeros(len(group), bool)
+    creeps = np.zeros(len(group), bool)
     share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), 128), np.zeros(len(group), int)
     rows, here = np.arange(len(group)), _measure_drift(maps, motions)
-    # Until they have been moved on: over the first drift.
-    unsaid = here.passed.copy(), here.met.copy()
+    time, events = here.passed.copy(), here.met.copy()
     for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
-        growth, grows = _growth(maps, here)
         # What has faded is of interest only if it grows again.
-        lasts = maps.moves(group[rows], here.at.y) | (grows & (growth > 0))
+        lasts = maps.moves(group[rows], here.at.y) | (here.grows & (here.growth > 0))
         # A shorter drift is rounding.
         going = here.steady & (length > 1e-11 * size) & (plainly[rows] < 48) & lasts
-        rows, here = rows[going], here.rows(going)
-        length, size, growth, grows = (part[going] for part in (length, size, growth, grows))
+        rows, here, length, size = rows[going], here.rows(going), length[going], size[going]
         if not len(rows):
             break
-        longest = np.where(grows, np.where(growth > 0, LONGEST_GROWTH, LONGEST_DECAY), LONGEST_LEAP)
+        grows = here.grows
+        longest = np.where(grows, np.where(here.growth > 0, LONGEST_GROWTH, LONGEST_DECAY), LONGEST_LEAP)
         # The first leap is a short one, but worthwhile.
         first = np.clip(1.5 * LEAST_DRIFTS * length / size, 0.004, LONGEST_LEAP)
         share[rows] = np.where(np.isnan(share[rows]), first, np.minimum(share[rows], longest))
@@ -96,19 +96,18 @@ def creep(
         plain = times < LEAST_DRIFTS
         times[plain] = 0.0
         along = times[:, None] * here.way / maps.weights
-        moved = np.where(grows[:, None], here.at.y * np.expm1(times * growth)[:, None], along)
+        moved = np.where(grows[:, None], here.at.y * np.expm1(times * here.growth)[:, None], along)
         leapt = here.at._replace(y=here.at.y + moved)
         waits = np.where(grows, settles[rows] // SOONER, settles[rows])
         settled = maps.returns(group[rows], leapt, np.where(plain, 512, waits))
         there = _measure_drift(maps, Motions(group[rows], settled.at))
-        growth_there, grows_there = _growth(maps, there)
         with np.errstate(divide="ignore", invalid="ignore"):
-            faster = np.where(grows, growth_there / growth, np.linalg.norm(there.way, axis=1) / length)
+            faster = np.where(grows, there.growth / here.growth, np.linalg.norm(there.way, axis=1) / length)
             change = np.abs(np.log(faster))
             longer = np.fmin(np.minimum(2 * share[rows], longest), _trusted(share[rows], change, grows))
             # As long as the mean of what both drifts say.
             skipped = 0.5 * times * (1 + 1 / faster)
-        alike = np.where(grows, grows_there & (change <= np.log(1.5)), _alike(here.way, there.way))
+        alike = np.where(grows, there.grows & (change <= np.log(1.5)), _alike(here.way, there.way))
         # Nor has it come back to the line after something else.
         expected = here.events * (waits / OVER)
         alike &= np.abs(settled.events - expected) <= np.where(grows, 0.0, 2 + 0.05 * expected)
@@ -120,10 +119,8 @@ def creep(
         done = rows[kept]
         creeps[done] = True
         last.put(done, there.at.rows(kept))
-        time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.passed)[kept] + unsaid[0][done]
-        events[done] += ((times * here.events).astype(int) + settled.events + there.met)[kept] + unsaid[1][done]
-        for one in unsaid:
-            one[done] = 0
+        time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.passed)[kept]
+        events[done] += ((times * here.events).astype(int) + settled.events + there.met)[kept]
         # From where they have got to; the others try a shorter leap.
         there.put(~kept, here.rows(~kept))
         left = ~kept
@@ -141,7 +138,8 @@ def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
     steady = _alike(before, way) & (middle.events == end.events)
     passed, met = middle.time + end.time, middle.events + end.events
-    return _Drift(end.at, way, end.time, end.events, passed, met, steady)
+    growth, straight = _growth(maps.weights * end.at.y, way)
+    return _Drift(end.at, way, end.time, end.events, passed, met, steady, growth, straight & (end.events == 0))
 
 
 def _trusted(share: Float[np.ndarray, " m"], change: Float[np.ndarray, " m"], grows: Bool[np.ndarray, " m"]):
@@ -151,14 +149,14 @@ def _trusted(share: Float[np.ndarray, " m"], change: Float[np.ndarray, " m"], gr
     return np.where(grows, np.minimum(by_distance, by_power), by_distance)
 
 
-def _growth(maps: ReturnMaps, drift: _Drift) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """The logarithm of the growth of motions over a drift, and which are without events and do nothing but grow, or decay."""
-    end, way = maps.weights * drift.at.y, drift.way
+def _growth(
+    end: Float[np.ndarray, "m 2n"], way: Float[np.ndarray, "m 2n"]
+) -> tuple[Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """The logarithm of the growth of states on these ways to their ends, and which of the ways go straight out, or in."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        middle, along = np.sum((end - way) ** 2, axis=1), np.sum(end * way, axis=1)
+        start, along = np.sum((end - way) ** 2, axis=1), np.sum(end * way, axis=1)
         straight = np.abs(along) >= 0.99 * np.linalg.norm(end, axis=1) * np.linalg.norm(way, axis=1)
-        growth = 0.5 * np.log1p((2 * along - np.sum(way**2, axis=1)) / middle)
-    return growth, straight & (drift.events == 0)
+        return 0.5 * np.log1p((2 * along - np.sum(way**2, axis=1)) / start), straight
 
 
 def _alike(one: Float[np.ndarray, "m 2n"], other: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, " m"]:
