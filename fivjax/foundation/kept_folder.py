@@ -120,13 +120,18 @@ def cannot_keep(folder: str | Path, reason: str) -> None:
 
 def make_room(folder: Path, largest: int) -> None:
     """Remove what was used longest ago, until the rest is small enough (bytes)."""
-    with contextlib.suppress(OSError):
-        files = [(entry.stat(), entry.path) for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
-        total = 0
-        for status, path in sorted(files, key=lambda file: -file[0].st_mtime):
-            total += status.st_size
-            if total > largest:
-                Path(path).unlink(missing_ok=True)
+    found = []
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            with contextlib.suppress(OSError):  # removed by another process just now
+                if entry.is_file(follow_symlinks=False):
+                    found.append((entry.stat(), entry.path))
+    total = 0
+    for status, path in sorted(found, key=lambda file: -file[0].st_mtime):
+        total += status.st_size
+        if total > largest:
+            with contextlib.suppress(OSError):
+                os.unlink(path)
 
 
 def _make(path: Path) -> None:

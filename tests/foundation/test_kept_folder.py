@@ -1,5 +1,6 @@
 """Compiled code is kept only where nobody else may write; where it cannot be kept, results are the same and a sentence says why."""
 
+import contextlib
 import os
 import stat
 import subprocess
@@ -170,6 +171,24 @@ def test_what_jax_says_of_its_cache_is_one_sentence(monkeypatch, capsys):
             )
     said = capsys.readouterr().err
     assert said.count("\n") == said.count("fivjax: ") == 2 and "No space left on device" in said and "damaged" in said
+
+
+def test_room_is_made_while_another_process_removes_files(tmp_path, monkeypatch):
+    for age, name in enumerate(("new", "gone", "old", "older")):
+        (tmp_path / name).write_bytes(b"12345678")
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    listing = os.scandir
+
+    @contextlib.contextmanager
+    def listed_before_it_was_removed(folder):
+        with listing(folder) as entries:
+            entries = list(entries)
+        (tmp_path / "gone").unlink()
+        yield entries
+
+    monkeypatch.setattr(kept_folder.os, "scandir", listed_before_it_was_removed)
+    kept_folder.make_room(tmp_path, 16)
+    assert sorted(os.listdir(tmp_path)) == ["new", "old"]
 
 
 def test_warp_begins_without_a_folder_of_its_own(tmp_path):
