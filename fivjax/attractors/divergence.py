@@ -2,6 +2,7 @@
 between them over many returns, of which the largest Lyapunov exponent of the return map is the limit.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,10 @@ APART = 1e-7
 PARTED, CLOSED_IN = 30.0, 15.0
 # What may be a torus is followed for longer where neighbours have parted by so many; and is none if they then part by so many.
 SUSPICIOUS, PARTED_ON_TORUS = 4.0, 12.0
+# After so many measurements each it is asked which motions have arrived.
+ARRIVING = 8
+# Which motions have come to something that is known.
+Arrived = Callable[[Motions], Bool[np.ndarray, " m"]]
 # Returns after which a neighbour is brought near again along a motion that is known: what parts slowly is still near then.
 RETURNS_ALONG = 128
 
@@ -45,9 +50,12 @@ class _Growth(NamedTuple):
     path: Float[np.ndarray, "m k 2n"]  # the motions' weighted states on the section
 
 
-def long_divergence(maps: ReturnMaps, motions: Motions, chaotic_from: float = PARTED) -> Divergence:
+def long_divergence(
+    maps: ReturnMaps, motions: Motions, chaotic_from: float = PARTED, arrived: Arrived | None = None
+) -> Divergence:
     """Whether neighbours part or close in exponentially where these motions lead to: asked over thousands of returns, because
-    events may be rare. On a torus they do neither. They part exponentially if it is by so many e-folds.
+    events may be rare. On a torus they do neither. They part exponentially if it is by so many e-folds. Of those that have
+    `arrived` on the way it is not asked any further.
     """
     group = motions.group
     first = maps.returns(*motions, 1)
@@ -55,7 +63,7 @@ def long_divergence(maps: ReturnMaps, motions: Motions, chaotic_from: float = PA
     time, events = time + first.time, events + first.events
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
-    for _ in range(MEASURED):
+    for turn in range(MEASURED):
         before = np.linalg.norm(maps.weights * at.y, axis=1)
         growth, taken, met, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
@@ -69,6 +77,8 @@ def long_divergence(maps: ReturnMaps, motions: Motions, chaotic_from: float = PA
         with np.errstate(invalid="ignore"):
             furthest = np.fmax(furthest, parted - least)
             left = ((parted - least < chaotic_from) & (most - parted < CLOSED_IN))[running]
+        if arrived is not None and turn % ARRIVING == ARRIVING - 1:
+            left &= ~arrived(Motions(group[running], at))
         running, at, beside = running[left], at.rows(left), beside[left]
         if not len(running):
             break

@@ -36,7 +36,6 @@ from .forces import free_matrices as free_matrices
 from .forces import gap as gap
 from .forces import held as held
 from .forces import measured as measured
-from .forces import product as product
 from .forces import relative_velocity as relative_velocity
 from .forces import slip_speed as slip_speed
 from .forces import total_forces as total_forces

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..foundation.linear_solve import product
 from .coordinates import at_places, spread, with_values
 from .mechanics import Mechanics
 from .mode import Contact, Status
@@ -11,9 +12,6 @@ from .mode_forces import ModeForces
 State = Float[Array, " state"]  # displacements, then velocities
 # One value, or with several contacts one for each.
 Each = Float[Array, "*contacts"]
-
-# For structures up to this size, matrix products are written as sums over columns.
-LARGEST_BY_COLUMNS = 12
 
 
 def relative_velocity(mechanics: Mechanics, y: State) -> Each:
@@ -52,16 +50,6 @@ def measured(mechanics: Mechanics, y: State) -> tuple[Float[Array, " s"], Float[
     """Displacements, or with `mechanics.springs` the stretches of these, and velocities."""
     n = degrees_of_freedom(y)
     return (y[:n] if mechanics.springs is None else mechanics.springs.stretches(y[:n])), y[n:]
-
-
-def product(matrix: Float[Array, "m n"], vector: Float[Array, " n"]) -> Float[Array, " m"]:
-    """A matrix times a vector. Small ones as a sum over columns: in a batch this becomes one fused loop over trajectories."""
-    if len(vector) > LARGEST_BY_COLUMNS:
-        return matrix @ vector
-    total = matrix[:, 0] * vector[0]
-    for j in range(1, len(vector)):
-        total = total + matrix[:, j] * vector[j]
-    return total
 
 
 def total_forces(mechanics: Mechanics, tangential_force: Each, normal_force: Each) -> tuple[Each, Each]:

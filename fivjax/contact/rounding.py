@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..foundation.linear_solve import LARGEST_BY_COLUMNS
 from .coordinates import at_places, spread, with_values
-from .forces import LARGEST_BY_COLUMNS, Each, State, degrees_of_freedom
+from .forces import Each, State, degrees_of_freedom
 from .guard import cone_margins
 from .mechanics import Mechanics
 from .mode import Contact, Status

@@ -1,4 +1,4 @@
-"""Linear systems and determinants by elimination, without LAPACK.
+"""Products of a matrix and a vector, linear systems and determinants by elimination, without LAPACK.
 
 In a batch every operation here acts on all systems at once and fuses with its neighbours, on any device. LAPACK is called
 system by system instead. Worse, its calls can wait for each other for ever: those of jaxlib 0.10.0 to 0.10.2 share a batch out
@@ -14,6 +14,18 @@ from jaxtyping import Array, Inexact
 
 # Larger systems are eliminated in a loop: written out, they would take longer to compile than to solve.
 LARGEST = 4
+# Products with vectors up to this length are written as sums over columns.
+LARGEST_BY_COLUMNS = 12
+
+
+def product(matrix: Inexact[Array, "m n"], vector: Inexact[Array, " n"]) -> Inexact[Array, " m"]:
+    """A matrix times a vector. Small ones as a sum over columns: in a batch this becomes one fused loop over trajectories."""
+    if len(vector) > LARGEST_BY_COLUMNS:
+        return matrix @ vector
+    total = matrix[:, 0] * vector[0]
+    for j in range(1, len(vector)):
+        total = total + matrix[:, j] * vector[j]
+    return total
 
 
 def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, " n *k"]) -> Inexact[Array, " n *k"]:

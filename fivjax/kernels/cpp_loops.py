@@ -3,11 +3,12 @@
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ..foundation.jaxprs import of_scan, solution, within
-from .cpp_arrays import Value, View
-from .cpp_numbers import WIDE, kind_of, text_of
+from .cpp_arrays import Value, View, of_text
+from .cpp_numbers import WIDE, base_of, kind_of, same, text_of
 from .cpp_writer import Writer
 
 
@@ -17,11 +18,11 @@ def _while(writer: Writer, equation, operands) -> list[Value]:
     fixed = operands[len(asked) :][: equation.params["body_nconsts"]]
     begin = operands[len(asked) + len(fixed) :]
     kinds, _ = _types_carried(writer, body.jaxpr, fixed, begin, [], equation.outvars)
-    carry = [writer.changed(value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    carry = [changed(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
     writer.open("for (;;)")
     (going,) = writer.run(condition.jaxpr, condition.consts, [*asked, *carry])
     writer.put(f"if (!({text_of(writer.entries(going).item())})) break;")
-    writer.assign(carry, writer.run(body.jaxpr, body.consts, [*fixed, *carry]))
+    assign(writer, carry, writer.run(body.jaxpr, body.consts, [*fixed, *carry]))
     writer.close()
     return carry
 
@@ -45,7 +46,7 @@ def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int
         writer.view(value, kind_of(atom.aval))
         for value, atom in zip(along, equation.invars[len(fixed) + len(begin) :], strict=True)
     ]
-    carry = [writer.changed(value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    carry = [changed(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
     rows = [
         rows_of(k, WIDE if wide[len(begin) + k] else kind_of(variable.aval))
         for k, variable in enumerate(equation.outvars[len(begin) :])
@@ -62,7 +63,7 @@ def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int
     for view, value in zip(rows, found[len(begin) :], strict=True):
         start = " + ".join([*view.offset[1:], f"{at} * {view.strides[0]}", str(view.offset[0])])
         writer.copy(value, view.base, view.kind, start, view.strides[1:])
-    writer.assign(carry, found[: len(begin)])
+    assign(writer, carry, found[: len(begin)])
     writer.close()
     return [*carry, *map(writer.small, rows)]
 
@@ -77,13 +78,13 @@ def _cond(writer: Writer, equation, operands) -> list[Value]:
     flags = list(map(writer.is_wide, rest))
     wide = [any(each) for each in zip(*(moved(branch.jaxpr, flags) for branch in branches), strict=True)]
     found = [
-        writer.unset(variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
+        unset(writer, variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
         for variable, is_wide in zip(equation.outvars, wide, strict=True)
     ]
     for k, branch in enumerate(branches):
         test = f"if ({which} <= 0)" if k == 0 else f"else if ({which} == {k})" if k < last else "else"
         writer.open(test)
-        writer.assign(found, writer.run(branch.jaxpr, branch.consts, rest))
+        assign(writer, found, writer.run(branch.jaxpr, branch.consts, rest))
         writer.close()
     return found
 
@@ -144,3 +145,60 @@ def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
         for variable, is_wide in zip(equation.outvars, found, strict=True):
             moves[variable] = is_wide and jnp.issubdtype(variable.aval.dtype, jnp.inexact)
     return list(map(reads, jaxpr.outvars))
+
+
+# ------------------------------------------------------------------------------------ what loops and branches change
+
+
+def changed(writer: Writer, value: Value, kind: str) -> Value:
+    """A variable, or a C array, that begins with this value."""
+    if value.shape == ():
+        found = writer.name(kind, "w")
+        writer.put(f"{kind} {found} = {writer.as_type(writer.entries(value).item(), kind)};")
+        return of_text(found)
+    into = writer.new(value.shape, kind)
+    writer.copy(value, into.base, kind)
+    return writer.small(into)
+
+
+def unset(writer: Writer, shape, kind: str) -> Value:
+    """The same, without a value yet."""
+    if shape == ():
+        found = writer.name(kind, "w")
+        writer.put(f"{kind} {found};")
+        return of_text(found)
+    return writer.small(writer.new(shape, kind))
+
+
+def assign(writer: Writer, targets: Sequence[Value], values: Sequence[Value]) -> None:
+    """Give these variables and arrays their new values, all at once."""
+    bases = {base_of(target) for target in targets}
+    moves = []
+    for target, value in zip(targets, values, strict=True):
+        if target.size == 0 or same(target, value):
+            continue
+        # What is itself changed by this is copied before.
+        if isinstance(value, View):
+            if value.base in bases:
+                copied = writer.new(value.shape, value.kind)
+                writer.copy(value, copied.base, value.kind)
+                value = copied
+        else:
+            value = np.array([_kept(writer, entry, bases) for entry in value.ravel()], object).reshape(value.shape)
+        moves.append((target, value))
+    for target, value in moves:
+        if target.shape == ():
+            variable = target.item()
+            kind = writer.type_of(variable)
+            writer.put(f"{variable} = {writer.as_type(writer.entries(value).item(), kind)};")
+        else:
+            writer.copy(value, base_of(target), writer.types[base_of(target)])
+
+
+def _kept(writer: Writer, entry, bases: set[str]):
+    if not isinstance(entry, str) or entry.partition("[")[0] not in bases:
+        return entry
+    kind = writer.type_of(entry)
+    found = writer.name(kind)
+    writer.put(f"const {kind} {found} = {entry};")
+    return found

@@ -225,7 +225,7 @@ def _product(writer: Writer, equation, operands, kind: str) -> Value:
             yield tuple(place[axis] for axis in range(part.ndim))
 
     if count_of(shape) * count_of(lengths) > FEW:
-        factors = writer.view(left, kind), writer.view(right, kind)
+        factors = _by_columns(writer, writer.view(left, kind)), writer.view(right, kind)
         into = writer.new(shape, WIDE if WIDE in (factors[0].kind, factors[1].kind) else kind)
         every = writer.name("int", "i")
         writer.put(
@@ -247,6 +247,20 @@ def _product(writer: Writer, equation, operands, kind: str) -> Value:
             total = writer.one("add", BY_NUMBER["add"], [total, term], kind)
         found[place] = total
     return found
+
+
+def _by_columns(writer: Writer, matrix: View) -> View:
+    """A matrix that is given, so that the numbers of a column lie side by side, as a loop over results wants them."""
+
+    def write() -> View:
+        into = writer.new(matrix.shape[::-1], matrix.kind)
+        writer.copy(matrix.selected(matrix.offset, (1, 0)), into.base, into.kind)
+        return into
+
+    if matrix.ndim != 2 or matrix.strides[0] <= matrix.strides[1] or not writer.is_known_before(matrix):
+        return matrix
+    columns = writer.once(("columns", matrix), [matrix], write)
+    return columns.selected(columns.offset, (1, 0))
 
 
 RULES: dict[str, Callable] = {

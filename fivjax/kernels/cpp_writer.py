@@ -8,6 +8,7 @@ A function may be traced through `jax.jvp`. Then some of what it is given are ta
 by side, one for each direction. What depends on one is wide, too, and the rest is computed once for all directions.
 """
 
+import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
@@ -17,18 +18,16 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
 from ..foundation.jaxprs import within
-from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, is_known, natural, of_numbers, of_text
+from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, is_known, natural, of_numbers
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
     SAME,
     WIDE,
-    base_of,
     converted,
     keeping_nan,
     kind_of,
     of_known,
-    same,
     simpler,
     text_of,
     without_repeats,
@@ -36,6 +35,8 @@ from .cpp_numbers import (
 
 # Arrays with more numbers are gone through by loops.
 FEW = 40
+# The arrays of a lane's own numbers and of its group's, which do not change.
+GIVEN = ("given", "shared")
 
 
 class Writer:
@@ -55,12 +56,16 @@ class Writer:
         self._count = count()
         # Blocks that are open, each with what has been computed in it: the same text is the same number.
         self._blocks: list[dict] = [{}]
+        # Code that comes before, what it has computed, and the arrays that are known there: at first what the code is given.
+        self._before: list[str] = []
+        self._once: dict = {}
+        self._known_before = {name for name in GIVEN if name in self.types}
 
     # Lines.
 
     @property
     def source(self) -> str:
-        return "\n".join([*self.functions.values(), *self.lines])
+        return "\n".join([*self.functions.values(), *self._before, *self.lines])
 
     def put(self, line: str) -> None:
         self.lines.append("  " * len(self._blocks) + line)
@@ -99,6 +104,22 @@ class Writer:
         found = self.name(kind, "a")
         self.put(f"{kind} {found}[{max(size, 1)}];")
         return found
+
+    def is_known_before(self, view: View) -> bool:
+        """Whether an array follows from what the code is given."""
+        return view.base in self._known_before and len(view.offset) == 1
+
+    def once(self, key, views: Sequence[View], write: Callable[[], View]) -> View:
+        """The array that `write` writes: if it follows from what the code is given, before all loops, and once for each key."""
+        if not all(map(self.is_known_before, views)):
+            return write()
+        if key not in self._once:
+            here = self.lines, self._blocks
+            self.lines, self._blocks = self._before, [{}]
+            found = self._once[key] = write()
+            self.lines, self._blocks = here
+            self._known_before.add(found.base)
+        return self._once[key]
 
     def loops(self, shape) -> list[str]:
         """The variables of nested loops over all places of an array."""
@@ -266,15 +287,23 @@ class Writer:
                 views.append(self.view(part, self._plain_type(part, otherwise)).broadcast(shape))
         if kind == "double" and any(map(self.is_wide, operands)):
             kind = WIDE
-        into = self.new(shape, kind)
-        names = self.loops(shape)
-        texts = [part.at(names) if isinstance(part, View) else text_of(part) for part in views]
-        if kind == WIDE and name == "select_n":
-            texts[1:] = [f"(wide)({text})" for text in texts[1:]]
-        text = form.format(*texts)
-        self.put(f"{into.at(names)} = {f'(wide)({text})' if kind == WIDE else text};")
-        self.close(len(names))
-        return into
+
+        def write() -> View:
+            into = self.new(shape, kind)
+            names = self.loops(shape)
+            texts = [part.at(names) if isinstance(part, View) else text_of(part) for part in views]
+            if kind == WIDE and name == "select_n":
+                texts[1:] = [f"(wide)({text})" for text in texts[1:]]
+            text = form.format(*texts)
+            self.put(f"{into.at(names)} = {f'(wide)({text})' if kind == WIDE else text};")
+            self.close(len(names))
+            return into
+
+        # Variables may have been computed in a loop.
+        if any(isinstance(part, str) for part in views):
+            return write()
+        arrays = [part for part in views if isinstance(part, View)]
+        return self.once((name, form, kind, shape, *views), arrays, write)
 
     def _plain_type(self, value: Value, otherwise: str) -> str:
         """That of the numbers of an array."""
@@ -311,6 +340,10 @@ class Writer:
         return value
 
     def _folded_in_loops(self, name: str, value: View, axes) -> Value:
+        write = functools.partial(self._fold_in_loops, name, value, axes)
+        return self.small(self.once((name, value, tuple(axes)), [value], write))
+
+    def _fold_in_loops(self, name: str, value: View, axes) -> View:
         kept = [axis for axis in range(value.ndim) if axis not in axes]
         into = self.new([value.shape[axis] for axis in kept], value.kind)
         form = keeping_nan(name, BY_NUMBER[name], value.kind)
@@ -326,62 +359,10 @@ class Writer:
         self.close(len(inner))
         self.put(f"{into.at(outer)} = {total};")
         self.close(len(outer))
-        return self.small(into)
+        return into
 
     def place(self, entry, most: int):
         """An index, kept between zero and the most, as JAX keeps it."""
         if not isinstance(entry, str):
             return min(max(int(entry), 0), most)
         return self.line(f"({entry} < 0 ? 0 : ({entry} > {most} ? {most} : (int)({entry})))", "int")
-
-    # What loops and branches change.
-
-    def changed(self, value: Value, kind: str) -> Value:
-        """A variable, or a C array, that begins with this value."""
-        if value.shape == ():
-            found = self.name(kind, "w")
-            self.put(f"{kind} {found} = {self.as_type(self.entries(value).item(), kind)};")
-            return of_text(found)
-        into = self.new(value.shape, kind)
-        self.copy(value, into.base, kind)
-        return self.small(into)
-
-    def unset(self, shape, kind: str) -> Value:
-        """The same, without a value yet."""
-        if shape == ():
-            found = self.name(kind, "w")
-            self.put(f"{kind} {found};")
-            return of_text(found)
-        return self.small(self.new(shape, kind))
-
-    def assign(self, targets: Sequence[Value], values: Sequence[Value]) -> None:
-        """Give these variables and arrays their new values, all at once."""
-        bases = {base_of(target) for target in targets}
-        moves = []
-        for target, value in zip(targets, values, strict=True):
-            if target.size == 0 or same(target, value):
-                continue
-            # What is itself changed by this is copied before.
-            if isinstance(value, View):
-                if value.base in bases:
-                    copied = self.new(value.shape, value.kind)
-                    self.copy(value, copied.base, value.kind)
-                    value = copied
-            else:
-                value = np.array([self._kept(entry, bases) for entry in value.ravel()], object).reshape(value.shape)
-            moves.append((target, value))
-        for target, value in moves:
-            if target.shape == ():
-                variable = target.item()
-                kind = self.type_of(variable)
-                self.put(f"{variable} = {self.as_type(self.entries(value).item(), kind)};")
-            else:
-                self.copy(value, base_of(target), self.types[base_of(target)])
-
-    def _kept(self, entry, bases: set[str]):
-        if not isinstance(entry, str) or entry.partition("[")[0] not in bases:
-            return entry
-        kind = self.type_of(entry)
-        found = self.name(kind)
-        self.put(f"const {kind} {found} = {entry};")
-        return found

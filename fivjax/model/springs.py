@@ -4,6 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..foundation.linear_solve import product
+
 
 class Springs(eqx.Module):
     r"""A stiffness matrix as n springs, $K = B^T \mathrm{diag}(k) B$ with a triangular $B$.
@@ -31,7 +33,7 @@ class Springs(eqx.Module):
 
     def stretches(self, displacement: Float[Array, " n"]) -> Float[Array, " n"]:
         """How far each spring is stretched, in m."""
-        return jnp.sum(self.stretch * displacement, axis=-1)
+        return product(self.stretch, displacement)
 
     def energy(self, displacement: Float[Array, " n"]) -> Float[Array, ""]:
         """The energy stored in them, in J."""

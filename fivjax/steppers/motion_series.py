@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .. import contact as physics
 from ..contact import Contact, Mechanics, ModeForces, State
 from ..contact.rounding import largest_rounding
+from ..foundation.linear_solve import product
 
 
 class Series(NamedTuple):
@@ -51,10 +52,10 @@ def series_of(
 
     def further(state: State, slip, otherwise, divisor):
         """What follows from one coefficient of the state: the next, and those of the guards and of N."""
-        of_displacements, of_velocities = map(physics.product, matrices, physics.measured(changes, state))
+        of_displacements, of_velocities = map(product, matrices, physics.measured(changes, state))
         found = of_displacements + of_velocities
         if beside is not None:
-            found = found + physics.product(beside, jnp.ravel(otherwise))
+            found = found + product(beside, jnp.ravel(otherwise))
         acceleration, guards, normal_force = jnp.split(found, (n, n + 2 * count))
         guards = guards.reshape(of_slip.shape) + of_slip * slip[..., None]
         guards = guards + of_gap * physics.gap(changes, state)[..., None]

@@ -1,6 +1,7 @@
 """JAX functions written out as C++ and computed by kernels: against JAX itself, with loops, branches, tables and tangents."""
 
 import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from fivjax.foundation.argument_forms import Form
 from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
 from fivjax.kernels.functions import KernelFunction
+from fivjax.kernels.kernel import kernel_of
 
 
 def with_loops(x, matrix, count):
@@ -219,3 +221,30 @@ def test_second_derivatives_of_a_kernel_need_no_jit():
         expected = np.einsum("bi,ij->bij", 6.0 * many * [2.0, -1.0], np.eye(2))
         np.testing.assert_allclose(jax.vmap(jax.hessian(of))(many), expected, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(jax.hessian(of)(many[0]), expected[0], rtol=1e-12, atol=1e-12)
+
+
+def test_what_follows_from_what_is_given_is_computed_once_before_all_loops():
+    """As the sizes of a large matrix: neither in each turn of a loop, nor again for each that needs it."""
+
+    def repeated(args, instants):
+        matrix, x, count = args
+
+        def turn(carry):
+            k, y = carry
+            sizes = jnp.abs(matrix)
+            return k + 1, jnp.sin(matrix @ y) / jnp.max(sizes) + jnp.abs(matrix) @ x
+
+        _, y = jax.lax.while_loop(lambda carry: carry[0] < count, turn, (jnp.zeros((), jnp.int32), x))
+        return y, ()
+
+    random, kernels = np.random.default_rng(5), KernelFunction(repeated)
+    args = random.normal(size=(9, 9)), random.normal(size=9), np.int32(3)
+    found, _ = kernels(args)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(found, repeated(tuple(map(jnp.asarray, args)), None)[0], rtol=1e-13)
+    form, _ = Form.of(args)
+    source = kernel_of(kernels, form.kept).text.source
+    before, _, after = source.partition("for (;;)")
+    assert before.count("wp::abs(given[") == 1 and "wp::abs(" not in after
+    # Rows of the matrix become columns, whose numbers a loop over results reads side by side.
+    assert not re.search(r"given\[\w+ \* 9", after)
