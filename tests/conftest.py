@@ -43,6 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     # What JAX traces is kept, so that looking for rubbish among it at JAX's pace takes a tenth of the time and finds little.
     gc.set_threshold(200_000, 20, 20)
+    # There is a worker for each core: threads of BLAS beside it wait for one another more than they work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Studies of minutes are worth optimising.
     if "not slow" in config.option.markexpr:
         os.environ.setdefault(FLAGS, COMPILED_FOR_TESTS)
