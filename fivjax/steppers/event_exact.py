@@ -109,6 +109,8 @@ class EventExact(AbstractStepper):
     ) -> Advance:
         return self.with_series(mechanics, contact, load, y, h, at_section)[0]
 
+    # Traced once for all functions that step so.
+    @eqx.filter_jit
     def with_series(
         self,
         mechanics: Mechanics,
