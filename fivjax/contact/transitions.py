@@ -114,7 +114,11 @@ def _following(
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
         own = ended[..., 0] | ended[..., 1]
         over = (own & (contact.status == Status.STICK)) | lifted
-        following = modes_from_forces(mechanics, load, y_next, contact, jnp.where(over, state_of(contact), NONE))
+        # Where slip has ended, the contact sticks if it can: where the static coefficient is larger, it could slide as well.
+        slides, slips = contact.status == Status.SLIDE, relative_velocity(mechanics, y) != 0
+        arrested = slides & slips & (relative_velocity(mechanics, y_next) == 0)
+        going_on = Contact(jnp.where(arrested, Status.STICK, contact.status), contact.direction)
+        following = modes_from_forces(mechanics, load, y_next, going_on, jnp.where(over, state_of(contact), NONE))
         # What the event does not reach goes on: a contact whose mode ends at the same instant has an event of its own.
         reached = affected_by(mechanics, own)
         status = jnp.where(reached, following.status, contact.status)

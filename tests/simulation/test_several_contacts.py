@@ -467,6 +467,32 @@ def test_one_contact_along_vectors_in_derivatives_maps_and_cycles():
     np.testing.assert_allclose(np.concatenate([end.displacement[-1], end.velocity[-1]]), mine.state, atol=1e-10)
 
 
+def test_a_contact_whose_slip_an_impact_elsewhere_ends_sticks_if_static_friction_holds_it():
+    """The other one lands, coupled by the mass matrix, and its impulse ends the slip: the force that holds the contact then is
+    above what sliding has, and below what sticking can have.
+    """
+    mass = np.array(
+        [[1.35, 0.0, -0.22, -0.07], [0.0, 2.18, 0.03, 0.61], [-0.22, 0.03, 1.85, 0.29], [-0.07, 0.61, 0.29, 1.43]]
+    )
+    load = np.array([-0.34, -1.0, 0.5, -1.0])
+    contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+    structure = fj.Structure(mass, np.zeros((4, 4)), 3.0 * np.eye(4), load, contacts=contacts)
+    scene = fj.Scene(structure, fj.Coulomb(0.3, 0.9), belt_speed=1.0, load=fj.ConstantLoad(5.0))
+    velocity, height, t1 = np.array([0.79, -1.0, 1.02, 0.0]), 1e-3, 2e-3
+    start = np.array([0.0, height, 0.0, 0.0])
+    run = fj.simulate(scene, t1, 1e-4, y0=(start, velocity))
+    # Both impulses lie in the cone of kinetic friction: nothing moves relative to the belt then.
+    slip = velocity - [1.0, 0.0, 1.0, 0.0]
+    impulses = -mass @ slip
+    assert np.all(np.abs(impulses[::2]) < 0.3 * impulses[1::2])
+    # What holds both: nothing accelerates.
+    holding = 3.0 * np.asarray(run.displacement)[-1] - 5.0 * load
+    shares = holding[::2] / holding[1::2]
+    assert 0.3 < abs(shares[1]) < 0.9 and abs(shares[0]) < 0.9
+    assert np.asarray(run.status)[-1].tolist() == [fj.Status.STICK, fj.Status.STICK]
+    np.testing.assert_allclose(np.asarray(run.friction_force)[-1] / np.asarray(run.normal_force)[-1], shares, rtol=1e-9)
+
+
 @pytest.mark.parametrize("count", range(2, 13))
 def test_weights_of_the_section_lie_far_apart_however_many_there_are(count):
     """Of so many in [1, 2), all would be 1/count apart at best, and are more than half of that: no two contacts cancel."""
