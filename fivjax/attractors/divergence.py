@@ -68,9 +68,11 @@ def long_divergence(
         growth, taken, met, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
         events[running] += met
-        # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades.
+        # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades. What
+        # rounding does to neighbours of a tiny motion is neither.
         with np.errstate(divide="ignore", invalid="ignore"):
-            parted[running] += MEASURED_OVER * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
+            more = MEASURED_OVER * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
+            parted[running] += np.where(APART * before > 64 * maps.alike[group[running]], more, 0.0)
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         last.put(running, at)
         # Not a number is neither.

@@ -130,7 +130,7 @@ def _started_by(scene: Scene, steps: LoadSteps) -> Float[Array, ""] | float:
     eps = float(jnp.finfo(scene.load.final.dtype).eps)
     if scene.friction.constant:
         return eps
-    noticed = 2.0**14 * eps
+    noticed = 2.0**22 * eps
     without_kick = jnp.max(jnp.abs(steps.loads)) <= noticed * jnp.abs(scene.load.final)
     return jnp.where(without_kick, noticed, eps)
 

@@ -132,7 +132,10 @@ class ReturnMaps:
         # The weighted size below which a motion of a group has faded.
         weights = np.atleast_1d(self.weights[self.structure.size + self.tangential])
         belts = np.abs(np.asarray(mechanics.belt_speed)).reshape(len(longest), -1)
-        self.faded = FADED * np.max(weights * belts, axis=1)
+        fastest = np.max(weights * belts, axis=1)
+        self.faded = FADED * fastest
+        # What differs by less is the same to friction that depends on slip: rounding beside the belt's speed.
+        self.alike = (0.0 if mechanics.friction.constant else np.finfo(float).eps) * fastest
 
     @classmethod
     def of(cls, scene: Scene) -> "ReturnMaps":

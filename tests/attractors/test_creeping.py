@@ -10,13 +10,14 @@ import fivjax as fj
 from fivjax.attractors.creeping import creep
 from fivjax.attractors.divergence import long_divergence
 from fivjax.attractors.motions import Motions
-from fivjax.section.return_maps import Images, Section
+from fivjax.section.return_maps import Images, ReturnMaps, Section
 
 
 class Line(SimpleNamespace):
     """The return map of a state (x, z): x drifts by `drift(x, group)` a return, and z decays to a curve, like other deviations."""
 
     weights = np.ones(2)
+    alike = np.zeros(1000)  # of groups: nothing is rounded away
 
     def moves(self, group, y):
         return np.ones(len(group), bool)
@@ -104,6 +105,24 @@ def test_neighbours_of_a_motion_that_grows_are_not_chaotic():
     at = Section(np.array([[1e-14, 0.0]]), np.ones(1, np.int32), np.ones(1))
     found = long_divergence(line, Motions(np.zeros(1, int), at))
     assert not found.chaotic[0] and found.closing_in[0] and found.at.y[0, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_what_rounding_does_to_neighbours_of_a_tiny_motion_is_no_chaos():
+    """Where friction falls, slip speeds that differ by 1e-16 of the belt's are the same. These motions grow by 1e-5 a second."""
+    mass, stiffness = np.diag([1.1, 1.1, 1.0]), np.array([[1.5, 0.9, 1.4], [0.9, 3.1, 0.9], [1.4, 0.9, 2.8]])
+    damping = np.array([[0.10, 0.05, 0.07], [0.05, 0.18, 0.04], [0.07, 0.04, 0.17]])
+    structure = fj.Structure(mass, damping, stiffness, [-0.4, -1.0, -1.0])
+    scene = fj.Scene(structure, fj.ExponentialDecay(0.48, 0.23, 2.4), 0.77, fj.ConstantLoad(1.0))
+
+    def growth(mu_static):
+        return float(np.max(np.real(fj.cea.eigenvalues(scene.replace(mu_static=mu_static)))))
+
+    maps = ReturnMaps.of(scene.replace(mu_static=brentq(lambda mu: growth(mu) - 1e-5, 0.3, 1.0, xtol=1e-14)))
+    y = np.random.default_rng(1).normal(size=(8, 6)) * np.repeat([1e-13, 1e-11], 4)[:, None]
+    y[:, [2, 5]] = 0.0
+    group = np.zeros(len(y), int)
+    found = long_divergence(maps, Motions(group, maps.in_contact(group, y)))
+    assert np.all(found.events == 0) and not np.any(found.chaotic)
 
 
 def test_without_a_kick_what_grows_comes_to_what_kicks_come_to():
