@@ -72,7 +72,7 @@ def long_divergence(
         # rounding does to neighbours of a tiny motion is neither.
         with np.errstate(divide="ignore", invalid="ignore"):
             more = MEASURED_OVER * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
-            parted[running] += np.where(APART * before > 64 * maps.alike[group[running]], more, 0.0)
+            parted[running] += np.where(APART * before > 64 * maps.resolution[group[running]], more, 0.0)
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         last.put(running, at)
         # Not a number is neither.

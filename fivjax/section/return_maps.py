@@ -135,7 +135,7 @@ class ReturnMaps:
         fastest = np.max(weights * belts, axis=1)
         self.faded = FADED * fastest
         # What differs by less is the same to friction that depends on slip: rounding beside the belt's speed.
-        self.alike = (0.0 if mechanics.friction.constant else np.finfo(float).eps) * fastest
+        self.resolution = (0.0 if mechanics.friction.constant else np.finfo(float).eps) * fastest
 
     @classmethod
     def of(cls, scene: Scene) -> "ReturnMaps":

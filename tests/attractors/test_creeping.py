@@ -17,7 +17,7 @@ class Line(SimpleNamespace):
     """The return map of a state (x, z): x drifts by `drift(x, group)` a return, and z decays to a curve, like other deviations."""
 
     weights = np.ones(2)
-    alike = np.zeros(1000)  # of groups: nothing is rounded away
+    resolution = np.zeros(1000)  # of groups: nothing is rounded away
 
     def moves(self, group, y):
         return np.ones(len(group), bool)

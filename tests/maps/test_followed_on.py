@@ -35,6 +35,7 @@ class Line:
     """A return map of which one coordinate is free, in place of `ReturnMaps`; one event per return beyond 2, none before."""
 
     weights, known_to, tangential, normal, sliding = np.ones(4), 1e-6, 0, 1, np.ones(2)
+    resolution = np.zeros(2)
     structure, section = types.SimpleNamespace(size=2, contacts=[None]), np.array([1.0, 0.0])
 
     def returns(self, group, at, crossings, kept=1, peaks=False):
