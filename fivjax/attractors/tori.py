@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from ..section.return_maps import ReturnMaps, section_at
 from . import tube
 from .cycles import (
+    AT_FIRST,
     CROSSINGS,
     MORE_CROSSINGS,
     MOST_CROSSINGS,
@@ -301,10 +302,17 @@ def with_cycles_amid(
     middles = [(row, one) for row in rows for one in _middles(traced[row])]
     rows, own = [row for row, _ in middles], np.array([group[row] for row, _ in middles])
     states = np.array([one for _, one in middles]) / maps.weights
-    near, closed = close_recurring(maps, Motions(own, section_at(states, maps.normal, maps.sliding[own])))
-    stable = np.max(np.abs(np.linalg.eigvals(closed.jacobian)), axis=1) < 1
-    found = zip((rows[k] for k in near), stable, points_on(maps, own[near], closed), strict=True)
-    return sorted({row for row, attracts, y in found if attracts and np.all(tubes[row].holds(maps.weights * y, NEAR))})
+    at = section_at(states, maps.normal, maps.sliding[own])
+    found = set()
+    # By Newton's method, which may lead astray from there; and from where motions lead.
+    for returns, recurrence in ((0, AT_FIRST), (128, Recurrence(nearly=0.01))):
+        at = maps.returns(own, at, returns).at if returns else at
+        near, closed = close_recurring(maps, Motions(own, at), recurrence)
+        stable = np.max(np.abs(np.linalg.eigvals(closed.jacobian)), axis=1) < 1
+        for k, attracts, y in zip(near, stable, points_on(maps, own[near], closed), strict=True):
+            if attracts and np.all(tubes[rows[k]].holds(maps.weights * y, NEAR)):
+                found.add(rows[k])
+    return sorted(found)
 
 
 def _chaotic(

@@ -617,3 +617,18 @@ def test_chaos_that_is_weak_is_no_torus():
     assert np.all(found["verdict"] == fj.Verdict.UNDECIDED) and np.all(found["chaotic"])
     with pytest.raises(fj.NoLimitCycle):
         fj.limit_cycle(scene)
+
+
+def test_a_stable_cycle_amid_a_torus_is_found_and_what_comes_to_it_is_not_on_the_torus():
+    """Next to the set on which the transient lingers there is a cycle to which Newton's method does not come from its middle."""
+    masses, stiffnesses = (0.5740043729372505, 0.015588146416319865), (112070.80222096035, 170185.63159544332)
+    parts = dict(zip(("m1", "m2", "k1", "k2"), (*masses, *stiffnesses), strict=True))
+    structure = fj.belt_oscillator(**parts, theta=0.2619158950973475, c1=0.17539750802864668, c2=1.7308489528862654)
+    scene = fj.Scene(
+        structure, fj.Coulomb(0.3542730888262558), 1.0351873694362148, fj.Pulse(100.0, p=3.0291391717756344)
+    )
+    m = fj.bistability_map(scene, p=[float(scene.load.p)], progress=False)
+    run = fj.simulate(scene, 8.0, 1e-3, derivatives="none")
+    late = np.abs(np.asarray(run.velocity)[4000:, 0]).max()
+    assert m.verdict.item() == fj.Verdict.LIMIT_CYCLE and m.attractor_kind.values.tolist() == ["periodic"]
+    assert m.amplitude.item() == pytest.approx(late, rel=1e-4)
