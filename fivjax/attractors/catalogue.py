@@ -148,6 +148,12 @@ class Catalogue(NamedTuple):
         tubes = [(part[place[part] < 0], one) for part, known in own for one in (*known.tori, *known.approaches)]
         return found | captured_by_tubes(self.maps, motions, latest, tubes)
 
+    def has_captured(self, motions: Motions) -> Bool[np.ndarray, " m"]:
+        """Which of these motions on the section a known attractor has captured."""
+        found = np.zeros(len(motions.group), bool)
+        found[list(self.captures(motions, ~found))] = True
+        return found
+
     def only(self, groups) -> "Catalogue":
         """The catalogue of these groups; what is added to it is added to the whole."""
         return self._replace(of_group={g: self.of_group[g] for g in groups})

@@ -5,7 +5,6 @@ each is asked, and from where it is thousands of returns later: cycles count how
 their neighbourhood is, and tori however narrow the tube from which everything comes back to them. The proof is the same.
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -142,7 +141,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     for tens of thousands.
     """
     maps, group = catalogue.maps, motions.group
-    followed = long_divergence(maps, motions, arrived=functools.partial(_captured, catalogue))
+    followed = long_divergence(maps, motions, arrived=catalogue.has_captured)
     now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
     run = _Underway(Motions(group, now), time, events)
     attractor: dict[int, Captor] = {}
@@ -170,13 +169,6 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     if len(rows):
         chaotic[rows] = long_divergence(maps, run.motions.rows(rows)).chaotic
     return Fates(chaotic, attractor, quiet, now, time, events)
-
-
-def _captured(catalogue: Catalogue, motions: Motions) -> Bool[np.ndarray, " m"]:
-    """Which of these motions an attractor has captured."""
-    found = np.zeros(len(motions.group), bool)
-    found[list(catalogue.captures(motions, ~found))] = True
-    return found
 
 
 def _creep(

@@ -73,8 +73,7 @@ def search_from(catalogue: Catalogue, motions: Motions) -> Motions:
             return motions
         catalogue.report(0)
         motions, done = _follow_lasting(catalogue.maps, motions, stop - done), stop
-        captured = np.zeros(len(motions.group), bool)
-        captured[list(catalogue.captures(motions, ~captured))] = True
+        captured = catalogue.has_captured(motions)
         picked = far_apart(weights * motions.at.y, motions.group, ~captured)
         if len(picked) and np.any(catalogue.add_cycles(motions.rows(picked), Recurrence(nearly=nearly))):
             captured[list(catalogue.captures(motions, ~captured))] = True

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..foundation.linear_solve import LARGEST_BY_COLUMNS
+from ..foundation.linear_solve import product
 from .coordinates import at_places, spread, with_values
 from .forces import Each, State, degrees_of_freedom
 from .guard import cone_margins
@@ -64,13 +64,7 @@ def magnitudes(
     """
     n = degrees_of_freedom(y)
     free = jnp.abs(mechanics.free_load) * jnp.abs(load)
-    if n > LARGEST_BY_COLUMNS:
-        free = free + jnp.abs(mechanics.free_position) @ y[:n] + jnp.abs(mechanics.free_velocity) @ y[n:]
-    else:
-        for j in range(n):
-            free = (
-                free + jnp.abs(mechanics.free_position[:, j]) * y[j] + jnp.abs(mechanics.free_velocity[:, j]) * y[n + j]
-            )
+    free = free + product(jnp.abs(mechanics.free_position), y[:n]) + product(jnp.abs(mechanics.free_velocity), y[n:])
     static = mechanics.friction.static
     of = _several_sizes if mechanics.several else _one_size
     tangential_force, normal_force, resting_n, onset = of(mechanics, contact, free, mode)

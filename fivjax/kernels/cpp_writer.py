@@ -303,7 +303,9 @@ class Writer:
         if any(isinstance(part, str) for part in views):
             return write()
         arrays = [part for part in views if isinstance(part, View)]
-        return self.once((name, form, kind, shape, *views), arrays, write)
+        # Numbers by their texts: 0.0 is not -0.0.
+        told = (part if isinstance(part, View) else text_of(part) for part in views)
+        return self.once((name, form, kind, shape, *told), arrays, write)
 
     def _plain_type(self, value: Value, otherwise: str) -> str:
         """That of the numbers of an array."""

@@ -248,3 +248,12 @@ def test_what_follows_from_what_is_given_is_computed_once_before_all_loops():
     assert before.count("wp::abs(given[") == 1 and "wp::abs(" not in after
     # Rows of the matrix become columns, whose numbers a loop over results reads side by side.
     assert not re.search(r"given\[\w+ \* 9", after)
+
+
+def test_what_differs_by_the_sign_of_a_zero_is_not_the_same():
+    def signs(args, instants):
+        (matrix,) = args
+        return (1.0 / (jnp.abs(matrix) * jnp.array(0.0))[0, 0], 1.0 / (jnp.abs(matrix) * jnp.array(-0.0))[0, 0]), ()
+
+    found, _ = KernelFunction(signs)((np.ones((9, 9)),))
+    assert tuple(map(float, found)) == (np.inf, -np.inf)
