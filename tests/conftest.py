@@ -22,7 +22,7 @@ COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_opt
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
 
-# The same holds for kernels: a third of the time without the later optimisations.
+# The same holds for kernels: a third of the time without the later optimisations, and a twelfth with none (`tests/simulation`).
 KERNELS_COMPILED_FOR_TESTS = "-O1 -fno-slp-vectorize"
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`

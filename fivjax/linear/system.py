@@ -6,7 +6,7 @@ from ..foundation import arguments
 from ..foundation.precision import is_known
 from ..model.friction import Coulomb
 from ..model.load import ConstantLoad
-from ..model.scene import Scene, scene_in_contact_coordinates
+from ..model.scene import Scene, check_corners, scene_in_contact_coordinates
 from ..model.structure import Structure
 
 
@@ -64,9 +64,7 @@ def with_axes(
         given = ", ".join(axes) or "none"
         raise ValueError(f"Give exactly {wanted}, as arrays; here the axes are: {given}.")
     scene = scene.replace(**{name: value for name, value in parameters.items() if name not in axes})
-    # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the ends of the axes.
-    for end in (0, -1):
-        scene.replace(**{name: values[end] for name, values in axes.items()})
+    check_corners(scene, axes)
     for name, values in axes.items():
         if _unseen(scene, name, values):
             raise ValueError(

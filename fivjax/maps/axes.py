@@ -1,6 +1,5 @@
 """Axes and arguments of maps and critical kicks, checked; and the critical friction that their datasets note."""
 
-import itertools
 import math
 import os
 from collections.abc import Mapping
@@ -9,7 +8,7 @@ import numpy as np
 
 from ..foundation import arguments
 from ..linear.critical import critical_friction
-from ..model.scene import Scene
+from ..model.scene import Scene, check_corners
 from ..steppers.base import AbstractStepper
 from .results import by_name, not_run
 
@@ -32,10 +31,7 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
         hint = hint or arguments.did_you_mean(unknown[0], scene.parameters)
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
     checked = {name: arguments.axis(name, values) for name, values in axes.items()}
-    # Every rule on a parameter is a bound, or an order between two parameters, so it is enough to check the corners of the
-    # grid.
-    for corner in itertools.product(*((values[0], values[-1]) for values in checked.values())):
-        scene.replace(**dict(zip(checked, corner, strict=True)))
+    check_corners(scene, checked)
     return checked
 
 

@@ -1,7 +1,8 @@
 """A scene: a structure pressed onto a moving belt, with a friction law and a load."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -163,6 +164,17 @@ class Scene(eqx.Module):
 
     def _repr_html_(self) -> str:
         return description.as_table(self)
+
+
+def check_corners(scene: Scene, axes: Mapping[str, np.ndarray]) -> None:
+    """Check that a scene may have all values of these rising axes of parameters.
+
+    Every rule on parameters is a bound, or an order between two of them, so it holds in the grid where it holds at all corners.
+
+    **Raises:** whatever `Scene.replace` refuses.
+    """
+    for corner in itertools.product(*((values[0], values[-1]) for values in axes.values())):
+        scene.replace(**dict(zip(axes, corner, strict=True)))
 
 
 def scene_in_contact_coordinates(scene: Scene) -> Scene:

@@ -641,6 +641,7 @@ def test_modes_of_a_scene_along_belt_speed():
 
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2))
+FALLING = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.5, 0.05, 0.5))
 
 
 @pytest.mark.parametrize(
@@ -663,6 +664,8 @@ SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2))
         (lambda: cea.chart(belt(), mu=[0.1, 0.2], k9=[1.0, 2.0]), "Unknown parameter `k9`"),
         (lambda: cea.chart(belt(), mu=[0.2, 0.1], k1=[1e5, 2e5]), "must be strictly increasing"),
         (lambda: cea.chart(belt(), mu=[0.1, 0.2], k1=[-1e5, 2e5]), "`k1` must be non-negative"),
+        # At one corner of the grid only: the first value of one axis with the last of the other.
+        (lambda: cea.chart(FALLING, mu_static=[0.2, 0.4], mu_dynamic=[0.1, 0.3]), "`mu_static` must be at least"),
         (lambda: cea.modes(belt(), mu=0.2), "exactly one axis"),
         (lambda: cea.modes("belt", mu=[0.2]), "must be a Structure or a Scene"),
     ],

@@ -209,17 +209,19 @@ def test_a_touch_between_two_samples_is_found_and_a_miss_is_none(depth):
             assert first > lowest_at
 
 
-# Two cycles that coexist; and a torus beside sliding, for which the search without kernels takes half a minute.
+# Two cycles that coexist, one of which nothing kicks into; and a torus beside sliding, for which the search without kernels takes
+# half a minute.
 @pytest.mark.parametrize(
-    ("belt_speed", "mu", "verdicts", "kinds"),
+    ("belt_speed", "mu", "kicks", "verdicts", "kinds"),
     [
-        (1.0, 0.26, {1}, ["periodic", "periodic"]),
-        pytest.param(3.0, 0.2, {0, 1}, ["torus"], marks=pytest.mark.slow),
+        (1.0, 0.26, 2, {1}, ["periodic", "periodic"]),
+        pytest.param(1.0, 0.26, 9, {1}, ["periodic", "periodic"], marks=pytest.mark.slow),
+        pytest.param(3.0, 0.2, 9, {0, 1}, ["torus"], marks=pytest.mark.slow),
     ],
 )
-def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch, belt_speed, mu, verdicts, kinds):
+def test_a_map_by_kernels_is_the_map_without_them(paper_scene, monkeypatch, belt_speed, mu, kicks, verdicts, kinds):
     """Verdicts, attractors and amplitudes."""
-    scene, p = paper_scene.replace(belt_speed=belt_speed, mu=mu), np.linspace(0.0, 3.0, 9)
+    scene, p = paper_scene.replace(belt_speed=belt_speed, mu=mu), np.linspace(0.0, 3.0, kicks)
     found = fj.bistability_map(scene, p=p, progress=False)
     for module in (sharing, kernel_scope):
         monkeypatch.setattr(module, "is_installed", lambda: False)
