@@ -52,7 +52,7 @@ def a_map(folder: Path, name: str) -> tuple[int, str, xr.Dataset | None]:
 def kinds(folder: Path) -> dict[str, list[Path]]:
     """The files that a map has kept, by kind."""
     traced = sorted((folder / "cache" / "fivjax" / "fivjax-traced").iterdir())
-    values, kernels = ("_laws", "written"), ("kernel-",)
+    values, kernels = ("_laws", "traced_source"), ("kernel-",)
     return {
         "kept programs": [path for path in traced if not path.name.startswith((*values, *kernels))],
         "kept values": [path for path in traced if path.name.startswith(values)],

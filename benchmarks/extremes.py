@@ -49,8 +49,8 @@ TURN_OF_A_STEP = 0.35  # rad that the fastest vibration turns by in the shortest
 def decided(trajectories: dict, energy: bool = False) -> Verdicts:
     start = ranges.FALLING if "decay" in trajectories else ranges.CONSTANT
     with np.errstate(all="ignore"), jax.enable_x64(True):
-        limits, means = engine.Limits(T_MAX, MAX_STEPS, energy), engine.Means("extremes")
-        return engine.run_to_verdict(start, engine.Listed(trajectories), fj.EventExact(), limits, means)
+        limits, means = engine.Limits(T_MAX, MAX_STEPS, energy), engine.RunOptions("extremes")
+        return engine.run_to_verdict(start, engine.TrajectoryList(trajectories), fj.EventExact(), limits, means)
 
 
 def drawn() -> list[tuple[dict, np.ndarray, np.ndarray]]:

@@ -267,14 +267,14 @@ def watched_memory():
 
 def steps() -> None:
     """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
-    from fivjax.maps.following import Batch, begin
+    from fivjax.maps.following import Batch, begin_all
     from fivjax.maps.groups import Task
     from fivjax.steppers.propagation import Propagation
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
     with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
         batch = Batch(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16), mu[:, None], pool)
-        trajectories = begin(batch, group, np.full((len(group), 1), 1.3))
+        trajectories = begin_all(batch, group, np.full((len(group), 1), 1.3))
         kernels, prepared = batch.matrix_kernels, batch.shared.tree.prepared
         kernels.follow(group, trajectories, steps)
         found = []

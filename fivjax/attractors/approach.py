@@ -18,11 +18,11 @@ from . import tube
 from .cycles import CROSSINGS, StableCycle, capturing_cycles
 from .motions import Motions
 from .returning import starts_beyond, starts_on_edges, tubes_returned_to
-from .tori import with_cycles_amid
+from .tori import around_stable_cycles
 from .tube import Tube, thin
 
 
-class Ways(NamedTuple):
+class PathSettings(NamedTuple):
     """How motions are followed on their ways into a cycle."""
 
     away: float  # their distance from it in the beginning, relative to its size
@@ -30,9 +30,9 @@ class Ways(NamedTuple):
     kept: int  # returns whose states count; of pilots all do
 
 
-ABOUT = Ways(0.1, 0, 32)
+ABOUT_CYCLES = PathSettings(0.1, 0, 32)
 # About a torus that is locked to a cycle of many crossings: along it motions take long.
-LOCKED = Ways(tube.RADIUS, 48, 128)
+ABOUT_LOCKED_TORI = PathSettings(tube.RADIUS, 48, 128)
 # Motions that are followed until they lead into a cycle, the most returns in which they do, and how many of their states are
 # kept at least, where there are more.
 PILOTS, LONGEST, ONWARD = 4, 16384, 1024
@@ -48,22 +48,22 @@ class Approach(NamedTuple):
 def approaches(
     maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], report
 ) -> list[Approach | None]:
-    """The approaches to cycles, each of its `group`; None where a tube about none was seen to be drawn in."""
+    """An approach to each of the cycles, each of its `group`; None where no tube about paths into it was seen to attract."""
     found: list[Approach | None] = [None] * len(cycles)
     # Where motions come from the edge of a tube to the neighbourhood in fewer returns than this, that says enough.
     worthwhile = 96
     small = [k for k, cycle in enumerate(cycles) if _returns_from(cycle, 0.5 * tube.RADIUS) > worthwhile]
     locked = [k for k in small if len(cycles[k].points) > CROSSINGS]
-    for chosen, ways in ([k for k in small if k not in locked], ABOUT), (locked, LOCKED):
+    for chosen, how in ([k for k in small if k not in locked], ABOUT_CYCLES), (locked, ABOUT_LOCKED_TORI):
         if not chosen:
             continue
         report(0)
-        states = _ways_in(maps, group[chosen], [cycles[k] for k in chosen], ways, report)
-        led = [chosen[place] for place in states]
-        tried = [Approach(cycles[k], Tube(own, tube.RADIUS)) for k, own in zip(led, states.values(), strict=True)]
-        drawn = {led[place]: tried[place] for place in _drawn_in(maps, group[led], tried, report).tolist()}
+        states = _paths_into(maps, group[chosen], [cycles[k] for k in chosen], how, report)
+        whose = [chosen[place] for place in states]
+        tried = [Approach(cycles[k], Tube(own, tube.RADIUS)) for k, own in zip(whose, states.values(), strict=True)]
+        drawn = {whose[place]: tried[place] for place in _attracting(maps, group[whose], tried, report).tolist()}
         curves = {k: maps.weights * one.cycle.points for k, one in drawn.items() if k in locked}
-        for k in with_cycles_amid(maps, group, curves, {k: drawn[k].tube for k in curves}):
+        for k in around_stable_cycles(maps, group, curves, {k: drawn[k].tube for k in curves}):
             del drawn[k]
         for k, one in drawn.items():
             found[k] = one
@@ -75,43 +75,44 @@ def _returns_from(cycle: StableCycle, away: float) -> float:
     return np.log(max(away / cycle.reach, 1.0)) * len(cycle.points) / (1 - cycle.multiplier)
 
 
-def _ways_in(
-    maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], ways: Ways, report
+def _paths_into(
+    maps: ReturnMaps, group: Int[np.ndarray, " c"], cycles: list[StableCycle], how: PathSettings, report
 ) -> dict[int, Float[np.ndarray, "k 2n"]]:
-    """The weighted states through which motions come into each cycle that start about it, the first of all motions first, by
-    the cycle's place: of those where pilots come into its neighbourhood, and the others to where those have been.
+    """The weighted states on paths that start about each cycle and lead into it, by the cycle's index, beginning with the first
+    state of each motion. Pilots are followed into the cycle's neighbourhood, the others until they come to where those have
+    been. Cycles without such paths are left out.
     """
     count, size = tube.STARTS, len(maps.weights)
-    about = [Tube(np.resize(maps.weights * cycle.points, (count, size)), ways.away) for cycle in cycles]
+    about = [Tube(np.resize(maps.weights * cycle.points, (count, size)), how.away) for cycle in cycles]
     own, at = np.repeat(group, count), starts_on_edges(maps, group, about)
-    if ways.settling:
-        at = maps.returns(own, at, ways.settling).at
-    at, paths = maps.path(own, at, ways.kept)
-    paths = np.swapaxes((maps.weights * paths).reshape(len(cycles), count, ways.kept, size), 1, 2)
+    if how.settling:
+        at = maps.returns(own, at, how.settling).at
+    at, paths = maps.path(own, at, how.kept)
+    paths = np.swapaxes((maps.weights * paths).reshape(len(cycles), count, how.kept, size), 1, 2)
     each = np.arange(len(own)).reshape(-1, count)
-    onward = _led_in(maps, Motions(own, at), each[:, :PILOTS], cycles, ways)
+    onward = _followed_into(maps, Motions(own, at), each[:, :PILOTS], cycles, how)
     # On long ways states lie close together.
-    led = {
+    whose = {
         k: thin(np.concatenate([np.zeros((0, size)), *states]), ONWARD)
         for k, states in onward.items()
         if np.all(np.isfinite(paths[k]))
     }
-    if not led:
+    if not whose:
         return {}
-    rows = list(led)
-    tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), led[k]]), tube.RADIUS) for k in rows]
+    rows = list(whose)
+    tubes = [Tube(np.concatenate([paths[k, :, :PILOTS].reshape(-1, size), whose[k]]), tube.RADIUS) for k in rows]
     others = at.rows(each[rows, PILOTS:].ravel())
     back, _ = tubes_returned_to(maps, group[rows], tubes, others, report)
-    return {k: np.concatenate([paths[k].reshape(-1, size), led[k]]) for k in (rows[place] for place in back)}
+    return {k: np.concatenate([paths[k].reshape(-1, size), whose[k]]) for k in (rows[place] for place in back)}
 
 
-def _led_in(
-    maps: ReturnMaps, motions: Motions, each: Int[np.ndarray, "c pilots"], cycles: list[StableCycle], ways: Ways
+def _followed_into(
+    maps: ReturnMaps, motions: Motions, each: Int[np.ndarray, "c pilots"], cycles: list[StableCycle], how: PathSettings
 ) -> dict[int, list[Float[np.ndarray, "k 2n"]]]:
     """Further weighted states of pilots, which have these rows for each cycle, until they are in its neighbourhood, by the
     cycle's place: of those where they come there in twice the time that the cycle's multiplier says.
     """
-    within = np.array([ways.kept + tube.HOME + 2 * _returns_from(cycle, ways.away) for cycle in cycles])
+    within = np.array([how.kept + tube.RETURNS_INSIDE + 2 * _returns_from(cycle, how.away) for cycle in cycles])
     states: dict[int, list] = {k: [] for k in range(len(cycles))}
     # Of a torus that is locked weakly it is enough that it is drawn in: on a closed curve that has a periodic motion all others
     # come to such ones.
@@ -119,7 +120,7 @@ def _led_in(
     within = np.minimum(within, LONGEST)
     left = np.zeros(len(motions.group), bool)
     left[each[~weakly]] = True
-    of, at, done = np.zeros(len(left), int), Section(*(part.copy() for part in motions.at)), ways.kept
+    of, at, done = np.zeros(len(left), int), Section(*(part.copy() for part in motions.at)), how.kept
     of[each] = np.arange(len(cycles))[:, None]
     while True:
         asked = [(rows[left[rows]], cycle) for rows, cycle in zip(each, cycles, strict=True)]
@@ -132,7 +133,7 @@ def _led_in(
         rows = np.flatnonzero(left)
         if not len(rows):
             return states
-        further = max(tube.HOME, done // 4)
+        further = max(tube.RETURNS_INSIDE, done // 4)
         ends, paths = maps.path(motions.group[rows], at.rows(rows), further)
         at.put(rows, ends)
         for row, path in zip(rows.tolist(), maps.weights * paths, strict=True):
@@ -140,7 +141,7 @@ def _led_in(
         done += further
 
 
-def _drawn_in(maps: ReturnMaps, group: Int[np.ndarray, " a"], tried: list[Approach], report) -> Int[np.ndarray, " d"]:
+def _attracting(maps: ReturnMaps, group: Int[np.ndarray, " a"], tried: list[Approach], report) -> Int[np.ndarray, " d"]:
     """Which of these tubes are drawn in: what starts on their edges comes back, above all where ways begin and further out."""
     left = np.arange(len(tried))
     for beyond in (True, False):

@@ -1,5 +1,5 @@
-"""The catalogue of the attractors of groups: what is known of each group, more found from where motions are, and by which of
-them motions have been captured.
+"""The catalogue of attractors: those that are known of each group, the search for more from where motions are, and which
+motions each has captured.
 
 Cycles are computed (`cycles`); what motions trace that no cycle captures is tried as a torus (`tori`).
 """
@@ -15,10 +15,10 @@ from .approach import Approach, approaches
 from .cycles import AT_FIRST, CROSSINGS, Recurrence, StableCycle, capturing_cycles, cycle_through, stable_cycles
 from .motions import Motions, far_apart
 from .returning import captured_by_tubes
-from .tori import TUBES, Torus, holds_one_of, tori_from
+from .tori import TUBES, Torus, contains_cycle, tori_from
 
 # By what a motion has been captured: a cycle's neighbourhood or approach, or a torus.
-Captor = StableCycle | Approach | Torus
+CapturingSet = StableCycle | Approach | Torus
 
 
 class Attractors(NamedTuple):
@@ -58,7 +58,7 @@ class Attractors(NamedTuple):
     def keep_apart(self, maps: ReturnMaps) -> None:
         """Leave out approaches in whose tubes other cycles lie: what they capture may come to those."""
         others = [(one, [cycle for cycle in self.cycles if cycle is not one.cycle]) for one in self.approaches]
-        self.approaches[:] = [one for one, cycles in others if not holds_one_of(maps, one.tube, cycles)]
+        self.approaches[:] = [one for one, cycles in others if not contains_cycle(maps, one.tube, cycles)]
 
 
 class Catalogue(NamedTuple):
@@ -131,7 +131,7 @@ class Catalogue(NamedTuple):
 
     def captures(
         self, motions: Motions, asked: Bool[np.ndarray, " m"], latest: Float[np.ndarray, "m 2n"] | None = None
-    ) -> dict[int, Captor]:
+    ) -> dict[int, CapturingSet]:
         """The known attractors of their groups by which motions have been captured, by row. Only those that are `asked` count;
         `latest` are their last crossings (`cycles.capturing_cycles`), unless they are on the section.
         """
@@ -144,7 +144,7 @@ class Catalogue(NamedTuple):
         own = [(part, self.of_group[int(g)]) for g, part in zip(which, np.split(rows, first[1:]), strict=True)]
         cycles = [(part, cycle) for part, known in own for cycle in known.cycles]
         place = capturing_cycles(self.maps, motions, latest, cycles)
-        found: dict[int, Captor] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
+        found: dict[int, CapturingSet] = {int(row): cycles[place[row]][1] for row in np.flatnonzero(place >= 0)}
         tubes = [(part[place[part] < 0], one) for part, known in own for one in (*known.tori, *known.approaches)]
         return found | captured_by_tubes(self.maps, motions, latest, tubes)
 

@@ -25,7 +25,7 @@ from ..section.return_maps import ReturnMaps, Section
 from .motions import Motions
 
 # Returns over which a drift is measured.
-OVER = 48
+DRIFT_RETURNS = 48
 # A leap is this share of the motion's size at most.
 LONGEST_LEAP = 0.05
 # The longest leaps of motions that grow about the equilibrium, or decay to it, in e-folds. Those that decay soon slide for
@@ -33,7 +33,7 @@ LONGEST_LEAP = 0.05
 LONGEST_GROWTH, LONGEST_DECAY = np.log(4.0), 0.2
 # A rate of growth changes with size no faster than this power of it.
 POWER = 4.0
-# Its other deviations are no larger beside it than before, so that it settles so many times sooner.
+# After a leap the other deviations are no larger beside the drift than before, so that the motion settles so many times sooner.
 SOONER = 8
 # Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
 LEAST_DRIFTS = 4.0
@@ -42,7 +42,7 @@ TRUSTED = 0.25
 
 
 class _Drift(NamedTuple):
-    """How motions drift over `OVER` returns."""
+    """How motions drift over `DRIFT_RETURNS` returns."""
 
     at: Section  # where they are at the end
     way: Float[np.ndarray, "m 2n"]  # weighted
@@ -109,7 +109,7 @@ def creep(
             skipped = 0.5 * times * (1 + 1 / faster)
         alike = np.where(grows, there.grows & (change <= np.log(1.5)), _alike(here.way, there.way))
         # Nor has it come back to the line after something else.
-        expected = here.events * (waits / OVER)
+        expected = here.events * (waits / DRIFT_RETURNS)
         alike &= np.abs(settled.events - expected) <= np.where(grows, 0.0, 2 + 0.05 * expected)
         kept = plain | (there.steady & alike & (there.events == here.events))
         share[rows] = np.where(plain, np.nan, np.where(kept, longer, 0.5 * share[rows]))
@@ -133,8 +133,8 @@ def creep(
 def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     """How motions drift in the latter half of `2 * OVER` returns."""
     group, at = motions
-    middle = maps.returns(group, at, OVER)
-    end = maps.returns(group, middle.at, OVER)
+    middle = maps.returns(group, at, DRIFT_RETURNS)
+    end = maps.returns(group, middle.at, DRIFT_RETURNS)
     before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
     steady = _alike(before, way) & (middle.events == end.events)
     passed, met = middle.time + end.time, middle.events + end.events

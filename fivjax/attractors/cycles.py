@@ -1,4 +1,5 @@
-"""Stable cycles of many groups, computed side by side from where trajectories nominate them, and who is captured by them.
+"""Stable cycles of many groups, closed side by side from states to which trajectories nearly return, and which motions each has
+captured.
 
 The return map is evaluated for many points of many groups in one batch: for Newton's method with its derivative, for
 neighbourhoods (`neighbourhood`) and for crossings of trajectories without. Everything else is small linear algebra.
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from ..section.return_maps import ReturnMaps, Section
 from .closing import Closed, close
 from .motions import Motions
-from .neighbourhood import LARGEST, Neighbourhood, Returned, Trial, neighbourhoods, side_by_side, trial
+from .neighbourhood import LARGEST, CycleTrial, Neighbourhood, ReturnImages, cycle_trial, neighbourhoods, side_by_side
 
 # Crossings of the section in one period: of cycles that are sought first; of those on a torus that is locked to them; and of
 # those on which neighbours close in.
@@ -168,9 +169,9 @@ def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndar
     return bool(apart < 1e-6 * np.linalg.norm(maps.weights * y))
 
 
-def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> Trial | None:
+def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> CycleTrial | None:
     y, status, direction = closed.at.rows(row)
-    found = trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status, y))
+    found = cycle_trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status, y))
     if found is None or closed.crossings[row] <= CROSSINGS:
         return found
     # A cycle of many crossings that captures only what is nearer than this lies on a torus that is locked weakly.
@@ -186,7 +187,7 @@ def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
         each = np.repeat(chosen, y.shape[1])
         at = centre.rows(each)._replace(y=y.reshape(-1, y.shape[-1]))
         image = maps.returns(group[each], at, crossings[each])
-        return Returned(*(part.reshape(*y.shape[:2], *part.shape[1:]) for part in (*image.at, image.events)))
+        return ReturnImages(*(part.reshape(*y.shape[:2], *part.shape[1:]) for part in (*image.at, image.events)))
 
     return returned
 

@@ -13,7 +13,7 @@ from .motions import Motions
 
 # Over so many returns growth is measured, again and again, and so often at most: the first returns turn directions to where
 # they grow. On a torus neighbours part no faster than linearly; in chaos exponentially.
-MEASURED_OVER, MEASURED = 48, 128
+WINDOW_RETURNS, MOST_WINDOWS = 48, 128
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
 # Neighbours have parted by so many e-folds since they were closest, as in chaos; or closed in by so many since they were
@@ -40,7 +40,7 @@ class Divergence(NamedTuple):
 
 
 class _Growth(NamedTuple):
-    """Motions and their neighbours after `MEASURED_OVER` returns."""
+    """Motions and their neighbours after `WINDOW_RETURNS` returns."""
 
     growth: Float[np.ndarray, " m"]  # the logarithm of the growth of their distance per return
     time: Float[np.ndarray, " m"]  # s
@@ -63,7 +63,7 @@ def long_divergence(
     time, events = time + first.time, events + first.events
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
-    for turn in range(MEASURED):
+    for turn in range(MOST_WINDOWS):
         before = np.linalg.norm(maps.weights * at.y, axis=1)
         growth, taken, met, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
@@ -71,7 +71,7 @@ def long_divergence(
         # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades. What
         # rounding does to neighbours of a tiny motion is neither.
         with np.errstate(divide="ignore", invalid="ignore"):
-            more = MEASURED_OVER * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
+            more = WINDOW_RETURNS * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
             parted[running] += np.where(APART * before > 64 * maps.resolution[group[running]], more, 0.0)
         least, most = np.fmin(least, parted), np.fmax(most, parted)
         last.put(running, at)
@@ -92,7 +92,7 @@ def long_divergence(
     return Divergence(chaotic, closing_in & ~chaotic, last, time, events)
 
 
-def parts_along(
+def diverges_along(
     maps: ReturnMaps, group: Int[np.ndarray, " m"], paths: Float[np.ndarray, "m k 2n"]
 ) -> Bool[np.ndarray, " m"]:
     """Whether neighbours part exponentially along these motions, by their weighted states on the section in order: chaos that
@@ -147,11 +147,11 @@ def _growth(maps: ReturnMaps, motions: Motions, beside) -> _Growth:
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     apart = np.linalg.norm(weights * (beside - at.y), axis=1)
     pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    pair, events, time, path, _ = maps.returns(np.tile(group, 2), pair, MEASURED_OVER, MEASURED_OVER)
+    pair, events, time, path, _ = maps.returns(np.tile(group, 2), pair, WINDOW_RETURNS, WINDOW_RETURNS)
     own = slice(None, len(group))
     at, other = pair.rows(own), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
     beside, distance = _brought_near(maps, at.y, away, size)
     with np.errstate(divide="ignore", invalid="ignore"):
-        growth = np.log(distance / apart) / MEASURED_OVER
+        growth = np.log(distance / apart) / WINDOW_RETURNS
     return _Growth(growth, time[own], events[own], at, beside, weights * path[own])

@@ -12,18 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..section.return_maps import ReturnMaps, Section
-from .catalogue import Captor, Catalogue
+from .catalogue import CapturingSet, Catalogue
 from .creeping import creep
 from .cycles import MORE_CROSSINGS, MOST_CROSSINGS, Recurrence
 from .divergence import long_divergence
 from .motions import Motions, far_apart
 from .tori import AT_A_TIME, TUBES, is_drifting
-from .tube import HOME
+from .tube import RETURNS_INSIDE
 
 # Times that a few more motions of each group are asked; and returns that those take which drift in between.
 TIMES, ONWARD = 4, 8192
 # Returns after which motions without events are asked again and again whether they slide for ever.
-SLID_ON = (HOME, 512, 512, 1024)
+SLID_ON = (RETURNS_INSIDE, 512, 512, 1024)
 # Which motions are certain to slide for ever.
 Slides = Callable[[Motions], Bool[np.ndarray, " r"]]
 
@@ -34,7 +34,7 @@ class Fates(NamedTuple):
     """
 
     chaotic: Bool[np.ndarray, " m"]
-    attractor: dict[int, Captor]
+    attractor: dict[int, CapturingSet]
     without_events: Bool[np.ndarray, " m"]
     at: Section
     time: Float[np.ndarray, " m"]  # s
@@ -45,7 +45,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
     """What becomes of these motions; their loads are final. The catalogue gets the attractors that are found."""
     maps, group = catalogue.maps, motions.group
     at, events, time, *_ = maps.returns(*motions, 1)
-    attractor: dict[int, Captor] = {}
+    attractor: dict[int, CapturingSet] = {}
     chaotic, quiet = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
@@ -88,7 +88,7 @@ class _Underway(NamedTuple):
 def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
     """The same of motions that nothing has captured by now: those without events are most likely slow to fade."""
     count = len(motions.group)
-    attractor: dict[int, Captor] = {}
+    attractor: dict[int, CapturingSet] = {}
     run = _Underway(motions, np.zeros(count), np.zeros(count, int))
     chaotic, quiet = np.zeros((2, count), bool)
     if slides is not None:
@@ -105,7 +105,7 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
 
 
 def _slide_on(
-    catalogue: Catalogue, run: _Underway, attractor: dict[int, Captor], slides: Slides
+    catalogue: Catalogue, run: _Underway, attractor: dict[int, CapturingSet], slides: Slides
 ) -> Bool[np.ndarray, " m"]:
     """Which of these motions are certain to slide for ever: while they have no events they are followed until that is so, or
     until they are captured, by an `attractor`.
@@ -144,7 +144,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     followed = long_divergence(maps, motions, arrived=catalogue.has_captured)
     now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
     run = _Underway(Motions(group, now), time, events)
-    attractor: dict[int, Captor] = {}
+    attractor: dict[int, CapturingSet] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
     for turn in range(TIMES + 1):
@@ -163,7 +163,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
-    quiet[rows] = maps.returns(*run.motions.rows(rows), HOME).events == 0
+    quiet[rows] = maps.returns(*run.motions.rows(rows), RETURNS_INSIDE).events == 0
     # Where neighbours closed in and yet there is no cycle, the motion was only regular for a time.
     rows = np.flatnonzero(left & (further | followed.closing_in) & ~quiet)
     if len(rows):

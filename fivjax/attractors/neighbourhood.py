@@ -76,7 +76,7 @@ class Neighbourhood(NamedTuple):
         return (size <= self.radius) & _same_mode(y, status, direction, self.status, self.direction)
 
 
-class Returned(NamedTuple):
+class ReturnImages(NamedTuple):
     """The images of several states of several cycles under their return maps; NaN where a motion does not come back."""
 
     y: Float[np.ndarray, "c m state"]
@@ -86,7 +86,7 @@ class Returned(NamedTuple):
 
 
 # The return maps of these cycles, by their places: each over its period, from its states of the section, in its contact mode.
-ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], Returned]
+ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], ReturnImages]
 
 
 def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
@@ -111,7 +111,7 @@ def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray
         return None
 
 
-class Trial(NamedTuple):
+class CycleTrial(NamedTuple):
     """A stable cycle with its adapted norm, about which a neighbourhood is sought; or several, `side_by_side`."""
 
     centre: Float[np.ndarray, "*c state"]
@@ -125,14 +125,14 @@ class Trial(NamedTuple):
     smallest: float | Float[np.ndarray, " c"]  # the last one
 
 
-def trial(
+def cycle_trial(
     centre: Float[np.ndarray, " state"],
     status: int | np.integer | Int[np.ndarray, " c"],
     direction: float | Float[np.ndarray, " c"],
     jacobian: Float[np.ndarray, "state state"],
     weights: Float[np.ndarray, " state"],
     basis: Float[np.ndarray, "state f"],
-) -> Trial | None:
+) -> CycleTrial | None:
     """The check to be made for a cycle; None if it is not stable by a margin. (Uncoupled oscillators have a second multiplier
     of 1, for a shift in time between them, so there is no check to make.)
 
@@ -145,8 +145,8 @@ def trial(
     if found is None or size == 0:
         return None
     root, rate = found
-    outwards = directions(basis.shape[1], len(weights))
-    return Trial(
+    outwards = sphere_directions(basis.shape[1], len(weights))
+    return CycleTrial(
         centre,
         status,
         direction,
@@ -160,7 +160,7 @@ def trial(
     )
 
 
-def neighbourhoods(trials: list[Trial], returned: ReturnMap) -> list[Neighbourhood | None]:
+def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighbourhood | None]:
     """Of each cycle the largest of a halving series of ellipsoids that the return map is checked to contract into itself.
 
     None if no ellipsoid passes, down to the smallest: trajectories near such a cycle stay undecided.
@@ -194,7 +194,7 @@ def neighbourhoods(trials: list[Trial], returned: ReturnMap) -> list[Neighbourho
 
 
 def _contraction(
-    trials: Trial,
+    trials: CycleTrial,
     chosen: Int[np.ndarray, " c"],
     one_in: int,
     radius: Float[np.ndarray, " c"],
@@ -206,7 +206,7 @@ def _contraction(
     """
     if not len(chosen):
         return radius
-    own = Trial(*(np.asarray(part)[chosen] for part in trials))
+    own = CycleTrial(*(np.asarray(part)[chosen] for part in trials))
     centre, sizes = own.centre[:, None], own.sizes[:, ::one_in]
     images = returned(chosen, centre + radius[:, None, None] * own.steps[:, ::one_in])
     away = (images.y - centre) @ np.swapaxes(own.norm, 1, 2)
@@ -217,7 +217,7 @@ def _contraction(
 
 
 def side_by_side(several: list):
-    """Several `Trial`s or `Neighbourhood`s as one, whose arrays have a leading axis over them."""
+    """Several `CycleTrial`s or `Neighbourhood`s as one, whose arrays have a leading axis over them."""
     return type(several[0])(*map(np.array, zip(*several, strict=True)))
 
 
@@ -228,7 +228,7 @@ def _same_mode(y, status, direction, other, other_direction):
 
 
 @functools.cache
-def directions(dimension: int, size: int) -> Float[np.ndarray, "d f"]:
+def sphere_directions(dimension: int, size: int) -> Float[np.ndarray, "d f"]:
     """Directions that fill the unit sphere evenly, in opposite pairs, including the axes: 64, or as many as large states need;
     as many for all cycles with states of this size, however many dimensions their contact modes leave free.
     """

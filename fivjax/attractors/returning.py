@@ -32,9 +32,9 @@ def tubes_returned_to(
         while crossed < within and len(running):
             report(0)
             # Most are back soon; the others are looked at in growing steps.
-            further = min(max(tube.HOME, crossed // 2), within - crossed)
+            further = min(max(tube.RETURNS_INSIDE, crossed // 2), within - crossed)
             crossed += further
-            image = maps.returns(own[running], last.rows(running), further, tube.HOME)
+            image = maps.returns(own[running], last.rows(running), further, tube.RETURNS_INSIDE)
             last.put(running, image.at)
             ends = weights * np.moveaxis(image.path, 1, 0)
             # One that fades, or fails, does not come back.
@@ -43,7 +43,7 @@ def tubes_returned_to(
             ok[of_tube[running[lost]]] = False
             for k in np.unique(of_tube[running]):
                 mine = of_tube[running] == k
-                back[running[mine]] = tubes[k].home(ends[:, mine], BACK_TO)
+                back[running[mine]] = tubes[k].holds_all(ends[:, mine], BACK_TO)
             running = running[ok[of_tube[running]] & ~back[running]]
         ok[of_tube[among & ~back]] = False
     return np.flatnonzero(ok), last
@@ -93,8 +93,8 @@ def captured_by_tubes(
     latest: Float[np.ndarray, "m 2n"],
     known: list[tuple[Int[np.ndarray, " r"], Tubular]],
 ) -> dict[int, Tubular]:
-    """Those to whose tubes motions have come, by row. `known` are those of a row's group, each with the rows that may have come
-    to it; as for `cycles.capturing_cycles`, `latest` tells which to ask, and their next crossings decide.
+    """The one of these sets whose tube has captured each motion, by row. `known` has each set with the rows that it may have
+    captured. As in `cycles.capturing_cycles`, the last crossings known, `latest`, tell which to ask; their next ones decide.
     """
     near = []
     for rows, one in known:
@@ -103,11 +103,11 @@ def captured_by_tubes(
     asked = np.unique(np.concatenate([np.zeros(0, int), *near]))
     if not len(asked):
         return {}
-    _, paths = maps.path(*motions.rows(asked), tube.HOME)
+    _, paths = maps.path(*motions.rows(asked), tube.RETURNS_INSIDE)
     found: dict[int, Tubular] = {}
     for (_, one), rows in zip(known, near, strict=True):
         open_ = np.array([row for row in rows if row not in found], int)
         if len(open_):
             ends = maps.weights * np.moveaxis(paths[np.searchsorted(asked, open_)], 1, 0)
-            found |= dict.fromkeys(open_[one.tube.home(ends)].tolist(), one)
+            found |= dict.fromkeys(open_[one.tube.holds_all(ends)].tolist(), one)
     return found

@@ -25,7 +25,7 @@ from .cycles import (
     points_on,
     stable_cycles,
 )
-from .divergence import growth_rates, parts_along
+from .divergence import diverges_along, growth_rates
 from .locked_tori import cycles_closed_in_on, cycles_repeated
 from .motions import NOMINATED, Motions, extent, smooth_mean
 from .returning import BACK_TO, starts_on_edges, tubes_returned_to
@@ -97,11 +97,11 @@ def tori_from(
         own = [{row: traced[row] for row in around}] if len(tubes) > 1 else []
         for paths in (traced | around, *own):
             tried = [(row, Tube(thin(paths[row].states, count).copy(), radius)) for row in paths if row in traced]
-            tried = [(row, one) for row, one in tried if not holds_one_of(maps, one, cycles[row])]
+            tried = [(row, one) for row, one in tried if not contains_cycle(maps, one, cycles[row])]
             if not tried:
                 continue
             new, of_locked = _attracting_tubes(maps, group, tried, cycles, report)
-            for row in with_cycles_amid(maps, group, {row: traced[row].states for row in new}, new):
+            for row in around_stable_cycles(maps, group, {row: traced[row].states for row in new}, new):
                 del new[row]
             for row in _chaotic(maps, group, traced, new):
                 del new[row], traced[row]
@@ -146,7 +146,9 @@ def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: i
         # An extent that changes so much is that of a motion on the way to a cycle.
         left = goes_on(ends) & (np.abs(_growth(ends)) <= np.log(1.5)) & maps.moves(group[running], at.y)
         for k in np.flatnonzero(left):
-            left[k] = not any(one.tube.home(ends[-tube.HOME :, k : k + 1]).item() for one in tori[running[k]])
+            left[k] = not any(
+                one.tube.holds_all(ends[-tube.RETURNS_INSIDE :, k : k + 1]).item() for one in tori[running[k]]
+            )
         if length >= count:
             whole = np.moveaxis(paths[:, -LONGER:], 1, 0)
             drifting = is_drifting(whole) & is_drifting(np.moveaxis(paths, 1, 0))
@@ -201,8 +203,9 @@ def is_drifting(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
 
 
 def goes_on(paths: Float[np.ndarray, "k *m 2n"]) -> Bool[np.ndarray, "*m"]:
-    """Whether a motion goes on, by its weighted states on the section, and the last of them is none of those up to `CROSSINGS`
-    before: else it is on a cycle. One that is locked weakly to a cycle of more crossings is better taken as on a torus.
+    """Whether a motion goes on without repeating itself, by its weighted states on the section: the last is none of the
+    `CROSSINGS` before it, or the motion is on a cycle. One that is locked weakly to a cycle of more is better taken as on a
+    torus.
     """
     with np.errstate(invalid="ignore"):
         width = extent(paths)
@@ -287,7 +290,7 @@ def _attracting_tubes(
     return dict(tubes[back[k]] for k in kept), cycles
 
 
-def with_cycles_amid(
+def around_stable_cycles(
     maps: ReturnMaps,
     group: Int[np.ndarray, " m"],
     traced: dict[int, Float[np.ndarray, "k 2n"]],
@@ -324,7 +327,7 @@ def _chaotic(
         return []
     # As many of each, so that no answer depends on which others are asked.
     paths = np.array([traced[row].states[-TRACED:] for row in rows])
-    return [row for row, parts in zip(rows, parts_along(maps, group[rows], paths), strict=True) if parts]
+    return [row for row, parts in zip(rows, diverges_along(maps, group[rows], paths), strict=True) if parts]
 
 
 def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]]:
@@ -341,7 +344,7 @@ def _middles(states: Float[np.ndarray, "k 2n"]) -> list[Float[np.ndarray, " 2n"]
     return found
 
 
-def holds_one_of(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
+def contains_cycle(maps: ReturnMaps, one: Tube, cycles: list[StableCycle]) -> bool:
     """Whether a stable cycle lies in a tube, or next to it: motions in its inner half may come to that instead."""
     return any(np.all(one.holds(maps.weights * cycle.points, NEAR)) for cycle in cycles)
 

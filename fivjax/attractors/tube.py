@@ -17,7 +17,7 @@ RADIUS = 0.04
 # Number of starts in it: one in four displaced outwards, one in four inwards, the others at random.
 STARTS = 16
 # Number of crossings in a row that must lie within half the tube.
-HOME = 16
+RETURNS_INSIDE = 16
 
 
 def mean_size(states: Float[np.ndarray, "k 2n"]) -> float:
@@ -82,7 +82,7 @@ class Tube:
         apart, _ = self._tree.query(np.where(finite[..., None], points, 0.0), distance_upper_bound=most)
         return finite & np.isfinite(apart)
 
-    def home(self, ends: Float[np.ndarray, "h m 2n"], within: float = 0.5) -> Bool[np.ndarray, " m"]:
+    def holds_all(self, ends: Float[np.ndarray, "h m 2n"], within: float = 0.5) -> Bool[np.ndarray, " m"]:
         """Which motions have come back: all of their last crossing states lie in this share of the tube."""
         return np.all(self.holds(ends, within), axis=0)
 

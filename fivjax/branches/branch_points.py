@@ -6,25 +6,25 @@ import numpy as np
 from jaxtyping import Complex
 
 from ..attractors.closing import close_near
-from ..cycles.around import middle_of_longest, seen_around
+from ..cycles.one_period import follow_period, middle_of_longest
 from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
 from .multiple_shooting import phases_around
-from .pseudo_arclength import Curve, Family, Place, multipliers_of
+from .pseudo_arclength import ComputedCycle, Curve, Family, multipliers_of
 from .special_points import Special
-from .verification import Real, crossings_of, on_section, real_motion
+from .verification import RealMotion, crossings_of, on_section, real_motion
 
 # Distances at which a branch goes on beyond what cannot be followed, as shares of the parameter's scale. A cycle that differs
 # in period or size by a larger share is of another branch.
 BEYOND = (1e-3, 3e-3, 1e-2)
 
 
-class Point(NamedTuple):
+class BranchPoint(NamedTuple):
     """A cycle on the branch with its multipliers, and its kind if it is a special point."""
 
     curve: Curve
-    place: Place
-    real: Real | None
+    cycle: ComputedCycle
+    real: RealMotion | None
     multipliers: Complex[np.ndarray, " m"]
     special: Special | None = None
 
@@ -33,7 +33,7 @@ class Point(NamedTuple):
         """Whether the real motion has the contact modes with which the cycle was computed, and its events where that has
         them.
         """
-        return _is_real(self.real, self.place)
+        return _is_real(self.real, self.cycle)
 
     @property
     def name(self) -> str:
@@ -41,32 +41,32 @@ class Point(NamedTuple):
         return "" if self.special is None else self.special.name
 
 
-def seen(family: Family, curve: Curve, place: Place, special: Special | None = None) -> Point:
+def branch_point(family: Family, curve: Curve, cycle: ComputedCycle, special: Special | None = None) -> BranchPoint:
     """A point of the branch from a computed cycle, with the real motion that starts on it."""
-    real = real_motion(family.at(place.parameter), family.stepper, place.phases)
-    return Point(curve, place, real, multipliers_of(place.images), special)
+    real = real_motion(family.at(cycle.parameter), family.stepper, cycle.phases)
+    return BranchPoint(curve, cycle, real, multipliers_of(cycle.images), special)
 
 
-def point_through(family: Family, parameter: float, start: SectionPoint, period: float) -> Point | None:
+def point_through(family: Family, parameter: float, start: SectionPoint, period: float) -> BranchPoint | None:
     """The point of a branch that is the cycle through a state; None at a special point, where its equations are singular."""
     scene = family.at(parameter)
-    segments = seen_around(scene, family.stepper, start, period).segments
+    segments = follow_period(scene, family.stepper, start, period).segments
     if np.any(segments.ended):
         # The point on the section may be where an event ends: a landing can make the tangential velocity jump through zero.
-        segments = seen_around(scene, family.stepper, middle_of_longest(segments), period).segments
+        segments = follow_period(scene, family.stepper, middle_of_longest(segments), period).segments
     phases = phases_around(segments)
     if phases is None:
         return None
     curve = Curve(family, phases)
-    place = curve.at_parameter(curve.unknowns(phases, parameter), parameter)
-    return None if place is None else seen(family, curve, place)
+    cycle = curve.at_parameter(curve.unknowns(phases, parameter), parameter)
+    return None if cycle is None else branch_point(family, curve, cycle)
 
 
-def beyond(family: Family, last: Point, sense: float) -> Point | None:
+def beyond(family: Family, last: BranchPoint, sense: float) -> BranchPoint | None:
     """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter, closed on the
     section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
     """
-    at, phases, scene = last.place.parameter, last.place.phases, family.at(last.place.parameter)
+    at, phases, scene = last.cycle.parameter, last.cycle.phases, family.at(last.cycle.parameter)
     start = None if last.real is None else on_section(scene, family.stepper, phases, last.real)
     crossings = None if start is None else crossings_of(ReturnMaps.of(scene), start)
     if start is None or crossings is None:
@@ -80,24 +80,24 @@ def beyond(family: Family, last: Point, sense: float) -> Point | None:
     return None
 
 
-def _are_alike(one: Point, other: Point, share: float) -> bool:
-    periods = one.place.phases.period, other.place.phases.period
-    sizes = [at.place.phases.size(at.curve.weights) for at in (one, other)]
+def _are_alike(one: BranchPoint, other: BranchPoint, share: float) -> bool:
+    periods = one.cycle.phases.period, other.cycle.phases.period
+    sizes = [at.cycle.phases.size(at.curve.weights) for at in (one, other)]
     return all(abs(b / a - 1) <= share for a, b in (periods, sizes))
 
 
-def is_real(family: Family, place: Place) -> bool:
+def is_real(family: Family, cycle: ComputedCycle) -> bool:
     """The same of a computed cycle."""
-    return _is_real(real_motion(family.at(place.parameter), family.stepper, place.phases), place)
+    return _is_real(real_motion(family.at(cycle.parameter), family.stepper, cycle.phases), cycle)
 
 
-def _is_real(real: Real | None, place: Place) -> bool:
+def _is_real(real: RealMotion | None, cycle: ComputedCycle) -> bool:
     found = None if real is None else real.phases
-    return found is not None and found.has_the_modes_of(place.phases) and not risen_to_zero(place)
+    return found is not None and found.has_the_modes_of(cycle.phases) and not risen_to_zero(cycle)
 
 
-def risen_to_zero(place: Place) -> list[int]:
+def risen_to_zero(cycle: ComputedCycle) -> list[int]:
     """The phases at whose computed end the guard rises: it has passed zero before, where the real motion has its event. In the
     last rebounds of a chain it neither rises nor falls, to rounding.
     """
-    return [k for k in place.phases.lasting() if not place.images.guard_h[k] < 0]
+    return [k for k in cycle.phases.lasting() if not cycle.images.guard_h[k] < 0]

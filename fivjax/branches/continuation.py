@@ -31,7 +31,7 @@ from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
 from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
-from .branch_points import Point, point_through
+from .branch_points import BranchPoint, point_through
 from .following import follow_branch
 from .multiple_shooting import Mode, Phases, parameter_direction
 from .pseudo_arclength import Family
@@ -201,14 +201,14 @@ def _checked_bounds(bounds) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
+def _dataset(xr, family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
     size = 2 * family.scene.structure.size
     states, status, direction, amplitude, slides = [], [], [], [], []
     for point in points:
-        scene = family.at(point.place.parameter)
+        scene = family.at(point.cycle.parameter)
         slides.append(bool(sliding_rates(scene)[0].real < 0))
         rest = sliding_state(scene, scene.load.final)
-        at = None if point.real is None else on_section(scene, family.stepper, point.place.phases, point.real)
+        at = None if point.real is None else on_section(scene, family.stepper, point.cycle.phases, point.real)
         states.append(np.full(size, np.nan) if at is None else np.asarray(at.y) + rest)
         status.append(-1 if at is None else int(at.contact.status))
         direction.append(np.nan if at is None else float(at.contact.direction))
@@ -220,13 +220,13 @@ def _dataset(xr, family: Family, points: list[Point], slopes) -> "xr.Dataset":
     names = list(family.scene.structure.coordinates)
     dataset = xr.Dataset(
         {
-            "parameter": ("point", [point.place.parameter for point in points]),
-            "period": ("point", [point.place.phases.period for point in points]),
+            "parameter": ("point", [point.cycle.parameter for point in points]),
+            "period": ("point", [point.cycle.phases.period for point in points]),
             "amplitude": ("point", amplitude),
             "multipliers": (("point", "multiplier"), multipliers),
             "stable": ("point", largest < 1 - MARGIN),
             "sliding_stable": ("point", slides),
-            "word": ("point", [word_of(point.place.phases) for point in points]),
+            "word": ("point", [word_of(point.cycle.phases) for point in points]),
             "special": ("point", [point.name for point in points]),
             "state": (("point", "coordinate"), np.stack(states)),
             "status": ("point", np.array(status, np.int8)),

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..foundation.progress import stage
-from .branch_points import Point, beyond, seen
-from .meeting_sliding import where_sliding_is_met
+from ..linear.linearisation import sliding_rates
+from .branch_points import BranchPoint, beyond, branch_point
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
-from .pseudo_arclength import Curve, Family, Place
-from .special_points import between
+from .pseudo_arclength import ComputedCycle, Curve, Family
+from .special_points import MEETS_SLIDING, Special, between
 
 # Lengths of steps, in the units of the curve (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
@@ -28,18 +28,20 @@ MOST_GAPS = 16
 SMALL = 0.02
 
 
-class Followed(NamedTuple):
+class HalfBranch(NamedTuple):
     """One direction of a branch."""
 
-    points: list[Point]
+    points: list[BranchPoint]
     ending: str  # why it ends, a sentence
 
 
-def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[float, float], most: int) -> Followed:
+def follow_branch(
+    family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float], most: int
+) -> HalfBranch:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
-    here, tangent = start, start.curve.tangent(start.place, None)
+    here, tangent = start, start.curve.tangent(start.cycle, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
-    points: list[Point] = []
+    points: list[BranchPoint] = []
     step, gaps = FIRST, 0
 
     def over_a_gap():
@@ -50,67 +52,67 @@ def follow_branch(family: Family, start: Point, sense: float, bounds: tuple[floa
     while len(points) < most:
         stage(f"following, {len(points)} cycles so far")
         curve = here.curve
-        ahead = _ahead(curve, here.place, tangent, step)
+        ahead = _ahead(curve, here.cycle, tangent, step)
         if ahead is None:
-            return Followed(points, _at(family, here, "no cycle is found further on, however short the step"))
+            return HalfBranch(points, _at(family, here, "no cycle is found further on, however short the step"))
         following, turned, step = ahead
-        last = seen(family, curve, following)
+        last = branch_point(family, curve, following)
         if not last.is_real:
             changed = change_of_modes(family, here, tangent, step)
             if changed is None:
                 if step > 100 * SHORTEST:
                     step *= 0.25
                     continue
-                return Followed(points, _at(family, here, "the contact modes change in a way that is not understood"))
+                return HalfBranch(points, _at(family, here, "the contact modes change in a way that is not understood"))
             special, onward = changed
-            if not bounds[0] <= special.place.parameter <= bounds[1]:
-                return _to_bound(family, points, here, tangent, special.place, bounds)
+            if not bounds[0] <= special.cycle.parameter <= bounds[1]:
+                return _to_bound(family, points, here, tangent, special.cycle, bounds)
             if special.curve is curve:
                 # The parameter may turn back just there.
-                passed = _specials(family, curve, here.place, tangent, special.place)
-                points += [one for one in passed if np.linalg.norm(one.place.u - special.place.u) > 1e-6]
-            at_change = seen(family, special.curve, special.place, special)
+                passed = _specials(family, curve, here.cycle, tangent, special.cycle)
+                points += [one for one in passed if np.linalg.norm(one.cycle.u - special.cycle.u) > 1e-6]
+            at_change = branch_point(family, special.curve, special.cycle, special)
             if onward is not None or at_change.real is not None:
                 points.append(at_change)
             onward = onward or over_a_gap()
             if onward is None:
-                return Followed(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
+                return HalfBranch(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
             continue
-        passed = _specials(family, curve, here.place, tangent, following)
-        points += [point for point in passed if bounds[0] <= point.place.parameter <= bounds[1]]
+        passed = _specials(family, curve, here.cycle, tangent, following)
+        points += [point for point in passed if bounds[0] <= point.cycle.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
-            return _to_bound(family, points, here, following.u - here.place.u, following, bounds)
+            return _to_bound(family, points, here, following.u - here.cycle.u, following, bounds)
         if (turned_at := _met_before(points, last)) is not None:
             # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
             points = points[: turned_at + 1]
             onward = over_a_gap()
             if onward is None:
                 why = "the branch would come back on itself, and nothing else was found to go on"
-                return Followed(points, _at(family, points[-1], why))
+                return HalfBranch(points, _at(family, points[-1], why))
             here, tangent, step = onward
             continue
         points.append(last)
         if _smallness(curve, following) < SMALL:
-            end = where_sliding_is_met(family, last)
+            end = _where_sliding_is_met(family, last)
             if end is None:
-                return Followed(points, _at(family, last, "the amplitude goes to zero"))
-            return Followed(
+                return HalfBranch(points, _at(family, last, "the amplitude goes to zero"))
+            return HalfBranch(
                 [*points, end],
-                f"At {family.name} = {end.place.parameter:.13g} the amplitude meets the sliding equilibrium, whose stability "
+                f"At {family.name} = {end.cycle.parameter:.13g} the amplitude meets the sliding equilibrium, whose stability "
                 f"changes there.",
             )
         if len(points) > 8 and _closes(start, here, last):
-            return Followed(points, _at(family, last, "the branch is back where it began"))
+            return HalfBranch(points, _at(family, last, "the branch is back where it began"))
         easy = following.iterations <= 3
         step = min(step * ((SOON if step < FIRST else LATER) if easy else 0.7), LONGEST)
         here, tangent = with_own_rebounds(family, last, turned)
-    return Followed(points, _at(family, here, f"`points` = {most} points are computed"))
+    return HalfBranch(points, _at(family, here, f"`points` = {most} points are computed"))
 
 
 def _ahead(
-    curve: Curve, here: Place, tangent: Float[np.ndarray, " m"], step: float
-) -> tuple[Place, Float[np.ndarray, " m"], float] | None:
+    curve: Curve, here: ComputedCycle, tangent: Float[np.ndarray, " m"], step: float
+) -> tuple[ComputedCycle, Float[np.ndarray, " m"], float] | None:
     """The next cycle, the tangent there, and the step to it, which is shortened until there is a cycle and the curve is nearly
     straight up to it. None if there is none, however short the step.
     """
@@ -129,80 +131,103 @@ def _ahead(
 
 def _to_bound(
     family: Family,
-    points: list[Point],
-    here: Point,
+    points: list[BranchPoint],
+    here: BranchPoint,
     along: Float[np.ndarray, " m"],
-    beyond: Place,
+    beyond: ComputedCycle,
     bounds: tuple[float, float],
-) -> Followed:
+) -> HalfBranch:
     """The points up to a bound of the parameter, which lies between a point and what is `beyond` it in the direction `along`:
     with the cycle at the bound, if it is found.
     """
     bound = bounds[0] if beyond.parameter < bounds[0] else bounds[1]
-    share = (bound - here.place.parameter) / (along[-1] * family.scale)
-    at = here.curve.at_parameter(here.place.u + share * along, bound)
-    last = [] if at is None else [seen(family, here.curve, at)]
-    return Followed(
+    share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
+    at = here.curve.at_parameter(here.cycle.u + share * along, bound)
+    last = [] if at is None else [branch_point(family, here.curve, at)]
+    return HalfBranch(
         points + [point for point in last if point.is_real], f"The bound {family.name} = {bound:.10g} is reached."
     )
 
 
-def _at(family: Family, point: Point, why: str) -> str:
-    return f"At {family.name} = {point.place.parameter:.12g} {why}."
+def _at(family: Family, point: BranchPoint, why: str) -> str:
+    return f"At {family.name} = {point.cycle.parameter:.12g} {why}."
 
 
-def _specials(family: Family, curve: Curve, a: Place, tangent, b: Place) -> list[Point]:
-    return [seen(family, curve, special.place, special) for special in between(curve, a, tangent, b)]
+def _specials(family: Family, curve: Curve, a: ComputedCycle, tangent, b: ComputedCycle) -> list[BranchPoint]:
+    return [branch_point(family, curve, special.cycle, special) for special in between(curve, a, tangent, b)]
 
 
-def _over_a_gap(family: Family, points: list[Point], start: Point, sense: float, bounds: tuple[float, float]):
+def _over_a_gap(
+    family: Family, points: list[BranchPoint], start: BranchPoint, sense: float, bounds: tuple[float, float]
+):
     """The point, tangent and step with which to go on where the next cycles cannot be followed; the point is added. The
     parameter may turn back there, but not to where the branch has come from.
     """
     before, last = [start, start, *points][-2:]
-    onwards = np.sign(last.place.parameter - before.place.parameter) or sense
+    onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or sense
     for way in (onwards, -onwards) if points else (sense,):
         found = beyond(family, last, way)
-        if found is None or not bounds[0] <= found.place.parameter <= bounds[1]:
+        if found is None or not bounds[0] <= found.cycle.parameter <= bounds[1]:
             continue
         if _met_before([start, *points, found], found) is None:
             points.append(found)
-            tangent = found.curve.tangent(found.place, None)
+            tangent = found.curve.tangent(found.cycle, None)
             return found, tangent * np.sign(way * tangent[-1]), FIRST
     return None
 
 
-def _smallness(curve: Curve, place: Place) -> float:
+def _smallness(curve: Curve, cycle: ComputedCycle) -> float:
     """The size of a cycle of pure sliding, relative to its size where the curve began; other cycles end before they are
     small.
     """
-    pure = len(place.phases.modes) == 1 and place.phases.modes[0].ending == AT_SECTION
-    return float(np.linalg.norm(place.u[: len(curve.of_state)])) if pure else np.inf
+    pure = len(cycle.phases.modes) == 1 and cycle.phases.modes[0].ending == AT_SECTION
+    return float(np.linalg.norm(cycle.u[: len(curve.of_state)])) if pure else np.inf
 
 
-def _met_before(points: list[Point], last: Point) -> int | None:
+def _met_before(points: list[BranchPoint], last: BranchPoint) -> int | None:
     """Where a branch has turned back, if its latest cycle is one that it has come along before: the last point until then."""
     if last.real is None:
         return None
-    parameters = np.array([point.place.parameter for point in points])
-    value, period = last.place.parameter, last.place.phases.period
+    parameters = np.array([point.cycle.parameter for point in points])
+    value, period = last.cycle.parameter, last.cycle.phases.period
     for k in np.flatnonzero((parameters[:-2] - value) * (parameters[1:-1] - value) <= 0):
         near = points[k]
         # Between these two points, or nearly so: elsewhere the cycle need not be computed.
-        one, other = near.place.phases.period, points[k + 1].place.phases.period
+        one, other = near.cycle.phases.period, points[k + 1].cycle.phases.period
         if abs(period - 0.5 * (one + other)) > 1.5 * abs(one - other) + SAME * period:
             continue
-        before = near.curve.at_parameter(near.place.u, value)
+        before = near.curve.at_parameter(near.cycle.u, value)
         if before is None or abs(before.phases.period - period) > SAME * period:
             continue
-        size, own = (at.phases.size(near.curve.weights) for at in (before, last.place))
+        size, own = (at.phases.size(near.curve.weights) for at in (before, last.cycle))
         if abs(size - own) <= 10 * SAME * size:
             return int(k + np.argmax(np.abs(parameters[k:] - value)))
     return None
 
 
-def _closes(start: Point, here: Point, last: Point) -> bool:
+def _closes(start: BranchPoint, here: BranchPoint, last: BranchPoint) -> bool:
     if start.curve.modes != last.curve.modes:
         return False
-    a, b, c = (point.place.u * point.curve.scales / start.curve.scales for point in (here, start, last))
+    a, b, c = (point.cycle.u * point.curve.scales / start.curve.scales for point in (here, start, last))
     return bool(np.linalg.norm(b - a) < np.linalg.norm(c - a) and np.linalg.norm(c - b) < np.linalg.norm(c - a))
+
+
+def _where_sliding_is_met(family: Family, last: BranchPoint) -> BranchPoint | None:
+    """The stability limit of sliding next to the last of shrinking cycles, as a point of their branch; None if none is near."""
+    from scipy.optimize import brentq
+
+    def growth(parameter: float) -> float:
+        return float(sliding_rates(family.at(parameter))[0].real)
+
+    near, width = last.cycle.parameter, 1e-6 * family.scale
+    for _ in range(16):
+        low, high = growth(near - width), growth(near + width)
+        if low * high < 0:
+            limit = float(brentq(growth, near - width, near + width, xtol=1e-15, rtol=1e-15))
+            fastest = sliding_rates(family.at(limit))[0]
+            rest, period = np.zeros_like(last.cycle.phases.y), np.array([2 * np.pi / abs(fastest.imag)])
+            cycle = last.cycle._replace(parameter=limit, phases=last.cycle.phases._replace(y=rest, h=period))
+            unknown = np.full_like(last.multipliers, np.nan)
+            return BranchPoint(last.curve, cycle, None, unknown, Special(MEETS_SLIDING, last.curve, cycle))
+        width *= 2
+    return None

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..contact import Status
-from .multiple_shooting import Images, Mode, Phases, inside, looked_up
-from .pseudo_arclength import Curve, Place, assembled
+from .multiple_shooting import Mode, PhaseImages, Phases, images_of_phases, inside
+from .pseudo_arclength import ComputedCycle, Curve, assembled
 
 MOST_ITERATIONS = 12
 EXACT = 1e-13
@@ -28,7 +28,7 @@ NAMES = {
 }
 
 
-class Touch(NamedTuple):
+class GuardMinimum(NamedTuple):
     """A minimum of a guard inside a phase; or a guard at the start of a phase, where it decides which mode follows."""
 
     phase: int
@@ -41,15 +41,15 @@ class Touch(NamedTuple):
 class Grazing(NamedTuple):
     """A cycle with a guard that touches zero."""
 
-    place: Place
-    touch: Touch
+    cycle: ComputedCycle
+    minimum: GuardMinimum
     row: Float[np.ndarray, " m"]  # derivative of the guard's minimum by the unknowns
 
 
-def touches(curve: Curve, place: Place) -> list[Touch]:
+def guard_minima(curve: Curve, cycle: ComputedCycle) -> list[GuardMinimum]:
     """All minima of guards inside the phases of a cycle, the lowest first."""
-    family, phases = curve.family, place.phases
-    looked = inside(family.at(place.parameter), family.stepper, phases)
+    family, phases = curve.family, cycle.phases
+    looked = inside(family.at(cycle.parameter), family.stepper, phases)
     found = []
     for k, mode in enumerate(phases.modes):
         step = phases.h[k] / (looked.guards.shape[1] - 1)
@@ -59,7 +59,7 @@ def touches(curve: Curve, place: Place) -> list[Touch]:
             if not size > 0:
                 continue
             if mode.status == Status.STICK or (mode.status == Status.SLIDE and j == 0):
-                found.append(Touch(k, j, 0.0, float(guard[0] / size), 0.0))
+                found.append(GuardMinimum(k, j, 0.0, float(guard[0] / size), 0.0))
             inner = guard[1:-1]
             for i in np.flatnonzero((inner <= guard[:-2]) & (inner <= guard[2:])) + 1:
                 bend = float(guard[i - 1] - 2 * guard[i] + guard[i + 1]) / step**2
@@ -68,47 +68,49 @@ def touches(curve: Curve, place: Place) -> list[Touch]:
                 value = guard[i] + 0.5 * slope * shift
                 if bend <= 0:
                     continue
-                found.append(Touch(k, j, float(i * step + shift), float(value / size), float(bend)))
-    return sorted(found, key=lambda touch: touch.value)
+                found.append(GuardMinimum(k, j, float(i * step + shift), float(value / size), float(bend)))
+    return sorted(found, key=lambda minimum: minimum.value)
 
 
-def looked_at(curve: Curve, parameter: float, phases: Phases, touch: Touch, direction=None) -> tuple[Images, Images]:
+def images_up_to_minimum(
+    curve: Curve, parameter: float, phases: Phases, minimum: GuardMinimum, direction=None
+) -> tuple[PhaseImages, PhaseImages]:
     """Images of all phases, and of the phase with the minimum up to its instant."""
-    family, k = curve.family, touch.phase
+    family, k = curve.family, minimum.phase
     status, pointing, _ = phases.modes[k]
-    partial = Mode(status, pointing, touch.guard)
+    partial = Mode(status, pointing, minimum.guard)
     modes = (*phases.modes, partial)
     following = (*phases.modes[1:], phases.modes[0], partial)
-    found = looked_up(
+    found = images_of_phases(
         family.at(parameter),
         family.direction if direction is None else direction,
         family.stepper,
         modes,
         following,
         np.concatenate([phases.y, phases.y[k : k + 1]]),
-        np.append(phases.h, touch.time),
+        np.append(phases.h, minimum.time),
     )
-    return Images(*(part[:-1] for part in found)), Images(*(part[-1:] for part in found))
+    return PhaseImages(*(part[:-1] for part in found)), PhaseImages(*(part[-1:] for part in found))
 
 
-def row_of(curve: Curve, phases: Phases, touch: Touch, partial: Images) -> Float[np.ndarray, " m"]:
+def row_of(curve: Curve, phases: Phases, minimum: GuardMinimum, partial: PhaseImages) -> Float[np.ndarray, " m"]:
     """The derivative of a guard's minimum by the unknowns; to first order, a change of its instant has no effect."""
     size = phases.y.shape[1]
     row = np.zeros(len(curve.scales))
-    row[touch.phase * size : (touch.phase + 1) * size] = partial.guard_y[0]
+    row[minimum.phase * size : (minimum.phase + 1) * size] = partial.guard_y[0]
     row[-1] = partial.guard_parameter[0]
     return row * curve.scales
 
 
-def grazing_near(curve: Curve, guess: Place, touch: Touch) -> Grazing | None:
+def grazing_near(curve: Curve, guess: ComputedCycle, minimum: GuardMinimum) -> Grazing | None:
     """The cycle near a guess on which this guard touches zero."""
     u, last = guess.u.copy(), np.inf
     for iteration in range(MOST_ITERATIONS):
         phases, parameter = curve.phases(u)
-        found, partial = looked_at(curve, parameter, phases, touch)
+        found, partial = images_up_to_minimum(curve, parameter, phases, minimum)
         residuals, rows = assembled(found, phases)
         residuals, rows = np.append(residuals, partial.guard[0]), rows * curve.scales
-        row = row_of(curve, phases, touch, partial)
+        row = row_of(curve, phases, minimum, partial)
         system = np.vstack([rows, row])
         sizes = np.max(np.abs(system), axis=1)
         sizes = np.where(sizes > 0, sizes, 1.0)
@@ -120,27 +122,29 @@ def grazing_near(curve: Curve, guess: Place, touch: Touch) -> Grazing | None:
             return None
         size = float(np.max(np.abs(step)))
         slope = float(partial.guard_h[0])
-        shift = -slope / touch.bend if touch.bend > 0 else 0.0
-        limit = 0.25 * phases.h[touch.phase]
+        shift = -slope / minimum.bend if minimum.bend > 0 else 0.0
+        limit = 0.25 * phases.h[minimum.phase]
         shift = float(np.clip(shift, -limit, limit))
         if (size < EXACT and abs(shift) < 1e-9 * curve.time) or (last < 1e-10 and size > 0.5 * last):
-            place = Place(u, rows / sizes[:-1, None], found, phases, parameter, iteration)
-            return Grazing(place, touch, row / sizes[-1])
+            cycle = ComputedCycle(u, rows / sizes[:-1, None], found, phases, parameter, iteration)
+            return Grazing(cycle, minimum, row / sizes[-1])
         if size > (FIRST_STEP if iteration == 0 else 0.5):
             return None
         u, last = u + step, size
-        if touch.bend > 0:
-            touch = touch._replace(time=touch.time + shift, bend=_bend(curve, u, touch, shift))
+        if minimum.bend > 0:
+            minimum = minimum._replace(time=minimum.time + shift, bend=_bend(curve, u, minimum, shift))
     return None
 
 
-def _bend(curve: Curve, u, touch: Touch, shift: float) -> float:
+def _bend(curve: Curve, u, minimum: GuardMinimum, shift: float) -> float:
     """The guard's second derivative in time, by a difference of its slopes."""
     phases, parameter = curve.phases(u)
     apart = 1e-4 * curve.time
     slopes = [
-        looked_at(curve, parameter, phases, touch._replace(time=touch.time + shift + side * apart))[1].guard_h[0]
+        images_up_to_minimum(curve, parameter, phases, minimum._replace(time=minimum.time + shift + side * apart))[
+            1
+        ].guard_h[0]
         for side in (-1.0, 1.0)
     ]
     bend = float(slopes[1] - slopes[0]) / (2 * apart)
-    return bend if bend > 0 else touch.bend
+    return bend if bend > 0 else minimum.bend

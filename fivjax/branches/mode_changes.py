@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..contact import Status
-from .branch_points import Point, is_real, risen_to_zero, seen
+from .branch_points import BranchPoint, branch_point, is_real, risen_to_zero
 from .grazing import NAMES
 from .multiple_shooting import AT_SECTION, Phases
-from .pseudo_arclength import Curve, Family, Place
+from .pseudo_arclength import ComputedCycle, Curve, Family
 from .special_points import Special, change_between, grazing_of, name_of, root, vanishing, without
 from .verification import on_section, real_motion
 
@@ -19,21 +19,21 @@ MOST_PHASES = 256
 BEYOND = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
 
-def change_of_modes(family: Family, here: Point, tangent: Float[np.ndarray, " m"], step: float):
+def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray, " m"], step: float):
     """The change of modes within a step: the special point, and the point, tangent and step with which to go on, if any."""
     curve = here.curve
-    low, high, ahead = 0.0, step, curve.along(here.place, tangent, step)
-    valid = here.place
+    low, high, ahead = 0.0, step, curve.along(here.cycle, tangent, step)
+    valid = here.cycle
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        place = curve.along(here.place, tangent, middle)
-        if place is None:
+        cycle = curve.along(here.cycle, tangent, middle)
+        if cycle is None:
             high = middle
             continue
-        if is_real(family, place):
-            low, valid = middle, place
+        if is_real(family, cycle):
+            low, valid = middle, cycle
         else:
-            high, ahead = middle, place
+            high, ahead = middle, cycle
     if ahead is None:
         return None
     gone = [k for k in valid.phases.lasting() if ahead.phases.h[k] <= 0]
@@ -48,7 +48,7 @@ def change_of_modes(family: Family, here: Point, tangent: Float[np.ndarray, " m"
     )
 
 
-def _missed(curve: Curve, here: Point, tangent, low: float, high: float, ahead: Place) -> Special | None:
+def _missed(curve: Curve, here: BranchPoint, tangent, low: float, high: float, ahead: ComputedCycle) -> Special | None:
     """The cycle on which a guard only just falls to zero at the end of a phase, between two distances along the tangent.
     Beyond, it rises there, so the event came before; and the parameter has turned back.
     """
@@ -56,42 +56,42 @@ def _missed(curve: Curve, here: Point, tangent, low: float, high: float, ahead: 
         if curve.modes[k].ending == AT_SECTION:
             continue
 
-        def rise(place: Place, k=k) -> float:
-            return float(place.images.guard_h[k])
+        def rise(cycle: ComputedCycle, k=k) -> float:
+            return float(cycle.images.guard_h[k])
 
-        _, place = root(lambda s: curve.along(here.place, tangent, s), rise, low, high)
-        if place is not None:
+        _, cycle = root(lambda s: curve.along(here.cycle, tangent, s), rise, low, high)
+        if cycle is not None:
             mode = curve.modes[k]
-            return Special(NAMES[Status(mode.status), mode.ending], curve, place, turns=True)
+            return Special(NAMES[Status(mode.status), mode.ending], curve, cycle, turns=True)
     return None
 
 
-def _grazes(curve: Curve, ahead: Place, step: float):
+def _grazes(curve: Curve, ahead: ComputedCycle, step: float):
     """A change beyond which no cycle is found, though it is known which guard touches zero."""
     grazing = grazing_of(curve, ahead)
-    if grazing is None or not _near(curve, grazing.place, ahead, step):
+    if grazing is None or not _near(curve, grazing.cycle, ahead, step):
         return None
-    return Special(name_of(grazing, None, removed=False), curve, grazing.place, grazing.row, grazing), None
+    return Special(name_of(grazing, None, removed=False), curve, grazing.cycle, grazing.row, grazing), None
 
 
-def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent, step: float):
+def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: ComputedCycle, tangent, step: float):
     """A change beyond which there are more phases."""
     for share in BEYOND:
-        place = curve.along(ahead, tangent, share * step)
-        if place is None:
+        cycle = curve.along(ahead, tangent, share * step)
+        if cycle is None:
             continue
-        real = real_motion(family.at(place.parameter), family.stepper, place.phases)
+        real = real_motion(family.at(cycle.parameter), family.stepper, cycle.phases)
         if real is None or real.phases is None or not len(curve.modes) < len(real.phases.modes) <= MOST_PHASES:
             continue
         change = change_between(real.phases.modes, curve.modes)
         longer = Curve(family, real.phases)
-        first = longer.corrected(longer.unknowns(real.phases, place.parameter))
+        first = longer.corrected(longer.unknowns(real.phases, cycle.parameter))
         if first is None or not is_real(family, first):
             continue
         special, grazing = None, grazing_of(curve, ahead)
-        if grazing is not None and _near(curve, grazing.place, ahead, step):
+        if grazing is not None and _near(curve, grazing.cycle, ahead, step):
             name = name_of(grazing, change, removed=False)
-            special = Special(name, curve, grazing.place, grazing.row, grazing)
+            special = Special(name, curve, grazing.cycle, grazing.row, grazing)
         elif change is not None and not change.merges:
             special = vanishing(longer, first, change.phase)
         if special is None:
@@ -104,12 +104,12 @@ def _inserted(family: Family, curve: Curve, valid: Place, ahead: Place, tangent,
         if vanishes and abs(away[index]) > 1e-6:
             away = away * np.sign(away[index])
         else:
-            away = _outward(family, longer, first, away, special.place)
-        return special, (seen(family, longer, first), away, max(share * step, 1e-3))
+            away = _outward(family, longer, first, away, special.cycle)
+        return special, (branch_point(family, longer, first), away, max(share * step, 1e-3))
     return None
 
 
-def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, step: float):
+def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase: int, step: float):
     """A change beyond which there are fewer phases."""
     shorter = _shorter(family, valid, phase)
     if shorter is None:
@@ -121,24 +121,24 @@ def _removed(family: Family, curve: Curve, valid: Place, tangent, phase: int, st
         return None
     special, away = None, fewer.tangent(first, None)
     grazing = grazing_of(fewer, first)
-    if grazing is not None and _near(fewer, grazing.place, first, 1e-3):
-        special = Special(name_of(grazing, change, removed=True), fewer, grazing.place, grazing.row, grazing)
-        away = fewer.tangent(grazing.place, None)
+    if grazing is not None and _near(fewer, grazing.cycle, first, 1e-3):
+        special = Special(name_of(grazing, change, removed=True), fewer, grazing.cycle, grazing.row, grazing)
+        away = fewer.tangent(grazing.cycle, None)
         away = away * np.sign(grazing.row @ away)
     else:
         found = None if change.merges else vanishing(curve, valid, phase)
         special = Special("", curve, valid) if found is None else found
         special = special._replace(name=name_of(None, change, removed=True))
-        away = _outward(family, fewer, first, away, special.place)
-    begin = special.place if special.curve is fewer else first
+        away = _outward(family, fewer, first, away, special.cycle)
+    begin = special.cycle if special.curve is fewer else first
     for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
         onward = fewer.along(begin, away, length)
         if onward is not None and is_real(family, onward):
-            return special, (seen(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
+            return special, (branch_point(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
     return special, None
 
 
-def _shorter(family: Family, valid: Place, phase: int):
+def _shorter(family: Family, valid: ComputedCycle, phase: int):
     """The phases without the given one, as a guess of a cycle; and the change that leads to them."""
     phases = valid.phases
     count, modes = len(phases.modes), phases.modes
@@ -164,8 +164,8 @@ def _shorter(family: Family, valid: Place, phase: int):
 
 
 def with_own_rebounds(
-    family: Family, here: Point, tangent: Float[np.ndarray, " m"]
-) -> tuple[Point, Float[np.ndarray, " m"]]:
+    family: Family, here: BranchPoint, tangent: Float[np.ndarray, " m"]
+) -> tuple[BranchPoint, Float[np.ndarray, " m"]]:
     """The point and tangent with as many rebounds as the real motion has before it rests: their number changes along a branch,
     and no cycle changes with it.
     """
@@ -173,28 +173,28 @@ def with_own_rebounds(
     if phases is None or len(phases.modes) == len(here.curve.modes) or len(phases.modes) > MOST_PHASES:
         return here, tangent
     curve = Curve(family, phases)
-    place = curve.corrected(curve.unknowns(phases, here.place.parameter))
-    if place is None or not is_real(family, place):
+    cycle = curve.corrected(curve.unknowns(phases, here.cycle.parameter))
+    if cycle is None or not is_real(family, cycle):
         return here, tangent
-    onward = curve.tangent(place, None)
+    onward = curve.tangent(cycle, None)
     before, after = (
         np.array([np.sum(one[k:-1]), one[-1]])
         for one, k in ((tangent, len(here.curve.of_state)), (onward, len(curve.of_state)))
     )
-    return seen(family, curve, place), onward * (1.0 if before @ after >= 0 else -1.0)
+    return branch_point(family, curve, cycle), onward * (1.0 if before @ after >= 0 else -1.0)
 
 
-def _near(curve: Curve, found: Place, guess: Place, step: float) -> bool:
+def _near(curve: Curve, found: ComputedCycle, guess: ComputedCycle, step: float) -> bool:
     return float(np.linalg.norm(found.u - guess.u)) < max(2 * step, 1e-3)
 
 
-def _outward(family: Family, curve: Curve, first: Place, tangent, special: Place | None):
+def _outward(family: Family, curve: Curve, first: ComputedCycle, tangent, special: ComputedCycle | None):
     """The direction along a curve in which its cycles are real motions."""
     for length in (1e-6, 1e-5, 1e-4, 1e-3):
         real = []
         for sign in (1.0, -1.0):
-            place = curve.along(first, tangent, sign * length)
-            real.append(place is not None and is_real(family, place))
+            cycle = curve.along(first, tangent, sign * length)
+            real.append(cycle is not None and is_real(family, cycle))
         if real[0] != real[1]:
             return tangent if real[0] else -tangent
     if special is not None and special.parameter != first.parameter and abs(tangent[-1]) > 1e-12:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Status
-from ..cycles.around import Round
+from ..cycles.one_period import PeriodSegments
 from ..foundation.carried import depending_on
 from ..foundation.compiling import power_of_4
 from ..foundation.numpy_evaluation import by_numpy
@@ -80,7 +80,7 @@ class Phases(NamedTuple):
         return [k for k, h in enumerate(self.h) if not (flies[k] and flies[k - 1] and h < least)]
 
 
-class Images(NamedTuple):
+class PhaseImages(NamedTuple):
     """The state after each phase, the guard that ends it, and their derivatives."""
 
     y: Float[np.ndarray, "k state"]  # the start of the next one
@@ -93,7 +93,7 @@ class Images(NamedTuple):
     guard_parameter: Float[np.ndarray, " k"]
 
 
-def phases_around(segments: Round) -> Phases | None:
+def phases_around(segments: PeriodSegments) -> Phases | None:
     """The phases of one period of real motion from a point of the section; None where it is at rest."""
     count = len(segments.h)
     modes, starts, lengths, whole = [], [], [], True
@@ -126,14 +126,14 @@ def same_modes(a: tuple[Mode, ...], b: tuple[Mode, ...]) -> bool:
     return len(a) == len(b) and any(a == b[k:] + b[:k] for k in range(len(b)))
 
 
-def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> Images:
+def images(scene: Scene, direction: Scene, stepper: EventExact, phases: Phases) -> PhaseImages:
     """Images of all phases, and their derivatives by state and duration and along a direction of the parameters."""
     modes = phases.modes
     following = modes[1:] + modes[:1]
-    return looked_up(scene, direction, stepper, modes, following, phases.y, phases.h)
+    return images_of_phases(scene, direction, stepper, modes, following, phases.y, phases.h)
 
 
-def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> Images:
+def images_of_phases(scene: Scene, direction: Scene, stepper: EventExact, modes, following, y, h) -> PhaseImages:
     """`images` of single phases, each with the mode that follows it."""
     by_kernel, count = has_kernel(scene, stepper), len(modes)
     ends = Ends(*_typed(modes), *_typed(following)[:2])
@@ -148,7 +148,9 @@ def looked_up(scene: Scene, direction: Scene, stepper: EventExact, modes, follow
     found = _image.derived(args, directions, own=own, by_kernel=by_kernel)
     ((y, guard), _), ((to, of_guard), _) = found
     parts = y, guard, to[..., :size], to[..., size], to[..., size + 1]
-    return Images(*(part[:count] for part in (*parts, of_guard[:, :size], of_guard[:, size], of_guard[:, size + 1])))
+    return PhaseImages(
+        *(part[:count] for part in (*parts, of_guard[:, :size], of_guard[:, size], of_guard[:, size + 1]))
+    )
 
 
 class Ends(NamedTuple):

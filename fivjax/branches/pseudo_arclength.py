@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 from ..contact import Status
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import Images, Mode, Phases, images, moved_along
+from .multiple_shooting import Mode, PhaseImages, Phases, images, moved_along
 
 MOST_ITERATIONS = 10
 # Newton's method has converged if its next correction would be this small, relative to the cycle's size.
@@ -37,12 +37,12 @@ class Family(NamedTuple):
         return moved_along(self.scene, self.direction, parameter - self.value)
 
 
-class Place(NamedTuple):
+class ComputedCycle(NamedTuple):
     """A cycle on the branch."""
 
     u: Float[np.ndarray, " m"]  # the unknowns, scaled; the parameter comes last
     jacobian: Float[np.ndarray, "m-1 m"]
-    images: Images
+    images: PhaseImages
     phases: Phases
     parameter: float
     iterations: int
@@ -70,7 +70,7 @@ class Curve:
         many = count * len(self.weights)
         return Phases(self.modes, values[:many].reshape(count, -1), values[many:-1]), float(values[-1])
 
-    def system(self, u: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray, Images, Phases, float]:
+    def system(self, u: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray, PhaseImages, Phases, float]:
         """Residuals and their derivatives, each equation scaled by the size of its derivatives."""
         phases, parameter = self.phases(u)
         family = self.family
@@ -81,7 +81,9 @@ class Curve:
         sizes = np.where(sizes > 0, sizes, 1.0)
         return residuals / sizes, rows / sizes[:, None], found, phases, parameter
 
-    def corrected(self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None) -> Place | None:
+    def corrected(
+        self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
+    ) -> ComputedCycle | None:
         """The cycle near a guess: in the plane through the guess with this normal, or without a normal the nearest one."""
         target, last = u.copy(), np.inf
         for iteration in range(MOST_ITERATIONS):
@@ -98,23 +100,23 @@ class Curve:
                 return None
             size = float(np.max(np.abs(step)))
             if size < EXACT or (last < CLOSE and size > 0.5 * last):
-                return Place(u, rows, found, phases, parameter, iteration)
+                return ComputedCycle(u, rows, found, phases, parameter, iteration)
             if size > 1.0 or (iteration > 4 and size > last):
                 return None
             u, last = u + step, size
         return None
 
-    def tangent(self, place: Place, like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
+    def tangent(self, cycle: ComputedCycle, like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
         """The unit tangent of the curve, on the side of `like`."""
-        _, _, axes = np.linalg.svd(place.jacobian)
+        _, _, axes = np.linalg.svd(cycle.jacobian)
         found = axes[-1]
         return found if like is None or found @ like >= 0 else -found
 
-    def along(self, place: Place, tangent: Float[np.ndarray, " m"], by: float) -> Place | None:
+    def along(self, cycle: ComputedCycle, tangent: Float[np.ndarray, " m"], by: float) -> ComputedCycle | None:
         """The cycle at a distance of about `by` along the tangent."""
-        return self.corrected(place.u + by * tangent, tangent)
+        return self.corrected(cycle.u + by * tangent, tangent)
 
-    def at_parameter(self, guess: Float[np.ndarray, " m"], parameter: float) -> Place | None:
+    def at_parameter(self, guess: Float[np.ndarray, " m"], parameter: float) -> ComputedCycle | None:
         """The cycle near a guess at this value of the parameter."""
         u, normal = guess.copy(), np.zeros_like(guess)
         u[-1], normal[-1] = parameter / self.scales[-1], 1.0
@@ -137,7 +139,7 @@ def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:
     return 0
 
 
-def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
+def assembled(found: PhaseImages, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
     """Residuals of all equations of a cycle, and their derivatives by states, durations and the parameter."""
     count, size = phases.y.shape
     many = count * size
@@ -156,7 +158,7 @@ def assembled(found: Images, phases: Phases) -> tuple[np.ndarray, np.ndarray]:
     return residuals, rows
 
 
-def _without_roots_at_start(found: Images, phases: Phases) -> Images:
+def _without_roots_at_start(found: PhaseImages, phases: Phases) -> PhaseImages:
     power = np.array([roots_at_start(phases.modes, k) for k in range(len(phases.modes))])
     h = phases.h / phases.period
     # Below these a guard is a rounding error; that of a rebound, which begins on the belt, has smaller ones.
@@ -171,7 +173,7 @@ def _without_roots_at_start(found: Images, phases: Phases) -> Images:
     )
 
 
-def monodromy(found: Images) -> Float[np.ndarray, "state state"]:
+def monodromy(found: PhaseImages) -> Float[np.ndarray, "state state"]:
     """The derivative of the motion over one period, from the start of the first phase, with saltation at each event."""
     matrix = np.eye(found.y.shape[1])
     for k in range(len(found.guard)):
@@ -181,7 +183,7 @@ def monodromy(found: Images) -> Float[np.ndarray, "state state"]:
     return matrix
 
 
-def multipliers_of(found: Images) -> Complex[np.ndarray, " m"]:
+def multipliers_of(found: PhaseImages) -> Complex[np.ndarray, " m"]:
     """Floquet multipliers without the one for a deviation along the cycle, largest first; NaN at a grazing."""
     matrix = monodromy(found)
     if not np.all(np.isfinite(matrix)):

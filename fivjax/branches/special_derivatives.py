@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..linear.linearisation import sliding_rates
-from .branch_points import Point
-from .grazing import looked_at, row_of
+from .branch_points import BranchPoint
+from .grazing import images_up_to_minimum, row_of
 from .multiple_shooting import images, moved_along, parameter_direction
-from .pseudo_arclength import Curve, Family, Place, assembled, multipliers_of
+from .pseudo_arclength import ComputedCycle, Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
 # Relative change of a parameter for differences of multipliers.
@@ -22,7 +22,7 @@ APART = 1e-6
 
 
 def derivatives_of_special_points(
-    family: Family, points: list[Point]
+    family: Family, points: list[BranchPoint]
 ) -> tuple[list[str], Float[np.ndarray, "point of"]]:
     """Names of the parameters, and the derivatives for each point; NaN where there are none."""
     scene = family.scene
@@ -36,13 +36,13 @@ def derivatives_of_special_points(
 
 
 def _derivative(family: Family, special: Special, name: str) -> float:
-    curve, place = special.curve, special.place
+    curve, cycle = special.curve, special.cycle
     if special.name == MEETS_SLIDING:
-        return _of_stability_limit(family, place.parameter, name)
+        return _of_stability_limit(family, cycle.parameter, name)
     direction = parameter_direction(family.scene, name)
-    found = images(family.at(place.parameter), direction, family.stepper, place.phases)
-    _, rows = assembled(found, place.phases)
-    _, own = assembled(place.images, place.phases)
+    found = images(family.at(cycle.parameter), direction, family.stepper, cycle.phases)
+    _, rows = assembled(found, cycle.phases)
+    _, own = assembled(cycle.images, cycle.phases)
     slope, own = rows[:, -1], own * curve.scales
     if special.turns:
         left, _, _ = np.linalg.svd(own[:, :-1] / np.max(np.abs(own), axis=1, keepdims=True))
@@ -54,10 +54,10 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         return np.nan
     last, row = 0.0, special.row
     if special.grazing is not None:
-        _, partial = looked_at(curve, place.parameter, place.phases, special.grazing.touch, direction)
-        _, itself = looked_at(curve, place.parameter, place.phases, special.grazing.touch)
+        _, partial = images_up_to_minimum(curve, cycle.parameter, cycle.phases, special.grazing.minimum, direction)
+        _, itself = images_up_to_minimum(curve, cycle.parameter, cycle.phases, special.grazing.minimum)
         last = float(partial.guard_parameter[0])
-        row = row_of(curve, place.phases, special.grazing.touch, itself)
+        row = row_of(curve, cycle.phases, special.grazing.minimum, itself)
     system = np.vstack([own, row])
     sizes = np.max(np.abs(system), axis=1)
     change = np.linalg.solve(system / sizes[:, None], -np.append(slope, last) / sizes)
@@ -77,20 +77,20 @@ def _of_stability_limit(family: Family, limit: float, name: str) -> float:
 
 def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray, slope: np.ndarray) -> float:
     """By differences of the multiplier's size along the families over both parameters."""
-    curve, place = special.curve, special.place
-    scene = family.at(place.parameter)
+    curve, cycle = special.curve, special.cycle
+    scene = family.at(cycle.parameter)
     value = float(np.asarray(scene.parameters[name]))
     by = APART * (abs(value) if value else 1.0)
     through_other = np.linalg.solve(own[:, :-1], -slope)
     through_own = np.linalg.solve(own[:, :-1], -own[:, -1])
-    step = APART * max(abs(place.parameter), 0.1 * family.scale) / family.scale
+    step = APART * max(abs(cycle.parameter), 0.1 * family.scale) / family.scale
 
     def size(own_step: float, other_step: float) -> float:
-        u = place.u.copy()
+        u = cycle.u.copy()
         u[:-1] += own_step * through_own + other_step * through_other
         u[-1] += own_step
         moved = family._replace(scene=moved_along(family.scene, parameter_direction(family.scene, name), other_step))
-        at = _solved(Curve(moved, place.phases), u, curve)
+        at = _solved(Curve(moved, cycle.phases), u, curve)
         if at is None:
             return np.nan
         which = critical_multiplier(multipliers_of(at.images), special.name)
@@ -101,7 +101,7 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
     return float(-with_other / with_own * curve.scales[-1])
 
 
-def _solved(curve: Curve, u: np.ndarray, like: Curve) -> Place | None:
+def _solved(curve: Curve, u: np.ndarray, like: Curve) -> ComputedCycle | None:
     # Converted from the units of the curve in which the guess was made.
     values = u * like.scales
     return curve.at_parameter(values / curve.scales, values[-1])

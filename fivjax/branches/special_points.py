@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Status
-from .grazing import NAMES, Grazing, grazing_near, touches
+from .grazing import NAMES, Grazing, grazing_near, guard_minima
 from .multiple_shooting import AT_SECTION, Mode, Phases, same_modes
-from .pseudo_arclength import Curve, Place, multipliers_of
+from .pseudo_arclength import ComputedCycle, Curve, multipliers_of
 
 FOLD, DOUBLING, TORUS = "fold", "period doubling", "Neimark–Sacker"
 # Where the derivative of the return map jumps: an impact, say, begins to end the slip.
@@ -32,7 +32,7 @@ class Special(NamedTuple):
 
     name: str
     curve: Curve
-    place: Place
+    cycle: ComputedCycle
     # The linearised equation that it adds to those of the cycle; None where it adds none.
     row: Float[np.ndarray, " m"] | None = None
     grazing: Grazing | None = None
@@ -51,21 +51,21 @@ class Change(NamedTuple):
 # ------------------------------------------------------------------------------------------------------ smooth branches
 
 
-def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) -> list[Special]:
+def between(curve: Curve, a: ComputedCycle, tangent: Float[np.ndarray, " m"], b: ComputedCycle) -> list[Special]:
     """Folds, period doublings and Neimark–Sacker bifurcations between two neighbouring cycles, in order."""
     length = float(tangent @ (b.u - a.u))
     found: list[tuple[float, Special]] = []
 
-    def place(s: float) -> Place | None:
+    def cycle(s: float) -> ComputedCycle | None:
         return {0.0: a, length: b}.get(s) or curve.along(a, tangent, s)
 
     end = curve.tangent(b, tangent)
     if tangent[-1] * end[-1] < 0 and max(abs(tangent[-1]), abs(end[-1])) > LEVEL:
 
-        def turning(at: Place) -> float:
+        def turning(at: ComputedCycle) -> float:
             return float(curve.tangent(at, tangent)[-1])
 
-        s, at = root(place, turning, 0.0, length)
+        s, at = root(cycle, turning, 0.0, length)
         if at is not None:
             smooth = np.min(np.abs(multipliers_of(at.images) - 1)) <= NEAR_ONE
             found.append((s, Special(FOLD, curve, at, turns=True) if smooth else Special(CORNER, curve, at)))
@@ -73,7 +73,7 @@ def between(curve: Curve, a: Place, tangent: Float[np.ndarray, " m"], b: Place) 
     for name, test in ((DOUBLING, doubling), (TORUS, pairing)):
         values = test(before), test(after)
         if np.all(np.isfinite(values)) and values[0] * values[1] < 0:
-            s, at = root(place, lambda at, test=test: test(multipliers_of(at.images)), 0.0, length)
+            s, at = root(cycle, lambda at, test=test: test(multipliers_of(at.images)), 0.0, length)
             if at is not None:
                 which = critical_multiplier(multipliers_of(at.images), name)
                 # Two real multipliers may have the product one, too.
@@ -106,7 +106,9 @@ def critical_multiplier(values: Complex[np.ndarray, " m"], name: str) -> complex
     return complex(upper[np.argmin(np.abs(np.abs(upper) - 1))]) if len(upper) else None
 
 
-def root(place: Callable[[float], Place | None], test: Callable[[Place], float], low: float, high: float):
+def root(
+    cycle: Callable[[float], ComputedCycle | None], test: Callable[[ComputedCycle], float], low: float, high: float
+):
     """The distance along a step at which a test function vanishes, between two others, and the cycle there; None if there is no
     such cycle.
     """
@@ -116,7 +118,7 @@ def root(place: Callable[[float], Place | None], test: Callable[[Place], float],
         pass
 
     def value(s: float) -> float:
-        at = place(s)
+        at = cycle(s)
         found = np.nan if at is None else test(at)
         if not np.isfinite(found):
             raise Lost
@@ -126,7 +128,7 @@ def root(place: Callable[[float], Place | None], test: Callable[[Place], float],
         s = float(brentq(value, low, high, xtol=1e-13, rtol=1e-13))
     except (Lost, ValueError):  # of one sign at both ends
         return low, None
-    return s, place(s)
+    return s, cycle(s)
 
 
 # ------------------------------------------------------------------------------------------------- changes of the modes
@@ -163,22 +165,22 @@ def _inserted(mode: Mode) -> str:
     return {Status.STICK: "stick", Status.SLIDE: "slip", Status.DETACH: "lift-off"}[Status(mode.status)]
 
 
-def grazing_of(curve: Curve, guess: Place, lowest: int = 4) -> Grazing | None:
+def grazing_of(curve: Curve, guess: ComputedCycle, lowest: int = 4) -> Grazing | None:
     """The cycle near a guess on which a guard touches zero: the nearest one of those found."""
-    for touch in sorted(touches(curve, guess), key=lambda touch: abs(touch.value))[:lowest]:
-        found = grazing_near(curve, guess, touch)
+    for minimum in sorted(guard_minima(curve, guess), key=lambda minimum: abs(minimum.value))[:lowest]:
+        found = grazing_near(curve, guess, minimum)
         if found is not None:
             return found
     return None
 
 
-def vanishing(curve: Curve, guess: Place, phase: int) -> Special | None:
+def vanishing(curve: Curve, guess: ComputedCycle, phase: int) -> Special | None:
     """The cycle near a guess on which the duration of a phase is zero."""
     u, normal = guess.u.copy(), np.zeros_like(guess.u)
     place_of = len(curve.of_state) + phase
     u[place_of], normal[place_of] = 0.0, 1.0
-    place = curve.corrected(u, normal)
-    return None if place is None else Special("", curve, place, row=normal)
+    cycle = curve.corrected(u, normal)
+    return None if cycle is None else Special("", curve, cycle, row=normal)
 
 
 def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> str:
@@ -186,8 +188,8 @@ def name_of(grazing: Grazing | None, change: Change | None, removed: bool) -> st
     what = "" if change is None else f"{change.word} {'removed' if removed else 'inserted'}"
     if grazing is None:
         return what or "contact modes change"
-    mode = grazing.place.phases.modes[grazing.touch.phase]
-    how = NAMES[Status(mode.status), grazing.touch.guard]
+    mode = grazing.cycle.phases.modes[grazing.minimum.phase]
+    how = NAMES[Status(mode.status), grazing.minimum.guard]
     return f"{how}: {what}" if what else how
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..contact import Contact, Status
-from ..cycles.around import Seen, seen_around
+from ..cycles.one_period import PeriodSummary, follow_period
 from ..model.scene import Scene
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
@@ -20,15 +20,15 @@ MOST_CROSSINGS = 24
 BACK = 1e-6
 
 
-class Real(NamedTuple):
+class RealMotion(NamedTuple):
     """One period of the motion that starts on a computed cycle."""
 
     start: Point  # its first state, in the middle of the longest phase
-    seen: Seen
+    seen: PeriodSummary
     phases: Phases | None
 
 
-def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | None:
+def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> RealMotion | None:
     """One period of the real motion from a computed cycle; None if a computed phase has a negative duration."""
     # At a special point the duration of a vanishing phase is zero up to rounding.
     if not (np.all(np.isfinite(phases.y)) and np.all(phases.h > -1e-9 * phases.period)):
@@ -41,11 +41,11 @@ def real_motion(scene: Scene, stepper: EventExact, phases: Phases) -> Real | Non
         if whole
         else _states(scene, stepper, phases, [LOOKS // 2])[longest]
     )
-    seen = seen_around(scene, stepper, start, phases.period)
-    return Real(start, seen, phases_around(seen.segments))
+    seen = follow_period(scene, stepper, start, phases.period)
+    return RealMotion(start, seen, phases_around(seen.segments))
 
 
-def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: Real) -> Point | None:
+def on_section(scene: Scene, stepper: EventExact, phases: Phases, real: RealMotion) -> Point | None:
     """The first crossing of the section on a computed cycle; None if there is none."""
     if float(real.start.y[scene.structure.size + scene.structure.tangential]) == 0.0:
         return real.start

@@ -8,12 +8,12 @@ from jaxtyping import Array, Float
 from ..foundation.compiling import compiled
 from .covariance import covariance_of
 from .cycle_misfit import CycleMisfit
-from .goodness_of_fit import ROUNDING, WhatIsLeft, exceeds_noise, what_is_left
+from .goodness_of_fit import ROUNDING, ResidualTests, exceeds_noise, residual_tests
 from .misfit import OFFSET_UNIT
 from .parameters import FreeParameters
 from .problem import Problem
 from .result import FITTED, Calibration, FitOutcome
-from .search import LEAST_KEPT, Search
+from .search import LEAST_KEPT, FitSearch
 
 # There is a signal if a fit explains more than this energy per fitted number, in units of the noise variance.
 SIGNIFICANT = 25.0
@@ -23,7 +23,7 @@ MOST_LEFT = 0.1
 UNSTABLE = 1.001
 
 
-def concluded(search: Search, identifiable_within: float) -> Calibration:
+def concluded(search: FitSearch, identifiable_within: float) -> Calibration:
     """The result of a search."""
     best, size = search.best, search.problem.size
     problem = search.problem.without(best.left_out)
@@ -88,7 +88,7 @@ def not_tried(problem: Problem, recordings, outcome: FitOutcome) -> Calibration:
         measured=tuple(means),
         fitted=tuple(np.full_like(part, np.nan) for part in means),
         noise=tuple(_noise(m) for m in problem.misfits),
-        left=WhatIsLeft(nan, False, False, nan, False),
+        left=ResidualTests(nan, False, False, nan, False),
         evaluations=0,
         outcome=outcome,
     )
@@ -103,7 +103,7 @@ def _stated(recordings) -> bool:
     return all(r.noise is not None for r in recordings)
 
 
-def _outcome(search: Search, problem: Problem, left: WhatIsLeft, models) -> FitOutcome:
+def _outcome(search: FitSearch, problem: Problem, left: ResidualTests, models) -> FitOutcome:
     if not _has_signal(search, problem, models):
         return FitOutcome.NO_SIGNAL
     if any(np.mean(np.asarray(m.kept)) < LEAST_KEPT for m in problem.misfits):
@@ -119,17 +119,17 @@ def _outcome(search: Search, problem: Problem, left: WhatIsLeft, models) -> FitO
     return FitOutcome.CONVERGED if left.is_noise else FitOutcome.STRUCTURE_LEFT
 
 
-def _left(search: Search, problem: Problem, found: np.ndarray, models) -> WhatIsLeft:
+def _left(search: FitSearch, problem: Problem, found: np.ndarray, models) -> ResidualTests:
     freedom = max(problem.numbers - len(search.best.x) - sum(m.projected for m in problem.misfits), 1)
     waveforms = []
     for mine, model in zip(problem.misfits, models, strict=True):
         scaled = (np.asarray(mine.means) - model) / np.asarray(mine.sigma)
         waveforms.append([column[kept > 0] for column, kept in zip(scaled.T, np.asarray(mine.kept).T, strict=True)])
     with np.errstate(invalid="ignore", over="ignore"):
-        return what_is_left(float(found @ found), int(freedom), waveforms, _stated(search.recordings))
+        return residual_tests(float(found @ found), int(freedom), waveforms, _stated(search.recordings))
 
 
-def _has_signal(search: Search, problem: Problem, models) -> bool:
+def _has_signal(search: FitSearch, problem: Problem, models) -> bool:
     """Whether any recording has more than noise in it, or a fit explains more energy than fitting noise would."""
     for mine, model in zip(problem.misfits, models, strict=True):
         measured, sigma = np.asarray(mine.means), np.asarray(mine.sigma)

@@ -19,7 +19,7 @@ from .folding import folded
 from .misfit import OFFSET_UNIT, AbstractMisfit, Compared, sliding_frequencies
 from .noise import LEAST_NOISE
 from .samples import Sampled
-from .shooting import Around, Cycle, around, settled, unclosed, waveform
+from .shooting import Cycle, OnePeriod, around, guess_limit_cycle, unclosed, waveform
 
 # Units of residuals for rough guesses: of the frequency, relative; of lines, as shares of the largest; of fractions of time.
 ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
@@ -71,7 +71,7 @@ class CycleMisfit(AbstractMisfit):
 
     def settled(self, scene: Scene) -> Cycle:
         """A guess of the limit cycle on which the scene settles."""
-        return settled(scene.replace(**self.known), self.method, self.frequency)
+        return guess_limit_cycle(scene.replace(**self.known), self.method, self.frequency)
 
     def compared(self, scene, own, share):
         scene, (cycle, shift) = scene.replace(**self.known), own
@@ -96,7 +96,7 @@ class CycleMisfit(AbstractMisfit):
         residual = jnp.concatenate([jnp.where(share < 1, rough, 0.0), jnp.where(share < 1, 0.0, exact)])
         return Compared(residual, model + zeros, touched, unclosed(scene, cycle, after), after.contact)
 
-    def _observed(self, after: Around, period):
+    def _observed(self, after: OnePeriod, period):
         """Fourier coefficients of the channels as they are sampled."""
         orders = jnp.arange(1, after.lines.shape[0] + 1)
         rate, columns = 2j * jnp.pi * orders / period, []
@@ -117,7 +117,7 @@ class CycleMisfit(AbstractMisfit):
         apart = (wanted - found) / (ROUGH_LINES * size)
         return jnp.concatenate([step[None], apart.real.ravel(), apart.imag.ravel()[1:]])
 
-    def _waveform(self, scene, cycle: Cycle, after: Around, lines, turns):
+    def _waveform(self, scene, cycle: Cycle, after: OnePeriod, lines, turns):
         """The channels at these turns, as they are sampled; and where they would jump if an event moved."""
         if self.response is not None:
             orders = jnp.arange(1, lines.shape[0] + 1)
@@ -144,7 +144,7 @@ class CycleMisfit(AbstractMisfit):
         changes, landings = (jnp.minimum(begin, end) for begin, _, end in sides)
         return self._known(jnp.stack(columns, axis=1), after), self._touched(changes, landings, cycle)
 
-    def _known(self, values, after: Around):
+    def _known(self, values, after: OnePeriod):
         """The values; none where there were more events than can be noted."""
         return jnp.where(jnp.any(jnp.isnan(after.events.changes)), jnp.nan, values)
 

@@ -27,7 +27,7 @@ from .misfit import sliding_frequencies
 from .parameters import FreeParameters, refuse_one_for_each_contact
 from .problem import Problem
 from .result import Calibration, FitOutcome
-from .search import Search
+from .search import FitSearch
 from .waveform_misfit import misfit_of_waveform, starts_unknown
 
 # The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
@@ -130,7 +130,7 @@ def calibrate(
         guesses = np.concatenate([near, around[1:]])
     else:
         guesses = latin_hypercube(parameters, scene, int(starts), float(spread), seed)
-    search = Search(problem, guesses, recordings)
+    search = FitSearch(problem, guesses, recordings)
     with following("calibrate", shown=progress, total=search.count, unit=" stages"):
         for number, words in enumerate(search.run()):
             tick(min(number, 1))

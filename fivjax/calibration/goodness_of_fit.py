@@ -25,7 +25,7 @@ ROUNDING = 1e-6
 OF_ESTIMATE = 1e-2
 
 
-class WhatIsLeft(NamedTuple):
+class ResidualTests(NamedTuple):
     """The residuals of a fit, in units of the noise."""
 
     misfit: float  # sum of squares per degree of freedom
@@ -46,9 +46,9 @@ class WhatIsLeft(NamedTuple):
         return ", ".join(said)
 
 
-def what_is_left(
+def residual_tests(
     squares: float, freedom: int, waveforms: Iterable[Iterable[Float[np.ndarray, " B"]]], stated: bool
-) -> WhatIsLeft:
+) -> ResidualTests:
     """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings,
     one for each channel; `stated`: whether the noise was given.
     """
@@ -58,7 +58,7 @@ def what_is_left(
     least = ROUNDING if stated else OF_ESTIMATE
     found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > least]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
-    return WhatIsLeft(
+    return ResidualTests(
         misfit=misfit,
         larger=bool(misfit > 1 + UNLIKELY * scatter),
         smaller=bool(misfit < 1 - UNLIKELY * scatter),
@@ -70,7 +70,7 @@ def what_is_left(
 def exceeds_noise(means: Float[np.ndarray, "B k"], sigma: Float[np.ndarray, "*B k"]) -> bool:
     """Whether a recording is more than white noise of this size around a constant."""
     scaled = (means - means.mean(axis=0)) / sigma
-    found = what_is_left(float(np.sum(scaled**2)), scaled.size - scaled.shape[1], [scaled.T], stated=False)
+    found = residual_tests(float(np.sum(scaled**2)), scaled.size - scaled.shape[1], [scaled.T], stated=False)
     return not found.is_noise
 
 

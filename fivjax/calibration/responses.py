@@ -14,7 +14,7 @@ from ..foundation.polynomial import value_and_rate
 from ..io.recordings import QUANTITIES, Channel
 from ..kernels.functions import KernelFunction
 from ..model.scene import Scene, steady_sliding
-from ..simulation.jump_instants import begun_at, load_from, next_jump
+from ..simulation.jump_instants import load_from, next_jump, start_of_run
 from ..steppers.base import MOST_ADVANCES, AbstractStepper
 from ..steppers.core import end_after, next_part
 from ..steppers.event_exact import for_derivatives
@@ -116,7 +116,7 @@ def _sample(args, instants: Float[Array, " q"]):
         q, _ = steady_sliding(scene, scene.load.force)
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     contact = status_from_forces(mechanics, load_from(scene.load, start), y0)
-    first = begun_at(scene, mechanics, contact, y0, start)
+    first = start_of_run(scene, mechanics, contact, y0, start)
 
     def step(now: _Step, instant) -> _Step:
         t, until = now.end, next_jump(scene.load, now.end)

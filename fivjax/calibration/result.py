@@ -11,7 +11,7 @@ from ..io.datasets import labelled
 from ..io.recordings import Recording
 from ..model.scene import Scene
 from .covariance import combinations
-from .goodness_of_fit import WhatIsLeft
+from .goodness_of_fit import ResidualTests
 
 
 class FitOutcome(enum.StrEnum):
@@ -75,7 +75,7 @@ class Calibration(eqx.Module):
     measured: tuple[np.ndarray, ...]  # block means, (B, k)
     fitted: tuple[np.ndarray, ...]
     noise: tuple[np.ndarray, ...]  # standard deviation of a block mean, by channel
-    left: WhatIsLeft  # the residuals, compared with the noise
+    left: ResidualTests  # the residuals, compared with the noise
     evaluations: int
     outcome: FitOutcome = eqx.field(static=True)
 

@@ -22,7 +22,7 @@ FINE = 16
 FINEST = 64
 
 
-class Through(NamedTuple):
+class LowPassGrid(NamedTuple):
     """A low-pass on a grid of fine steps, from before the first block to after the last, so that it may ring."""
 
     count: int
@@ -85,7 +85,7 @@ def sampled(recording: Recording, blocks: Averaged) -> Sampled:
     )
 
 
-def _through(recording: Recording, blocks: Averaged) -> Through:
+def _through(recording: Recording, blocks: Averaged) -> LowPassGrid:
     response, interval = recording.filter, 1 / recording.rate
     assert response is not None
     passed = bandwidth(response, FINEST * recording.rate / FINE)
@@ -101,4 +101,4 @@ def _through(recording: Recording, blocks: Averaged) -> Through:
     if recording.sampling == "averages":
         factor = factor * np.sinc(frequencies * interval)
     middles = ringing + finer // 2 + finer * np.arange(samples)
-    return Through(count, -ringing * step, step, factor, middles.reshape(len(blocks.means), blocks.per_block))
+    return LowPassGrid(count, -ringing * step, step, factor, middles.reshape(len(blocks.means), blocks.per_block))

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from ..io.recordings import Recording
 from .cycle_closing import growth_of_disturbances
-from .goodness_of_fit import what_is_left
+from .goodness_of_fit import residual_tests
 from .least_squares import Minimum, minimise
 from .problem import About, Problem
 from .time_offsets import KEPT_WITH_OFFSETS, MOST_ROUNDS, best_offsets, periods_aside
@@ -52,7 +52,7 @@ class Candidate(NamedTuple):
     about: About | None
 
 
-class Search:
+class FitSearch:
     """The search of one fit; `best` is its end."""
 
     best: Minimum
@@ -123,7 +123,7 @@ class Search:
             if k == 0 or self.cost(found) < self.cost(self.best):
                 self.best = found
             squares, freedom = found.at.cost, max(self.compared_numbers(found) - found.x.size, 1)
-            if found.arrived and not what_is_left(squares, freedom, [], stated=False).larger:
+            if found.arrived and not residual_tests(squares, freedom, [], stated=False).larger:
                 break
 
     def _improved(self) -> list[Candidate]:

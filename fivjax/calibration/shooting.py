@@ -66,7 +66,7 @@ class Cycle(NamedTuple):
         return Cycle(unknowns.at[where].set(self.y[where]), self.contact, unknowns[where])
 
 
-class Around(NamedTuple):
+class OnePeriod(NamedTuple):
     """One period of a motion that may not be closed yet."""
 
     y: State  # at the end of the period
@@ -108,7 +108,7 @@ class PeriodAsked(eqx.Module):
     channels: tuple[Channel, ...] = eqx.field(static=True, default=())
 
 
-def settled(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
+def guess_limit_cycle(scene: Scene, method: AbstractStepper, frequency: Float[Array, ""]) -> Cycle:
     """A guess of the limit cycle under the final load: of the motions from a few starts, after they have settled, the one that
     returns closest to `frequency` (Hz) among those that return to themselves.
 
@@ -166,7 +166,7 @@ def _settle(args, instants: Float[Array, " q"]):
 _settling = KernelFunction(_settle)
 
 
-def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> Around:
+def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> OnePeriod:
     """A guess of a cycle followed for its period, with `count` lines of its velocities. Differentiable in forward mode."""
     args = scene, cycle, PeriodAsked(for_derivatives(method), count)
     (after, lines, impulses), _ = _period(args, by_kernel=has_kernel(scene, method))
@@ -175,7 +175,7 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> A
 
 
 def _once_around(args, _):
-    """An `Around` without its lines and impulses, and the integrals that these are made of."""
+    """An `OnePeriod` without its lines and impulses, and the integrals that these are made of."""
     scene, cycle, how = args
     mechanics, load = Mechanics(scene), scene.load.final
     method, count, codes = how.method, how.count, jnp.array([Status.STICK, Status.DETACH])
@@ -204,7 +204,7 @@ def _once_around(args, _):
     # With more events than can be noted, nothing is known of them.
     noted = Events(jnp.where(seen <= MOST_EVENTS, changes, jnp.nan), landings)
     y = jnp.where(after.enough, after.y, jnp.nan)
-    return (Around(y, after.contact, None, None, spent / cycle.period, noted), *sums), ()
+    return (OnePeriod(y, after.contact, None, None, spent / cycle.period, noted), *sums), ()
 
 
 _period = KernelFunction(_once_around)
@@ -262,7 +262,7 @@ def _channels_along(args, instants: Float[Array, " q"]):
 _along_period = KernelFunction(_channels_along)
 
 
-def unclosed(scene: Scene, cycle: Cycle, after: Around) -> State:
+def unclosed(scene: Scene, cycle: Cycle, after: OnePeriod) -> State:
     """What closes the cycle where it is zero: the state after the period less that before it.
 
     With several contacts, one of them may have no event in the whole period. What it holds then returns whatever it was, which

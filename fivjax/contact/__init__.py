@@ -30,11 +30,11 @@ from .forces import State as State
 from .forces import acceleration as acceleration
 from .forces import acceleration_under as acceleration_under
 from .forces import added_forces as added_forces
+from .forces import constrained_coordinates as constrained_coordinates
 from .forces import contact_forces as contact_forces
 from .forces import free_acceleration as free_acceleration
 from .forces import free_matrices as free_matrices
 from .forces import gap as gap
-from .forces import held as held
 from .forces import measured as measured
 from .forces import relative_velocity as relative_velocity
 from .forces import slip_speed as slip_speed

@@ -82,10 +82,10 @@ def acceleration_under(
     """Accelerations from the free ones and the contact forces added to those at rest, in m/s²."""
     pushed = spread(mechanics.from_tangential, tangential_force)
     total = free + pushed + spread(mechanics.from_normal, normal_force)
-    return jnp.where(held(mechanics, contact), 0.0, total)
+    return jnp.where(constrained_coordinates(mechanics, contact), 0.0, total)
 
 
-def held(mechanics: Mechanics, contact: Contact) -> Bool[Array, " n"]:
+def constrained_coordinates(mechanics: Mechanics, contact: Contact) -> Bool[Array, " n"]:
     """Which coordinates the status keeps from being accelerated."""
     n = mechanics.free_load.shape[0]
     closed = at_places(n, mechanics.normal, contact.status != Status.DETACH)

@@ -21,35 +21,39 @@ class ModeForces(eqx.Module):
     """How the contact forces of one mode follow from the free accelerations."""
 
     contact: Contact
-    dragging: Float[Array, "*contacts"]  # σμ
+    signed_friction: Float[Array, "*contacts"]  # σμ
     of_one: "_OneContact | None"
-    answer: Float[Array, "k k"] | None  # the inverse of the system of several contacts: from right-hand sides to (T, N)
+    inverse: (
+        Float[Array, "k k"] | None
+    )  # the inverse of the system of several contacts: from right-hand sides to (T, N)
 
     def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]):
         self.contact = contact
-        self.dragging = contact.direction * mu
-        self.of_one = self.answer = None
+        self.signed_friction = contact.direction * mu
+        self.of_one = self.inverse = None
         if mechanics.several:
             sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
-            self.answer = inverse(mode_matrix(mechanics, sticking, closed, self.dragging))
+            self.inverse = inverse(mode_matrix(mechanics, sticking, closed, self.signed_friction))
         else:
             self.of_one = _OneContact(mechanics, contact, mu)
 
-    def added(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Each | None = None) -> tuple[Each, Each]:
+    def added(
+        self, mechanics: Mechanics, free: Float[Array, " n"], other_friction: Each | None = None
+    ) -> tuple[Each, Each]:
         """(T, N) in N that the mode adds to those at `mechanics.rest`.
 
-        `otherwise` is a part of the friction force of a sliding contact besides σμN, in N.
+        `other_friction` is a part of the friction force of a sliding contact besides σμN, in N.
         """
         if mechanics.rest is not None:
             # The change of friction at the normal force of rest: exactly zero where friction is constant.
-            more = (self.dragging - mechanics.rest.friction) * mechanics.rest.normal_force
-            otherwise = more if otherwise is None else otherwise + more
-        if self.answer is not None:
-            return self._of_several(self.answer, mechanics, free, otherwise)
+            more = (self.signed_friction - mechanics.rest.friction) * mechanics.rest.normal_force
+            other_friction = more if other_friction is None else other_friction + more
+        if self.inverse is not None:
+            return self._of_several(self.inverse, mechanics, free, other_friction)
         assert self.of_one is not None
         status = self.contact.status
         tangential_force, normal_force = self.of_one.forces(
-            mechanics, free, None if otherwise is None else jnp.where(status == Status.SLIDE, otherwise, 0.0)
+            mechanics, free, None if other_friction is None else jnp.where(status == Status.SLIDE, other_friction, 0.0)
         )
         if mechanics.rest is None:
             return tangential_force, normal_force
@@ -59,24 +63,24 @@ class ModeForces(eqx.Module):
         )
 
     def _of_several(
-        self, answer, mechanics: Mechanics, free, otherwise
+        self, inverse_matrix, mechanics: Mechanics, free, other_friction
     ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
         status, rest = self.contact.status, mechanics.rest
         open_t, open_n = (0.0, 0.0) if rest is None else (-rest.tangential_force, -rest.normal_force)
-        slides = jnp.zeros_like(self.dragging) if otherwise is None else otherwise
+        slides = jnp.zeros_like(self.signed_friction) if other_friction is None else other_friction
         right_t = by_status(self.contact, stick=-free[mechanics.tangential], slide=slides, detach=open_t)
         right_n = jnp.where(status == Status.DETACH, open_n, -free[mechanics.normal])
-        forces = answer @ jnp.concatenate([right_t, right_n])
+        forces = inverse_matrix @ jnp.concatenate([right_t, right_n])
         return forces[: len(status)], forces[len(status) :]
 
 
 def mode_matrix(
-    mechanics: Mechanics, sticking: Bool[Array, " c"], closed: Bool[Array, " c"], dragging: Float[Array, " c"]
+    mechanics: Mechanics, sticking: Bool[Array, " c"], closed: Bool[Array, " c"], signed_friction: Float[Array, " c"]
 ) -> Float[Array, "k k"]:
     """The matrix of the system for the forces of several contacts; rows and columns are all T, then all N."""
     g_tt, g_tn, g_nn = mechanics.compliance
     one = jnp.eye(sticking.shape[0], dtype=g_tt.dtype)
-    slides = jnp.where(closed & ~sticking, -dragging, 0.0)
+    slides = jnp.where(closed & ~sticking, -signed_friction, 0.0)
     stuck, touching = sticking[:, None], closed[:, None]
     return jnp.concatenate(
         [
@@ -93,7 +97,7 @@ class _OneContact(eqx.Module):
 
     normal: tuple[Float[Array, ""], Float[Array, ""]]  # kg
     tangential: tuple[Float[Array, ""], Float[Array, ""]]  # kg
-    dragging: Float[Array, ""]  # σμ while it slides
+    signed_friction: Float[Array, ""]  # σμ while it slides
 
     def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, ""]):
         g_tt, g_tn, g_nn = mechanics.compliance
@@ -102,16 +106,18 @@ class _OneContact(eqx.Module):
         slide = jnp.where(slides, 1.0 / mechanics.normal_compliance(contact.direction, mu), 0.0)
         self.normal = g_tn * stick, -g_tt * stick - slide
         self.tangential = -g_nn * stick, g_tn * stick
-        self.dragging = jnp.where(slides, contact.direction * mu, none)
+        self.signed_friction = jnp.where(slides, contact.direction * mu, none)
 
-    def forces(self, mechanics: Mechanics, free: Float[Array, " n"], otherwise: Float[Array, ""] | None):
+    def forces(self, mechanics: Mechanics, free: Float[Array, " n"], other_friction: Float[Array, ""] | None):
         free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
-        if otherwise is not None:
+        if other_friction is not None:
             _, g_tn, _ = mechanics.compliance
-            free_n = free_n + g_tn * otherwise
+            free_n = free_n + g_tn * other_friction
         normal_force = self.normal[0] * free_t + self.normal[1] * free_n
-        tangential_force = self.tangential[0] * free_t + self.tangential[1] * free_n + self.dragging * normal_force
-        return (tangential_force if otherwise is None else tangential_force + otherwise), normal_force
+        tangential_force = (
+            self.tangential[0] * free_t + self.tangential[1] * free_n + self.signed_friction * normal_force
+        )
+        return (tangential_force if other_friction is None else tangential_force + other_friction), normal_force
 
 
 def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -76,7 +76,7 @@ def magnitudes(
         tangential_force = tangential_force + by_status(
             contact,
             stick=none,
-            slide=_otherwise(mechanics, contact) * jnp.abs(at_rest.normal_force),
+            slide=_other_friction(mechanics, contact) * jnp.abs(at_rest.normal_force),
             detach=jnp.abs(at_rest.tangential_force),
         )
         normal_force = normal_force + resting_n
@@ -99,12 +99,12 @@ def magnitudes(
     return guards, on_constraint_rates(mechanics, contact, jnp.concatenate([y[n:], acceleration]))
 
 
-def _otherwise(mechanics: Mechanics, contact: Contact) -> Each:
+def _other_friction(mechanics: Mechanics, contact: Contact) -> Each:
     """How far σμ may be from its value at rest."""
     assert mechanics.rest is not None
     static = mechanics.friction.static
-    dragging = contact.direction * mechanics.friction(jnp.zeros_like(static))
-    return jnp.abs(dragging - mechanics.rest.friction) if mechanics.friction.constant else 2 * static
+    signed_friction = contact.direction * mechanics.friction(jnp.zeros_like(static))
+    return jnp.abs(signed_friction - mechanics.rest.friction) if mechanics.friction.constant else 2 * static
 
 
 def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], mode) -> tuple[Each, Each, Each, Each]:
@@ -127,7 +127,7 @@ def _one_size(mechanics: Mechanics, contact: Contact, free: Float[Array, " n"], 
         return tangential_force, normal_force, none, none
     rest_n = jnp.abs(mechanics.rest.normal_force)
     resting_n = by_status(
-        contact, stick=none, slide=g_tn * _otherwise(mechanics, contact) * rest_n / compliance, detach=rest_n
+        contact, stick=none, slide=g_tn * _other_friction(mechanics, contact) * rest_n / compliance, detach=rest_n
     )
     # Slip begins with an acceleration that is the rounding error of the margin at which sticking ended. If it counted as more
     # than zero, sticking and sliding would follow each other for ever.
@@ -142,18 +142,18 @@ def _several_sizes(
     """The same for several contacts."""
     static = mechanics.friction.static
     mode = ModeForces(mechanics, contact, static) if mode is None else mode
-    assert mode.answer is not None
-    answer, count = jnp.abs(mode.answer), len(mechanics.places)
+    assert mode.inverse is not None
+    inverse, count = jnp.abs(mode.inverse), len(mechanics.places)
     free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
     sticking, closed = contact.status == Status.STICK, contact.status != Status.DETACH
     right = jnp.concatenate([jnp.where(sticking, free_t, 0.0), jnp.where(closed, free_n, 0.0)])
-    forces = answer @ right
+    forces = inverse @ right
     none = jnp.zeros_like(free_t)
     if mechanics.rest is None:
         return forces[:count], forces[count:], none, none
     rest_t, rest_n = jnp.abs(mechanics.rest.tangential_force), jnp.abs(mechanics.rest.normal_force)
-    missing_t = by_status(contact, stick=none, slide=_otherwise(mechanics, contact) * rest_n, detach=rest_t)
-    missing = answer @ jnp.concatenate([missing_t, jnp.where(closed, 0.0, rest_n)])
+    missing_t = by_status(contact, stick=none, slide=_other_friction(mechanics, contact) * rest_n, detach=rest_t)
+    missing = inverse @ jnp.concatenate([missing_t, jnp.where(closed, 0.0, rest_n)])
     g_tt, _, g_nn = mechanics.compliance
     alone = free_n / jnp.diagonal(g_nn)
     onset = jnp.abs(jnp.diagonal(g_tt)) * (static * alone + free_t / jnp.diagonal(g_tt))

@@ -16,7 +16,7 @@ from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps, Section
 from ..simulation.trajectory import Trajectory, simulate
 from ..steppers.event_exact import EventExact
-from .around import Phase, floquet_multipliers, seen_around, word
+from .one_period import Phase, floquet_multipliers, follow_period, word
 
 # A multiplier counts as inside the unit circle if its size is below one by at least this.
 MARGIN = 1e-9
@@ -198,7 +198,7 @@ def section_multipliers(jacobian: Float[np.ndarray, "state state"]) -> Complex[n
 def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitCycle:
     """The limit cycle of a fixed point of the scene's return map."""
     point, stepper = closed.point, EventExact()
-    seen = seen_around(scene, stepper, point, closed.period)
+    seen = follow_period(scene, stepper, point, closed.period)
     largest = np.abs(section_multipliers(closed.jacobian))[0]
     points = np.asarray(point.y)[None]
     if closed.crossings > 1:

@@ -21,8 +21,8 @@ from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
 from ..section.return_maps import ReturnMaps, Section, section_at
 from ..steppers.event_exact import EventExact
-from .around import seen_around, word
 from .cycle import LimitCycle, under_final_load
+from .one_period import follow_period, word
 
 # Points of the curve; and returns in a window of which harmonics and the word are given.
 POINTS, WINDOW = 2304, 96
@@ -41,7 +41,7 @@ def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitC
     points, rotation, residual = _curve(weights, found.path[0])
     exponents = _lyapunov_exponents(maps, start)
     point = start.point(0)
-    seen = seen_around(scene, EventExact(), point, float(maps.returns(only, start, WINDOW).time[0]))
+    seen = follow_period(scene, EventExact(), point, float(maps.returns(only, start, WINDOW).time[0]))
     largest = np.exp(exponents).astype(complex)
     return LimitCycle(
         scene=under_final_load(scene),

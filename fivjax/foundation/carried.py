@@ -11,11 +11,11 @@ Carry = TypeVar("Carry")
 
 
 def depending_on(given: PyTree, begin: Carry) -> Carry:
-    """`begin`, which a loop starts from, as depending on all that is `given` to the loop, as what it leads to does.
+    """What a loop begins with, marked as depending on all that is `given` to the loop, as the loop's later values do.
 
-    Its values stay as they are. JAX asks which of a loop's numbers have derivatives, or differ between the members of a batch,
-    by transforming the loop's body until the answer no longer changes. With the answer in `begin` it does so once: long bodies
-    are traced in two thirds of the time.
+    The values of `begin` stay as they are. JAX asks which of a loop's numbers have derivatives, or differ between the members
+    of a batch, by transforming the loop's body until the answer no longer changes. With the answer in `begin` it does so once:
+    long bodies are traced in two thirds of the time.
     """
     known = [leaf.ravel()[0] for leaf in jax.tree.leaves(given) if eqx.is_inexact_array(leaf) and leaf.size]
     if not known:

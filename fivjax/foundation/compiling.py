@@ -38,7 +38,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     @functools.cache
     def alone():
         # `filter_jit` hands further arguments on to JAX, but its overloads do not say so.
-        return eqx.filter_jit(function, compiler_options=less_thought())  # pyright: ignore[reportCallIssue]
+        return eqx.filter_jit(function, compiler_options=quick_compiler_options())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -60,7 +60,7 @@ def transformed(arguments) -> bool:
 
 
 @functools.cache
-def less_thought() -> dict[str, int | bool]:
+def quick_compiler_options() -> dict[str, int | bool]:
     """The options of `COMPILED_QUICKLY` that this machine's compiler knows and the user has not set."""
     if jax.default_backend() != "cpu":
         return {}

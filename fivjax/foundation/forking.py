@@ -1,4 +1,4 @@
-"""Processes forked from one that has used JAX: a fork copies no threads, and what JAX computes would wait for its own for ever.
+"""Processes forked from one that has used JAX. A fork copies no threads, so a computation by JAX in it would wait for ever.
 
 A process that is forked before JAX has computed anything is able to compute.
 """

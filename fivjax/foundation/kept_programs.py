@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 
-from .compiling import compiled, less_thought, transformed
+from .compiling import compiled, quick_compiler_options, transformed
 from .forking import refuse_if_forked
 from .kept_executables import NotSerializable, can_serialize, program_from, serialized
 from .kept_folder import folder_of_caches, folder_to_keep_in, keep, make_room, read_kept
@@ -121,7 +121,7 @@ def _program(function: Callable, structure, rest: tuple, arrays: Sequence, quick
     path = _place(function, structure, rest)
     if path is None:
         return None
-    options = less_thought() if quickly_compiled else {}
+    options = quick_compiler_options() if quickly_compiled else {}
 
     def ready(content: bytes) -> Callable:
         kind, form, program = content.split(b"\0", 2)

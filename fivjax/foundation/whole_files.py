@@ -32,7 +32,7 @@ def write_whole(path: Path, content: bytes, like: os.stat_result | None = None, 
     **Raises:** `OSError`; what was there is unchanged then, and nothing is left beside it.
     """
     remove_left_over(path.parent)
-    handle, part = _begun(path.parent, 0o600 if private or like else 0o666)
+    handle, part = _new_locked_file(path.parent, 0o600 if private or like else 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
@@ -56,7 +56,7 @@ def try_to_write(folder: Path) -> None:
 
     **Raises:** `OSError` where that is not possible.
     """
-    handle, part = _begun(folder, 0o600)
+    handle, part = _new_locked_file(folder, 0o600)
     os.close(handle)
     part.unlink(missing_ok=True)
 
@@ -68,7 +68,7 @@ def own_folder(parent: Path) -> Iterator[Path]:
     **Raises:** `OSError` where it cannot be made.
     """
     remove_left_over(parent)
-    folder, handle = _begun_folder(parent)
+    folder, handle = _new_locked_folder(parent)
     try:
         yield folder
     finally:
@@ -90,7 +90,7 @@ def _hidden(folder: Path) -> Path:
     return folder / f"{PREFIX}{secrets.token_hex(8)}{SUFFIX}"
 
 
-def _begun(folder: Path, mode: int) -> tuple[int, Path]:
+def _new_locked_file(folder: Path, mode: int) -> tuple[int, Path]:
     """A new file under a hidden name, open and locked."""
     while True:
         part = _hidden(folder)
@@ -100,7 +100,7 @@ def _begun(folder: Path, mode: int) -> tuple[int, Path]:
         os.close(handle)
 
 
-def _begun_folder(parent: Path) -> tuple[Path, int | None]:
+def _new_locked_folder(parent: Path) -> tuple[Path, int | None]:
     """A new folder under a hidden name, and what holds its lock."""
     while True:
         folder = _hidden(parent)

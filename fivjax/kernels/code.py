@@ -22,7 +22,7 @@ from .cpp_writer import Writer
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class Slot:
     """Where an array is in a row of numbers."""
 
     start: int
@@ -51,15 +51,15 @@ class Place:
 
 
 @dataclasses.dataclass(frozen=True)
-class Text:
+class KernelSource:
     """A kernel's code, and what its arrays hold: values, then tangents of those that are real numbers."""
 
     structures: tuple  # of the function's results
     source: str
-    ends: tuple[Place, ...]
-    rows: tuple[Place, ...]
-    end_dots: tuple[Place, ...]
-    row_dots: tuple[Place, ...]
+    ends: tuple[Slot, ...]
+    rows: tuple[Slot, ...]
+    end_dots: tuple[Slot, ...]
+    row_dots: tuple[Slot, ...]
 
     @functools.cached_property
     def widths(self) -> tuple[int, int, int, int]:
@@ -71,9 +71,9 @@ class Text:
         return ends, rows, end_dots, row_dots
 
 
-def written(function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0) -> tuple:
-    """A `Text`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its arrays
-    that are `wide`. So many of the first arrays are `shared` by the trajectories of a group.
+def traced_source(function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0) -> tuple:
+    """A `KernelSource`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its
+    arrays that are `wide`. So many of the first arrays are `shared` by the trajectories of a group.
     """
     like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
     instants = jax.ShapeDtypeStruct((2,), np.dtype("float64"))
@@ -138,14 +138,14 @@ def form_with_slopes(form: Form, wide: Sequence[bool]) -> Form:
     )[0]
 
 
-def text(plain: tuple) -> Text:
-    """A `Text` from what was `written`."""
+def source_from_plain(plain: tuple) -> KernelSource:
+    """A `KernelSource` from its plain values."""
     structures, source, *places = plain
     structures = tuple(from_text(structure) for structure in structures)
-    return Text(
+    return KernelSource(
         structures,
         source,
-        *(tuple(Place(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places),
+        *(tuple(Slot(start, tuple(shape), dtype) for start, shape, dtype in those) for those in places),
     )
 
 

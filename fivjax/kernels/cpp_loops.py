@@ -18,7 +18,7 @@ def _while(writer: Writer, equation, operands) -> list[Value]:
     fixed = operands[len(asked) :][: equation.params["body_nconsts"]]
     begin = operands[len(asked) + len(fixed) :]
     kinds, _ = _types_carried(writer, body.jaxpr, fixed, begin, [], equation.outvars)
-    carry = [changed(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    carry = [variable_from(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
     writer.open("for (;;)")
     (going,) = writer.run(condition.jaxpr, condition.consts, [*asked, *carry])
     writer.put(f"if (!({text_of(writer.entries(going).item())})) break;")
@@ -46,7 +46,7 @@ def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int
         writer.view(value, kind_of(atom.aval))
         for value, atom in zip(along, equation.invars[len(fixed) + len(begin) :], strict=True)
     ]
-    carry = [changed(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    carry = [variable_from(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
     rows = [
         rows_of(k, WIDE if wide[len(begin) + k] else kind_of(variable.aval))
         for k, variable in enumerate(equation.outvars[len(begin) :])
@@ -76,9 +76,9 @@ def _cond(writer: Writer, equation, operands) -> list[Value]:
         chosen = branches[min(max(int(which), 0), last)]
         return writer.run(chosen.jaxpr, chosen.consts, rest)
     flags = list(map(writer.is_wide, rest))
-    wide = [any(each) for each in zip(*(moved(branch.jaxpr, flags) for branch in branches), strict=True)]
+    wide = [any(each) for each in zip(*(wide_results(branch.jaxpr, flags) for branch in branches), strict=True)]
     found = [
-        unset(writer, variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
+        unset_variable(writer, variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
         for variable, is_wide in zip(equation.outvars, wide, strict=True)
     ]
     for k, branch in enumerate(branches):
@@ -109,14 +109,14 @@ def _types_carried(writer: Writer, body: Jaxpr, fixed, begin, along, variables) 
 def _carried(body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool]) -> tuple[list[bool], list[bool]]:
     """Which of the numbers that a loop carries are wide, from its first turn or a later one, and which of its results."""
     while True:
-        after = moved(body, [*fixed, *begin, *along])
+        after = wide_results(body, [*fixed, *begin, *along])
         more = [one or other for one, other in zip(begin, after[: len(begin)], strict=True)]
         if more == begin:
             return begin, after
         begin = more
 
 
-def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
+def wide_results(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
     """Which results of a traced function are wide if these of its operands are: real numbers that depend on one."""
     moves = dict(zip(jaxpr.invars, wide, strict=True))
 
@@ -136,10 +136,10 @@ def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
             )
             found = [*begin, *after[carried:]]
         elif name == "cond":
-            ways = (moved(branch.jaxpr, flags[1:]) for branch in params["branches"])
+            ways = (wide_results(branch.jaxpr, flags[1:]) for branch in params["branches"])
             found = [any(each) for each in zip(*ways, strict=True)]
         elif name not in RULES and isinstance(called := within(params), ClosedJaxpr):
-            found = moved(called.jaxpr, flags)
+            found = wide_results(called.jaxpr, flags)
         else:
             found = [any(flags)] * len(equation.outvars)
         for variable, is_wide in zip(equation.outvars, found, strict=True):
@@ -150,7 +150,7 @@ def moved(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
 # ------------------------------------------------------------------------------------ what loops and branches change
 
 
-def changed(writer: Writer, value: Value, kind: str) -> Value:
+def variable_from(writer: Writer, value: Value, kind: str) -> Value:
     """A variable, or a C array, that begins with this value."""
     if value.shape == ():
         found = writer.name(kind, "w")
@@ -161,7 +161,7 @@ def changed(writer: Writer, value: Value, kind: str) -> Value:
     return writer.small(into)
 
 
-def unset(writer: Writer, shape, kind: str) -> Value:
+def unset_variable(writer: Writer, shape, kind: str) -> Value:
     """The same, without a value yet."""
     if shape == ():
         found = writer.name(kind, "w")

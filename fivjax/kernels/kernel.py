@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from ..foundation.argument_forms import Form
 from ..foundation.blocks import workers
 from ..foundation.kept_programs import kept_value
-from .code import text, written
+from .code import source_from_plain, traced_source
 from .lane_functions import AT_A_TIME, LaneFunction
 from .warp_library import gpus_for, warp
-from .xla_calls import Places
+from .xla_calls import Addresses
 
 # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
 WIDTHS = (1, 2, 4, 8, 16)
@@ -26,7 +26,8 @@ LEAST_IN_THREADS = 32
 # The arrays of every kernel, with their axes: over trajectories, then as said.
 GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
-# What a kernel is told beside where they are: the length of a row of numbers, from one row of instants to the next, and theirs.
+# A kernel is given the addresses of these arrays, the length of a row of numbers, the step from one row of instants to the
+# next, and the number of instants.
 SIZES = ("numbers", "step", "count")
 # Where trajectories share numbers in groups: where these are, and the group of each; they are told the length of a group's row.
 OF_GROUPS = ("shared", "groups")
@@ -58,7 +59,7 @@ class Kernel:
     def __init__(self, function, form: Form, wide: tuple[bool, ...], width: int, shared: int):
         own = function.differentiated if width else function.function
         self.function, self.form, self.wide, self.width = function, form, wide, width
-        self.text = text(kept_value(written, own, form, wide, shared))
+        self.text = source_from_plain(kept_value(traced_source, own, form, wide, shared))
         places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
         body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)
         # One program, as everything about a kernel that is traced.
@@ -100,7 +101,7 @@ class Kernel:
         of_lanes = [] if groups is None else [groups.of_lane]
         self.of_lanes.on_gpus(devices, [*rows, *of_lanes], found, told)
 
-    def launch(self, places: Places, pool: Executor | None = None, groups: Groups | None = None) -> None:
+    def launch(self, places: Addresses, pool: Executor | None = None, groups: Groups | None = None) -> None:
         """The same on the CPU for arrays at these places, in as many threads as there are cores."""
         lanes = places[len(GIVEN)][1][0]
         shared = [] if groups is None else [(array.ctypes.data, array.shape) for array in groups]
@@ -139,7 +140,7 @@ class Kernel:
         return tuple(map(jax.tree.unflatten, self.text.structures, parts))
 
 
-def _told(places: Places, shared: Places) -> list[int]:
+def _told(places: Addresses, shared: Addresses) -> list[int]:
     """What a kernel is told of arrays at these places, and of `Groups`: where they are, and `SIZES`."""
     (_, (_, numbers)), _, (_, (rows, count)) = places[: len(GIVEN)]
     addresses = [address for address, _ in (*places, *shared)]

@@ -20,9 +20,9 @@ from jax.interpreters import ad, batching, mlir
 
 from ..foundation.argument_forms import Array, Form
 from ..foundation.precision import own_settings
-from .code import Place, form_with_slopes, jvp_along
+from .code import Slot, form_with_slopes, jvp_along
 from .kernel import GIVEN, Kernel, kernel_of, width_for
-from .xla_calls import Places, called_by_xla
+from .xla_calls import Addresses, called_by_xla
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -69,7 +69,7 @@ def _tangents(kernel: "_Hashed", ends: int, rows: int, count: int, parts: list, 
     )
 
 
-def _spread(size: int, dots, places: Sequence[Place], dot_places: Sequence[Place], repeated: int):
+def _spread(size: int, dots, places: Sequence[Slot], dot_places: Sequence[Slot], repeated: int):
     """Tangents of all numbers, from those of the real ones; each array is there so many times."""
     real, parts = iter(dot_places), []
     for place in places:
@@ -216,7 +216,7 @@ def _lowered(dots, instants, *arrays, kernel: _Hashed):
 def _callable(kernel: _Hashed):
     """A function of JAX arrays that launches the kernel."""
 
-    def launch(places: Places) -> None:
+    def launch(places: Addresses) -> None:
         for address, shape in places[len(GIVEN) :]:
             ctypes.memset(address, 0, math.prod(shape) * np.dtype(np.float64).itemsize)
         kernel.kernel.launch(places)

@@ -86,11 +86,11 @@ _Handler = ctypes.CFUNCTYPE(_POINTER, ctypes.POINTER(_Call))
 _HANDLERS: dict[str, _Handler] = {}
 
 # Of each array its address and its shape.
-Places = list[tuple[int, tuple[int, ...]]]
+Addresses = list[tuple[int, tuple[int, ...]]]
 
 
 def called_by_xla(
-    name: str, function: Callable[[Places], None]
+    name: str, function: Callable[[Addresses], None]
 ) -> Callable[[Sequence[jax.ShapeDtypeStruct]], Callable]:
     """A function of JAX arrays, under `jit` on a CPU, for shapes and types of the results.
 

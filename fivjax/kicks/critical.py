@@ -15,10 +15,10 @@ from ..io.datasets import labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
 from ..maps.crossing import NO_KICK, FirstCrossing, first_crossings, with_ends
 from ..maps.datasets import time_limit
-from ..maps.engine import Means, run_to_verdict
+from ..maps.engine import RunOptions, run_to_verdict
 from ..maps.executors import with_workers
 from ..maps.groups import Limits
-from ..maps.plan import Listed
+from ..maps.plan import TrajectoryList
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..steppers.base import AbstractStepper
@@ -137,8 +137,8 @@ def critical_perturbation(
 
     def run(values, method, label: str, limits: Limits | None = None):
         limits = Limits(t_max) if limits is None else limits
-        means = Means(label, memory, progress, executor)
-        return run_to_verdict(scene, Listed(values), method, limits, means, attractors=known)
+        means = RunOptions(label, memory, progress, executor)
+        return run_to_verdict(scene, TrajectoryList(values), method, limits, means, attractors=known)
 
     scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")

@@ -93,7 +93,7 @@ def saddle_passed(scene: Scene, path: Crossings) -> Saddle | None:
     return None
 
 
-class Approach(NamedTuple):
+class ManifoldDistances(NamedTuple):
     """$F_N$ and its derivative at each crossing of a trajectory near the saddle."""
 
     place: np.ndarray
@@ -102,7 +102,7 @@ class Approach(NamedTuple):
     slope: np.ndarray  # its derivative in p
 
 
-def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"]) -> Approach:
+def manifold_distances(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"]) -> ManifoldDistances:
     """`F_N` along a trajectory, with the derivative along the first direction."""
     target = weights * np.asarray(saddle.closed.point.y)
     away = weights * path.y[: path.count] - target
@@ -112,7 +112,7 @@ def approach(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state
     closest = int(np.argmin(np.where(status, distance, np.inf)))
     place = np.flatnonzero((distance < NEAR) & status & (np.arange(path.count) <= closest))
     slopes = (weights * path.y_parameter[0, : path.count]) @ saddle.left
-    return Approach(place, distance[place], (away @ saddle.left)[place], slopes[place])
+    return ManifoldDistances(place, distance[place], (away @ saddle.left)[place], slopes[place])
 
 
 @in_double_precision
@@ -136,7 +136,7 @@ def critical_kick(
             saddle = saddle_passed(scene, path)
             if saddle is None:
                 return None
-        near = approach(path, saddle, weights)
+        near = manifold_distances(path, saddle, weights)
         if not len(near.place):
             return None
         size = np.linalg.norm(weights * np.asarray(saddle.closed.point.y))
@@ -162,7 +162,7 @@ def _derivatives(
     directions: Scene,
     saddle: Saddle,
     path: Crossings,
-    near: Approach,
+    near: ManifoldDistances,
 ) -> dict[str, float]:
     weights = np.asarray(scene.structure.weights)
     with np.errstate(all="ignore"):
@@ -188,7 +188,7 @@ def manifold_normal(
     saddle = saddle_passed(scene, path) if saddle is None else saddle
     if saddle is None:
         return None
-    near = approach(path, saddle, weights)
+    near = manifold_distances(path, saddle, weights)
     if not len(near.place):
         return None
     place = int(near.place[np.argmin(near.distance)])

@@ -130,7 +130,7 @@ def _parting(a: _Events, b: _Events, together: float) -> tuple[int, float, int] 
     return None
 
 
-def _begun(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], Float[Array, " state"]]:
+def _start_of_kick(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], Float[Array, " state"]]:
     load = scene.load
     assert isinstance(load, Pulse)
     mechanics = mechanics_about_sliding(scene)
@@ -143,7 +143,7 @@ def _begun(scene: Scene) -> tuple[Mechanics, Contact, Float[Array, ""], Float[Ar
 def _find_events(args, _):
     """The events of the motion after the kick."""
     how, scene = args
-    mechanics, contact, more, y = _begun(scene)
+    mechanics, contact, more, y = _start_of_kick(scene)
 
     def stretch(carry, part):
         begin, y, contact, found = carry
@@ -205,7 +205,7 @@ def _guard(scene: Scene, stepper: EventExact, directions: Scene, time: float, ev
 
 def _find_guard(args, _):
     how, scene, time, events, guard = args
-    mechanics, contact, more, y = _begun(scene)
+    mechanics, contact, more, y = _start_of_kick(scene)
     duration, happened = scene.load.duration, jnp.zeros((), jnp.int32)
 
     def stretch(carry, part):

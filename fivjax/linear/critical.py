@@ -52,14 +52,14 @@ class StabilityLimit(eqx.Module):
         return CODES[int(self.code)][1]
 
 
-def bare(structure: Structure) -> Structure:
+def matrices_only(structure: Structure) -> Structure:
     """The structure as matrices, without the function that made it: one compiled program serves all structures of a size."""
     return Structure(*structure.matrices, contacts=structure.contacts)
 
 
 def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
     # In contact coordinates, so that one compiled program serves contacts of any directions.
-    return bare(in_contact_coordinates(structure)), jnp.full(len(structure.contacts), float(direction))
+    return matrices_only(in_contact_coordinates(structure)), jnp.full(len(structure.contacts), float(direction))
 
 
 def _is_a_limit(value):
@@ -105,7 +105,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     check_direction(direction)
     if not one_contact(structure):
         return _critical_friction_of_several(*_several(structure, direction))
-    return _critical_friction(bare(structure), jnp.asarray(float(direction)))
+    return _critical_friction(matrices_only(structure), jnp.asarray(float(direction)))
 
 
 @compiled
@@ -140,7 +140,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
     check_direction(direction)
     if not one_contact(structure):
         return _stability_limit_of_several(*_several(structure, direction))
-    return _stability_limit(bare(structure), jnp.asarray(float(direction)))
+    return _stability_limit(matrices_only(structure), jnp.asarray(float(direction)))
 
 
 def _slope_limit(scene):

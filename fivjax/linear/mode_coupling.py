@@ -10,7 +10,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.structure import Structure
-from .critical import bare
+from .critical import matrices_only
 from .crossings import first_limit
 from .feedback import friction_loop
 from .outcomes import COALESCENCE, StabilityOutcome
@@ -85,7 +85,7 @@ def coalescence(structure: Structure, *, damped: bool = False, direction: int = 
     arguments.instance("damped", damped, bool, "True or False")
     check_direction(direction)
     mu, omega, damped_mu, s, found, kept = jax.tree.map(
-        np.asarray, _coalescence(bare(in_contact_coordinates(structure)), jnp.asarray(float(direction)))
+        np.asarray, _coalescence(matrices_only(in_contact_coordinates(structure)), jnp.asarray(float(direction)))
     )
     if not found or (damped and not kept):
         outcome = StabilityOutcome.UNDECIDED if found else StabilityOutcome.NEVER_UNSTABLE

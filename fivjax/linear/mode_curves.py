@@ -12,7 +12,7 @@ from ..model.structure import Structure
 from .critical import stability_limit
 from .mode_coupling import coalescence
 from .mode_following import HALVINGS, LOOKS, Sampler, match_modes
-from .several_contacts import free_coordinates, one_contact
+from .several_contacts import free_closed_coordinates, one_contact
 from .system import with_axes
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _modes_dataset(scene: Scene, name: str, values: np.ndarray, followed: list) 
     import xarray as xr
 
     structure = scene.structure
-    n, keep = structure.size, free_coordinates(structure)
+    n, keep = structure.size, free_closed_coordinates(structure)
     m = len(keep)
     eigenvalue, partner = np.full((2, len(values), m), np.nan, complex)
     shape = np.full((len(values), m, n), np.nan, complex)

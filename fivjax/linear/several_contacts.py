@@ -30,7 +30,7 @@ def one_contact(structure: Structure) -> bool:
     return len(structure.contacts) == 1 and structure.contacts_at_coordinates
 
 
-def free_coordinates(structure: Structure) -> np.ndarray:
+def free_closed_coordinates(structure: Structure) -> np.ndarray:
     """The coordinates, of `in_contact_coordinates`, that closed contacts leave free."""
     return free_in_sliding(in_contact_coordinates(structure))
 
@@ -49,20 +49,20 @@ def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"
     else:
         _, slopes = jax.jvp(lambda v: scene.friction(v), (speed,), (jnp.ones_like(speed),))
         slopes = forces * slopes
-    return sliding_state(scene.structure, friction, slopes), forces
+    return sliding_state_matrix(scene.structure, friction, slopes), forces
 
 
 def sliding_forces(structure: Structure, friction: Float[Array, " c"], force) -> Float[Array, " c"]:
     """The normal forces of steady sliding under a load, in N."""
     structure = in_contact_coordinates(structure)
-    normal, free = np.atleast_1d(contact_coordinates(structure)[1]), free_coordinates(structure)
+    normal, free = np.atleast_1d(contact_coordinates(structure)[1]), free_closed_coordinates(structure)
     *_, stiffness, load = structure.matrices
     rows = sliding_rows(structure, jnp.concatenate([stiffness, load[:, None]], axis=1), friction)
     displacements = solve(rows[:, free], rows[:, -1] * force)
     return stiffness[normal][:, free] @ displacements - load[normal] * force
 
 
-def sliding_state(
+def sliding_state_matrix(
     structure: Structure, friction: Float[Array, " c"], slopes: Float[Array, " c"]
 ) -> Float[Array, "m m"]:
     """A of ż = A z with z = (x, ẋ), x the coordinates that closed contacts leave free.
@@ -72,13 +72,13 @@ def sliding_state(
     structure = in_contact_coordinates(structure)
     tangential, _ = contact_coordinates(structure)
     mass, damping, stiffness = sliding_matrices(structure, friction)
-    along = free_coordinates(structure)[:, None] == np.atleast_1d(tangential)
+    along = free_closed_coordinates(structure)[:, None] == np.atleast_1d(tangential)
     return state_matrix(mass, damping + jnp.diag(along @ slopes), stiffness)
 
 
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
     # In units of the structure's own frequencies, as `significant_growth` needs it.
-    matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
+    matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
     scale = _time_scale(structure)
     half = matrix.shape[0] // 2
     units = jnp.concatenate([jnp.ones(half), jnp.full(half, scale)])
@@ -111,7 +111,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     halvings = 50
     low, high = jax.lax.fori_loop(0, halvings, bisect, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
-    values = eigenvalues(sliding_state(structure, direction * high, jnp.zeros_like(direction)))
+    values = eigenvalues(sliding_state_matrix(structure, direction * high, jnp.zeros_like(direction)))
     omega = jnp.abs(values[jnp.argmax(values.real)].imag)
     undamped = jnp.all(structure.damping == 0)
     flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
@@ -139,7 +139,7 @@ def _(primals, tangents):
     at = jnp.where(usable, mu, 0.1)
 
     def growth(structure, mu):
-        matrix = sliding_state(structure, direction * mu, jnp.zeros_like(direction))
+        matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
         return jnp.max(eigenvalues(matrix).real)
 
     _, along_structure = jax.jvp(lambda s: growth(s, at), (structure,), (tangents[0],))

@@ -20,10 +20,10 @@ from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset, wilson
-from .engine import Means, run_to_verdict
+from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
 from .groups import Limits
-from .plan import Grid, Listed
+from .plan import Grid, TrajectoryList
 from .resuming import keeper_at
 
 
@@ -42,9 +42,9 @@ def verdicts_from(
     """
     places = state_places(scene.structure)
     values = {name: np.ascontiguousarray(states[:, place]) for name, place in places.items()}
-    scene, means = under_final_load(scene), Means(label, progress=False)
-    listed = Listed(values, places)
-    return run_to_verdict(scene, listed, EventExact(), Limits(30.0), means, attractors=attractors).verdict
+    scene, options = under_final_load(scene), RunOptions(label, progress=False)
+    listed = TrajectoryList(values, places)
+    return run_to_verdict(scene, listed, EventExact(), Limits(30.0), options, attractors=attractors).verdict
 
 
 @in_own_coordinates
@@ -109,7 +109,7 @@ def basins(
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         verdicts = run_to_verdict(
-            scene, grid, method, Limits(t_max), Means("basins", memory, progress, executor, keeper)
+            scene, grid, method, Limits(t_max), RunOptions("basins", memory, progress, executor, keeper)
         )
     dataset = map_dataset(scene, method, t_max, grid, verdicts, linear_limit(scene, axes))
     for name, place in states.items():

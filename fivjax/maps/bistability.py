@@ -15,7 +15,7 @@ from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset
-from .engine import Means, run_to_verdict
+from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
 from .groups import Limits
 from .plan import Grid
@@ -118,19 +118,19 @@ def bistability_map(
     limits = Limits(t_max, int(max_steps), bool(energy))
     refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
     keeper = keeper_at(resume, scene, method, grid, limits._asdict() | refinement, limits.energy)
-    means = Means("map", memory, progress, executor, keeper)
+    options = RunOptions("map", memory, progress, executor, keeper)
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         # Compiled and computed while trajectories are followed.
         aside = ThreadPoolExecutor(1)
         limit = aside.submit(linear_limit, scene, axes)
         aside.shutdown(wait=False)
         if not refine:
-            verdicts = run_to_verdict(scene, grid, method, limits, means)
+            verdicts = run_to_verdict(scene, grid, method, limits, options)
             return map_dataset(scene, method, t_max, grid, verdicts, _known_by_now(limit, verdicts))
         found: dict = {}  # attractors, which finer levels need not find again
 
         def level(places: np.ndarray, what: str) -> Verdicts:
-            return run_to_verdict(scene, grid, method, limits, means._replace(label=f"map, {what}"), places, found)
+            return run_to_verdict(scene, grid, method, limits, options._replace(label=f"map, {what}"), places, found)
 
         cells = refine_grid(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..attractors.approach import Approach
-from ..attractors.catalogue import Attractors, Captor, Catalogue
+from ..attractors.catalogue import Attractors, CapturingSet, Catalogue
 from ..attractors.cycles import Recurrence, StableCycle
 from ..attractors.divergence import long_divergence
 from ..attractors.long_run import fates
@@ -32,7 +32,7 @@ class Late(NamedTuple):
     """What becomes of trajectories whose time is over."""
 
     chaotic: Bool[np.ndarray, " m"]
-    attractor: dict[int, Captor]  # by row
+    attractor: dict[int, CapturingSet]  # by row
     sliding: Int[np.ndarray, " r"]  # rows of those that slide for ever
     now: Progress  # all trajectories when that is so, which may be long after their time was over
 
@@ -128,7 +128,7 @@ class Capture:
             constants = 12.0 * cycle.period / (1 - cycle.multiplier)
             self.settled_by[g] = max(self.settled_by[g], min(constants, self.most_time[g]))
 
-    def entered(self, pending: np.ndarray, now: Progress, undecided: np.ndarray) -> dict[int, Captor]:
+    def entered(self, pending: np.ndarray, now: Progress, undecided: np.ndarray) -> dict[int, CapturingSet]:
         """The attractors that have captured trajectories, by row."""
         if self.maps is None:
             return {}
@@ -189,7 +189,7 @@ def later(
     return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 
-def attractor_columns(count: int, attractor: dict[int, Captor], chaotic: np.ndarray):
+def attractor_columns(count: int, attractor: dict[int, CapturingSet], chaotic: np.ndarray):
     """Kind, amplitude, period, multiplier, reach and contraction of the attractor of each of so many trajectories."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
     amplitude, period, multiplier, reach, contraction = np.full((5, count), np.nan)

@@ -24,7 +24,7 @@ from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
 from .job_files import file_of, from_bytes, to_bytes
-from .plan import Places
+from .plan import Indices
 from .results import Verdicts, by_name, not_run
 
 KIND = "fivjax checkpoint"
@@ -80,16 +80,16 @@ class Checkpoint:
             warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=5)
         return bool(kept.damaged) or kept.elsewhere
 
-    def recall(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Indices | None) -> Verdicts:
         """The results kept of these trajectories (all, unless given)."""
         chosen = slice(None) if places is None else places
         return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
 
-    def job_file(self, places: Places) -> tuple[str, str]:
+    def job_file(self, places: Indices) -> tuple[str, str]:
         """The path and the key of the file for the job with these trajectories."""
         return file_of(self._jobs, self.run, places)
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
+    def keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         """Keep the results of a job; they are written if it is time."""
         if found is not None:
             self.found[int(places[0])] = found

@@ -24,7 +24,7 @@ from ..verdicts.verdict import Verdict
 from .executors import Workers, hand_out
 from .groups import Limits, groups_of
 from .jobs import Done, Job, run_job
-from .plan import Grid, Listed, Places, Plan, plan_of
+from .plan import Grid, Indices, Plan, TrajectoryList, plan_of
 from .results import Verdicts, count_of, not_run
 
 
@@ -33,15 +33,15 @@ class Keeper(Protocol):
 
     found: dict[int, dict[bytes, Attractors]]  # attractors from earlier jobs, by the first trajectory of each job
 
-    def recall(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Indices | None) -> Verdicts:
         """The results of an earlier run of these trajectories (all, unless given), in their order."""
         ...
 
-    def job_file(self, places: Places) -> tuple[str, str]:
+    def job_file(self, places: Indices) -> tuple[str, str]:
         """The path and the key of the file in which the job with these trajectories keeps how far it has come."""
         ...
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
+    def keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         """Keep the results of the job with these trajectories; of its attractors, those that are needed later."""
         ...
 
@@ -50,7 +50,7 @@ class Keeper(Protocol):
         ...
 
 
-class Means(NamedTuple):
+class RunOptions(NamedTuple):
     """How a run is carried out: its results do not depend on this."""
 
     label: str  # of its progress bar
@@ -63,11 +63,11 @@ class Means(NamedTuple):
 
 def run_to_verdict(
     scene: Scene,
-    trajectories: Grid | Listed,
+    trajectories: Grid | TrajectoryList,
     method: AbstractStepper,
     limits: Limits,
-    means: Means,
-    places: Places | None = None,
+    options: RunOptions,
+    places: Indices | None = None,
     attractors: dict[bytes, Attractors] | None = None,
 ) -> Verdicts:
     """Follow trajectories (all, unless their indices `places` are given, in rising order) until their verdicts are known.
@@ -78,15 +78,17 @@ def run_to_verdict(
     Interrupted by the user, it returns the verdicts known by then (of jobs in other processes, those of finished jobs); all
     other trajectories have `Verdict.NOT_RUN`.
     """
-    plan, keeper = plan_of(scene, trajectories, method, limits, places), means.keeper
+    plan, keeper = plan_of(scene, trajectories, method, limits, places), options.keeper
     total = trajectories.total if places is None else len(places)
     verdicts = not_run(total, limits.energy) if keeper is None else keeper.recall(places)
     already, unit = total - int(verdicts.pending().sum()), " trajectories"
     with (
         stop_requests() as requested,
-        following(means.label, shown=means.progress, total=total, already=already, unit=unit) as work,
+        following(options.label, shown=options.progress, total=total, already=already, unit=unit) as work,
     ):
-        run = _Run(plan, means, verdicts, places, {} if attractors is None else attractors, _Ended(work), requested)
+        run = _Run(
+            plan, options, verdicts, places, {} if attractors is None else attractors, _EndedCount(work), requested
+        )
         try:
             for part in plan.parts:
                 run.follow(part)
@@ -104,17 +106,17 @@ def run_to_verdict(
 
 
 class _Run(NamedTuple):
-    """A run under way: its plan and means, and the results by now."""
+    """A run under way: its plan and options, and the results by now."""
 
     plan: Plan
-    means: Means
+    options: RunOptions
     verdicts: Verdicts
-    places: Places | None
+    places: Indices | None
     attractors: dict[bytes, Attractors]
-    ended: "_Ended"
+    ended: "_EndedCount"
     requested: list[int]  # signals that ask to stop
 
-    def rows(self, number: int) -> Places:
+    def rows(self, number: int) -> Indices:
         """The rows of a job's trajectories among the results."""
         own = self.plan.jobs[number]
         return own if self.places is None else np.searchsorted(self.places, own)
@@ -125,7 +127,7 @@ class _Run(NamedTuple):
         groups = groups_of(values, tuple(task.states))[0] if self.attractors else np.zeros((0, seeding.shape[1]))
         keys = {row.tobytes() for row in (*groups, *np.unique(seeding, axis=0))}
         known = {key: self.attractors[key] for key in keys & self.attractors.keys()}
-        file = (None, "") if self.means.keeper is None else self.means.keeper.job_file(own)
+        file = (None, "") if self.options.keeper is None else self.options.keeper.job_file(own)
         return Job(task, values, seeding, known, *file)
 
     def write(self, number: int, results: Verdicts) -> None:
@@ -139,7 +141,7 @@ class _Run(NamedTuple):
 
     def follow(self, part: list[int]) -> None:
         """Run the jobs of one part of the plan whose results are missing, and add the attractors that they find."""
-        plan, keeper, workers = self.plan, self.means.keeper, self.means.executor
+        plan, keeper, workers = self.plan, self.options.keeper, self.options.executor
         # Attractors may be needed by another run over the same parameters, or by jobs that share a group.
         needed_later = self.places is not None or bool(plan.parts[-1])
 
@@ -176,7 +178,7 @@ class _Run(NamedTuple):
         end at their next report, and change nothing any more.
         """
         failed, over = [], []
-        most = int(self.means.memory // self.plan.memory) if self.plan.memory else 1
+        most = int(self.options.memory // self.plan.memory) if self.plan.memory else 1
 
         def report(count: int) -> None:
             if not over:
@@ -207,7 +209,7 @@ class _Run(NamedTuple):
             over.append(True)
 
 
-class _Ended:
+class _EndedCount:
     """Counts trajectories that have ended; several threads may report to it."""
 
     def __init__(self, work: Work):

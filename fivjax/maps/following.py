@@ -1,4 +1,5 @@
-"""Many trajectories begun and followed for some steps, in blocks or by kernels, with what can be proved of each then.
+"""Many trajectories at a time: how they begin, are followed for some steps (in blocks or by kernels), and get the verdicts that
+can be proved by then.
 
 `jax.vmap` makes of one trajectory (`one_trajectory`) a row of them that share a group, and a second `jax.vmap` makes that a
 block of rows.
@@ -19,8 +20,8 @@ from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
 from ..section.return_maps import BLOCK, Section, of_block
-from ..verdicts.sliding_proof import SlidingModes, used_up
-from .groups import Shared, Task, shared_by, with_values
+from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
+from .groups import GroupConstants, Task, constants_of, with_values
 from .matrix_kernels import MatrixKernels, begin_building
 from .one_trajectory import (
     UNBOUNDED_FROM,
@@ -42,7 +43,7 @@ class Batch:
         if task.by_kernel:
             begin_building(task, pool)
         self.task, self.pool = task, pool
-        self.shared = shared_by(task, of_groups)
+        self.shared = constants_of(task, of_groups)
         # Of several contacts a trajectory takes more memory.
         self.block = BLOCK_OF_SEVERAL if len(task.scene.structure.contacts) > 1 else None
 
@@ -58,7 +59,7 @@ class Batch:
         return MatrixKernels(self.shared, self.pool) if self.task.by_kernel else None
 
 
-def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
+def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
     """Trajectories at their beginning, each with its kick and initial values in `columns`."""
     task = batch.task
     if batch.kernels is not None:
@@ -72,7 +73,7 @@ def begin(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray,
     return in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
 
 
-def follow(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
+def advance_all(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
     """Trajectories so many steps further, in place."""
     task = batch.task
     if batch.kernels is not None:
@@ -99,7 +100,7 @@ def _follow_by_kernel(
 
 
 def _may_be_concluded(
-    shared: Shared, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
+    shared: GroupConstants, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
 ) -> np.ndarray:
     """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
     steps: those whose mode has not changed in it, after the last jump of the load, and those that have not moved, are too large
@@ -127,7 +128,7 @@ def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.
 def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared: tuple[Mechanics, SlidingModes], y, status, direction):
         mechanics, modes = shared
-        return used_up(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
+        return margin_share_bound(mechanics, modes, Contact(status.astype(jnp.int32), direction), y, jnp.asarray(True))
 
     return of_block(one, shared, rows)
 
@@ -159,7 +160,7 @@ def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajec
 _follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
-def _of_all(scene, method, names, history, everything: Shared, columns, function):
+def _of_all(scene, method, names, history, everything: GroupConstants, columns, function):
     """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
 
     def of_group(shared, columns, *own):

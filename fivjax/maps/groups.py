@@ -34,7 +34,7 @@ from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 HISTORY = ("p", "duration", "start")
 
 
-class Shared(eqx.Module):
+class GroupConstants(eqx.Module):
     """The data that the trajectories of a group have in common."""
 
     values: Float[Array, " k"]  # the parameters that are not those of the kick
@@ -78,7 +78,7 @@ class Task(NamedTuple):
         return isinstance(self.method, EventExact) and has_kernel(self.scene, self.method)
 
 
-def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagation:
+def batch_stepper(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagation:
     """The stepper that gives the same motion of many trajectories in less time, if there is one."""
     one = len(scene.structure.contacts) == 1
     if method != EventExact() or not scene.friction.constant or not one:
@@ -92,7 +92,7 @@ def in_bulk(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagat
 
 def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
     """The version of Warp, where its kernels follow the trajectories of such a run."""
-    by = method if energy else in_bulk(method, scene)
+    by = method if energy else batch_stepper(method, scene)
     by_kernel = isinstance(by, Propagation) or has_kernel(scene, by)
     return {"warp": metadata.version("warp-lang")} if by_kernel else {}
 
@@ -118,8 +118,8 @@ def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tupl
     return distinct, group.ravel()
 
 
-def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
-    """`Shared` of each row of `distinct`, as one array."""
+def constants_of(task: Task, distinct: np.ndarray) -> Flattened:
+    """`GroupConstants` of each row of `distinct`, as one array."""
     # So many groups are worked out at a time.
     size, parts = 64, []
     for start in range(0, len(distinct), size):
@@ -134,7 +134,7 @@ def shared_by(task: Task, distinct: np.ndarray) -> Flattened:
         mechanics, prepared, _, drifts, weights, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(Shared(distinct[rows], mechanics, prepared, own_modes, drifts, weights, longest))
+        part = flatten(GroupConstants(distinct[rows], mechanics, prepared, own_modes, drifts, weights, longest))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)

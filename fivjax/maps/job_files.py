@@ -23,7 +23,7 @@ from ..attractors.tori import Torus
 from ..attractors.tube import Tube
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import replace_whole
-from .plan import Places
+from .plan import Indices
 from .results import Verdicts, by_name
 
 
@@ -181,7 +181,7 @@ def from_content(content: bytes, key: str) -> JobState | None:
     )
 
 
-def file_of(folder: Path, run: dict, places: Places) -> tuple[str, str]:
+def file_of(folder: Path, run: dict, places: Indices) -> tuple[str, str]:
     """The path and the key of the file, in this folder, for the job of this run with these trajectories."""
     key = hashlib.sha256(json.dumps(run).encode() + np.asarray(places, np.int64).tobytes()).hexdigest()
     # Workers may have another working directory.

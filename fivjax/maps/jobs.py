@@ -15,17 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..attractors.catalogue import Attractors, Captor
+from ..attractors.catalogue import Attractors, CapturingSet
 from ..attractors.cycles import CROSSINGS, MORE_CROSSINGS
 from ..foundation.flattened import Flattened
 from ..foundation.parent import end_with_parent
 from ..foundation.precision import in_double_precision
 from ..verdicts.verdict import Verdict
 from .capture import Capture, attractor_columns
-from .following import Batch, begin, follow
+from .following import Batch, advance_all, begin_all
 from .groups import Task, groups_of
 from .job_files import JobFile, JobState
-from .results import Ended, Verdicts, not_run, record
+from .results import EndedTrajectories, Verdicts, not_run, record
 
 # How long trajectories are followed after the last jump of their load, unless told: so many periods of the slowest mode, or so
 # many seconds if none oscillates.
@@ -94,7 +94,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     own = [job.values[name] for name in (*task.history, *task.states)]
     columns = np.stack([np.zeros(len(group)), *own], axis=-1)[:, 1:]
     pending = np.arange(len(group))
-    trajectories = begin(batch, group, columns)
+    trajectories = begin_all(batch, group, columns)
     capture = Capture(batch, of_groups, group, seeds, report)
     # After so many rounds the attractors of the groups of those that are undecided are computed; those that are undecided later
     # ask for a cycle of their own, each time after twice the steps.
@@ -127,7 +127,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             in_time = now.t - now.skipped - now.last_jump < np.maximum(limit, capture.settled_by)[group[pending]]
         else:
             in_time = now.t < limit[group[pending]]
-        entered: dict[int, Captor] = {}
+        entered: dict[int, CapturingSet] = {}
         if done > known_from:
             entered = capture.entered(pending, now, (verdict == Verdict.UNDECIDED) & in_time)
             verdict[list(entered)] = Verdict.LIMIT_CYCLE
@@ -140,7 +140,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             pending, now, finished & (verdict == Verdict.UNDECIDED), proving=task.limits.t_max is None
         )
         verdict[list(late.attractor)], verdict[late.sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
-        ended = Ended(verdict, *attractor_columns(len(pending), entered | late.attractor, late.chaotic))
+        ended = EndedTrajectories(verdict, *attractor_columns(len(pending), entered | late.attractor, late.chaotic))
         rows = np.flatnonzero(finished)
         record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, ended)))
         pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
@@ -158,7 +158,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
         steps = min(max(task.method.round, done // 5), max(task.limits.max_steps - done, 1))
         file.moving()
-        follow(batch, group[pending], trajectories, steps)
+        advance_all(batch, group[pending], trajectories, steps)
         done += steps
 
 

@@ -19,11 +19,11 @@ from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment
 from ..steppers.propagation import Propagation
-from ..verdicts.sliding_proof import used_up
-from ..verdicts.slow_growth import slid_on
+from ..verdicts.sliding_proof import margin_share_bound
+from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
-from .groups import Shared
+from .groups import GroupConstants
 
 # A deviation counts as unbounded if it is this much larger than the equilibrium displacements under the largest load, the
 # belt's motion and the start.
@@ -55,7 +55,7 @@ class Setting(eqx.Module):
 
     scene: Scene
     method: AbstractStepper | Propagation
-    shared: Shared
+    shared: GroupConstants
 
 
 class EnergyRecord(eqx.Module):
@@ -79,7 +79,13 @@ class LoadSteps(eqx.Module):
 
 
 def begin(
-    scene: Scene, shared: Shared, places: tuple[int, ...], values, *, energy: bool = False, for_kernel: bool = False
+    scene: Scene,
+    shared: GroupConstants,
+    places: tuple[int, ...],
+    values,
+    *,
+    energy: bool = False,
+    for_kernel: bool = False,
 ) -> Progress:
     """A trajectory at the sliding equilibrium of its scene, before the kick. At these places of its state it has `values`
     (totals, not deviations) instead, where they are not NaN.
@@ -200,7 +206,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
         )
     quiet_load = now.last_jump <= now.t
-    bound = used_up(mechanics, modes, now.contact, now.y, quiet_load)
+    bound = margin_share_bound(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
         Verdict.NOT_FINITE,
@@ -228,5 +234,5 @@ def _may_slide_on(setting: Setting, now: Progress) -> bool:
 
 def _with_sliding(setting: Setting, now: Progress, quiet_load: Bool[Array, ""]) -> Progress:
     open_ = quiet_load & (now.verdict == Verdict.UNDECIDED)
-    y, time = slid_on(setting.shared.mechanics, setting.shared.modes, now.contact, now.y, open_)
+    y, time = slide_while_certain(setting.shared.mechanics, setting.shared.modes, now.contact, now.y, open_)
     return eqx.tree_at(lambda now: (now.t, now.skipped, now.y), now, (now.t + time, now.skipped + time, y))

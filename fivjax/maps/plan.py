@@ -17,10 +17,10 @@ from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import HISTORY, Limits, Task, bytes_per_trajectory, groups_of, in_bulk
+from .groups import HISTORY, Limits, Task, batch_stepper, bytes_per_trajectory, groups_of
 
 # Indices of trajectories in a run; those of one job, for instance.
-Places = Int[np.ndarray, " r"]
+Indices = Int[np.ndarray, " r"]
 # Attractors are computed from scratch for one in so many values of each parameter, and continued from there to the values that
 # follow (`attractors.search`).
 SEEDING = 4
@@ -41,12 +41,12 @@ class Grid:
         self.across = [k for k, name in enumerate(axes) if name not in HISTORY and name not in self.states]
         self.group_count = math.prod(self.shape[k] for k in self.across)
 
-    def columns(self, places: Places | None = None) -> dict[str, np.ndarray]:
+    def columns(self, places: Indices | None = None) -> dict[str, np.ndarray]:
         """The values of these trajectories (all, unless given), by name."""
         index = np.unravel_index(np.arange(self.total) if places is None else places, self.shape)
         return {name: values[own] for (name, values), own in zip(self.axes.items(), index, strict=True)}
 
-    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+    def seeding(self, places: Indices) -> Float[np.ndarray, "r k"]:
         """The parameters of the group whose attractors seed the search in the group of each of these trajectories: its own,
         where that is searched from scratch. It follows from the whole grid, not from `places`.
         """
@@ -57,7 +57,7 @@ class Grid:
         own = np.stack([values[at] for values, at in columns], axis=-1)
         return _near_enough(own, np.stack([values[at - at % SEEDING] for values, at in columns], axis=-1))
 
-    def groups(self, places: Places) -> Int[np.ndarray, " r"]:
+    def groups(self, places: Indices) -> Int[np.ndarray, " r"]:
         """The group of each of these trajectories."""
         if not self.across:
             return np.zeros(len(places), int)
@@ -76,15 +76,15 @@ class Grid:
             left = max(left // shape[k], 1)
         return tuple(shape)
 
-    def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
+    def jobs(self, places: Indices | None, most: int) -> Sequence[Indices]:
         """These trajectories (all, unless given) divided into jobs; a part of the grid is never in two of them."""
         tile = self.tile(most)
         if places is None:
             return Tiles(self.shape, tile)
-        return cut(Tiles(self.shape, tile).holding(places), places, most)
+        return cut_into_jobs(Tiles(self.shape, tile).holding(places), places, most)
 
 
-class Listed:
+class TrajectoryList:
     """Trajectories by equally long columns of their values; `states` as in a grid."""
 
     def __init__(self, values: Mapping[str, np.ndarray], states: Mapping[str, int] | None = None):
@@ -93,11 +93,11 @@ class Listed:
         self._distinct, self._group = groups_of(self.values, self.states)
         self.group_count = len(self._distinct)
 
-    def columns(self, places: Places | None = None) -> dict[str, np.ndarray]:
+    def columns(self, places: Indices | None = None) -> dict[str, np.ndarray]:
         """The values of these trajectories (all, unless given), by name."""
         return {name: column[slice(None) if places is None else places] for name, column in self.values.items()}
 
-    def seeding(self, places: Places) -> Float[np.ndarray, "r k"]:
+    def seeding(self, places: Indices) -> Float[np.ndarray, "r k"]:
         """As for a grid; a group for which there is none of the run is searched from scratch."""
         return self._seeding[self._group[places]]
 
@@ -111,14 +111,14 @@ class Listed:
         wanted = (ranks - ranks % SEEDING).tolist()
         return _near_enough(own, own[[place.get(tuple(rank), k) for k, rank in enumerate(wanted)]])
 
-    def groups(self, places: Places) -> Int[np.ndarray, " r"]:
+    def groups(self, places: Indices) -> Int[np.ndarray, " r"]:
         """The group of each of these trajectories."""
         return self._group[places]
 
-    def jobs(self, places: Places | None, most: int) -> Sequence[Places]:
+    def jobs(self, places: Indices | None, most: int) -> Sequence[Indices]:
         """These trajectories (all, unless given) divided into jobs, group by group."""
         places = np.arange(self.total) if places is None else places
-        return cut(self._group[places], places, most)
+        return cut_into_jobs(self._group[places], places, most)
 
 
 def _near_enough(own: Float[np.ndarray, "r k"], other: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
@@ -148,16 +148,16 @@ class Tiles(Sequence):
             for k, part, length in zip(at, self.tile, self.shape, strict=True)
         )
 
-    def __getitem__(self, number: int) -> Places:
+    def __getitem__(self, number: int) -> Indices:
         along = [np.arange(part.start, part.stop) for part in self.slices(number)]
         return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
 
-    def holding(self, places: Places) -> Int[np.ndarray, " r"]:
+    def holding(self, places: Indices) -> Int[np.ndarray, " r"]:
         """The number of the part in which each of these trajectories lies."""
         index = np.unravel_index(places, self.shape)
         return np.ravel_multi_index([i // part for i, part in zip(index, self.tile, strict=True)], self.parts)
 
-    def among(self, places: Places | None) -> Iterator[tuple[int, Int[np.ndarray, " t"], Int[np.ndarray, " t"]]]:
+    def among(self, places: Indices | None) -> Iterator[tuple[int, Int[np.ndarray, " t"], Int[np.ndarray, " t"]]]:
         """The parts in which these trajectories (all, unless given) lie: of each its number, which entries of it they are, and
         which of `places`.
         """
@@ -172,7 +172,7 @@ class Tiles(Sequence):
             yield number, np.searchsorted(self[number], places[rows]), rows
 
 
-def cut(unit: Int[np.ndarray, " r"], places: Places, most: int) -> list[Places]:
+def cut_into_jobs(unit: Int[np.ndarray, " r"], places: Indices, most: int) -> list[Indices]:
     """Jobs of whole units with at most `most` trajectories each; a larger unit makes several jobs."""
     order = np.argsort(unit, kind="stable")
     _, counts = np.unique(unit, return_counts=True)
@@ -200,26 +200,26 @@ class Plan(NamedTuple):
     """A run in parts that follow one another; the jobs of a part are independent."""
 
     task: Task
-    trajectories: Grid | Listed
-    jobs: Sequence[Places]
+    trajectories: Grid | TrajectoryList
+    jobs: Sequence[Indices]
     parts: tuple[list[int], ...]  # numbers of jobs; if several share a group, all but the first are in the second part
     memory: float  # of the largest job, bytes
 
 
 def plan_of(
     scene: Scene,
-    trajectories: Grid | Listed,
+    trajectories: Grid | TrajectoryList,
     method: AbstractStepper,
     limits: Limits,
-    places: Places | None = None,
+    places: Indices | None = None,
 ) -> Plan:
     """The plan of a run of these trajectories, or of those at `places`; see `engine.run_to_verdict`."""
     states = trajectories.states
-    followed = method if limits.energy else in_bulk(method, scene)
+    followed = method if limits.energy else batch_stepper(method, scene)
     of_group = trajectories.total / trajectories.group_count
     each = bytes_per_trajectory(scene, of_group)
     count = trajectories.total if places is None else len(places)
-    jobs = trajectories.jobs(places, in_a_job(followed, each, of_group, count))
+    jobs = trajectories.jobs(places, largest_job_size(followed, each, of_group, count))
     counts, later = np.zeros(trajectories.group_count, np.int64), []
     for number, own in enumerate(jobs):
         groups, here = np.unique(trajectories.groups(own), return_counts=True)
@@ -249,7 +249,7 @@ def plan_of(
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def in_a_job(method: AbstractStepper | Propagation, each: float, of_group: float, count: int) -> int:
+def largest_job_size(method: AbstractStepper | Propagation, each: float, of_group: float, count: int) -> int:
     """The most trajectories of a job, of so many in the run, if each takes `each` bytes and so many, on average, are of one
     group.
     """

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..verdicts.verdict import Verdict
-from .plan import Places
+from .plan import Indices
 from .results import Verdicts, not_run
 
 # A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
-Run = Callable[[Places, str], Verdicts]
+Run = Callable[[Indices, str], Verdicts]
 
 
 class Audit(NamedTuple):
@@ -28,7 +28,7 @@ class Refined(NamedTuple):
     """A grid of which some cells were computed: of a large one few, so that there is no result for each cell."""
 
     verdicts: Verdicts  # of the computed cells; behind these, a trajectory that was not run
-    places: Places  # the computed cells
+    places: Indices  # the computed cells
     row: Int[np.ndarray, " cells"]  # the result that each cell takes
     audit: Audit
 
@@ -55,7 +55,7 @@ def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -
     verdicts = run(places, "coarse grid")
     row[places] = np.arange(len(places))
 
-    def compute(which: Places, what: str) -> np.ndarray:
+    def compute(which: Indices, what: str) -> np.ndarray:
         """Compute these points; the rows of their results."""
         nonlocal places, verdicts
         rows = np.arange(len(places), len(places) + len(which))
@@ -88,7 +88,7 @@ def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray,
     return functools.reduce(np.add, np.ix_(*along))
 
 
-def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Places:
+def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Indices:
     """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
     the `row` of the corner before them.
     """
@@ -102,7 +102,7 @@ def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.nd
     return new[wanted]
 
 
-def _points_to_audit(computed: Places, total: int, share: float) -> Places:
+def _points_to_audit(computed: Indices, total: int, share: float) -> Indices:
     """A random share of the points that were not `computed`, without a list of them all."""
     left = total - len(computed)
     count = min(left, math.ceil(share * left))

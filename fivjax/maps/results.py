@@ -71,7 +71,7 @@ def by_name(verdicts: Verdicts) -> dict[str, np.ndarray]:
     return {**parts.pop("energy"), **parts}
 
 
-class Ended(NamedTuple):
+class EndedTrajectories(NamedTuple):
     """Verdicts of trajectories, and the attractors that have captured them."""
 
     verdict: np.ndarray
@@ -83,7 +83,7 @@ class Ended(NamedTuple):
     contraction: np.ndarray
 
 
-def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: Ended) -> None:
+def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: EndedTrajectories) -> None:
     """Write the results of trajectories that have ended at their indices."""
     verdict = ended.verdict
     verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, ended.amplitude)

@@ -15,8 +15,8 @@ from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
-from .groups import bytes_per_trajectory, in_bulk, kernels_by
-from .plan import Grid, in_a_job
+from .groups import batch_stepper, bytes_per_trajectory, kernels_by
+from .plan import Grid, largest_job_size
 from .store import Store, is_store
 
 
@@ -48,8 +48,8 @@ def keeper_at(
         return Checkpoint(path, run, grid.total, energy)
     of_group = grid.total / grid.group_count
     each = bytes_per_trajectory(scene, of_group)
-    # As a short run has them, so that who comes back to a store finds it as it was, however much is asked for.
-    tile = grid.tile(in_a_job(method if energy else in_bulk(method, scene), each, of_group, 1))
+    # The chunks are those of a short run: a store that is resumed with more points, or fewer, finds the same ones.
+    tile = grid.tile(largest_job_size(method if energy else batch_stepper(method, scene), each, of_group, 1))
     return Store(path, run, grid, tile, energy)
 
 

@@ -31,7 +31,7 @@ from ..foundation.whole_files import own_folder
 from ..io.files import check_writable, replace_whole
 from .checkpoint import refuse_other_run
 from .job_files import file_of, from_bytes, to_bytes
-from .plan import Grid, Places, Tiles
+from .plan import Grid, Indices, Tiles
 from .results import Verdicts, by_name, not_run
 
 KIND = "fivjax store"
@@ -83,7 +83,7 @@ class Store:
     def _chunks_begun(self) -> Iterator[int]:
         return (number for number in range(len(self.tiles)) if self._chunk("verdict", number).exists())
 
-    def recall(self, places: Places | None) -> Verdicts:
+    def recall(self, places: Indices | None) -> Verdicts:
         """The results kept by earlier runs of these trajectories (all, unless given)."""
         verdicts = not_run(self.tiles.total if places is None else len(places), self.energy)
         for number, inside, rows in self.tiles.among(places):
@@ -117,11 +117,11 @@ class Store:
                 return {}
         return parts
 
-    def job_file(self, places: Places) -> tuple[str, str]:
+    def job_file(self, places: Indices) -> tuple[str, str]:
         """The path and the key of the file for the job with these trajectories."""
         return file_of(self.path / JOBS, self.run, places)
 
-    def keep(self, places: Places, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
+    def keep(self, places: Indices, verdicts: Verdicts, found: dict[bytes, Attractors] | None) -> None:
         """Keep the results of the job with these trajectories."""
         if found is not None:
             folder = self.path / FOUND

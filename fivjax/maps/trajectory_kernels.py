@@ -1,4 +1,4 @@
-"""Trajectories begun, followed and concluded by kernels, of which each does for one trajectory what `one_trajectory` says."""
+"""Kernels that begin, follow and conclude trajectories: each of their threads does for one what `one_trajectory` says."""
 
 from concurrent.futures import Executor
 
@@ -17,11 +17,11 @@ from ..model.scene import Scene
 from ..section.by_kernel import in_parts, numbers_in_rows
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import Shared, Task, with_values
+from .groups import GroupConstants, Task, with_values
 from .one_trajectory import Progress, Setting, begin, conclude, with_step
 
 
-class OfTask(eqx.Module):
+class TaskConstants(eqx.Module):
     """What is the same for all trajectories of a run."""
 
     scene: Scene
@@ -31,7 +31,7 @@ class OfTask(eqx.Module):
     method: AbstractStepper | Propagation = eqx.field(static=True)
     energy: bool = eqx.field(static=True)
 
-    def setting(self, shared: Shared, row) -> Setting:
+    def setting(self, shared: GroupConstants, row) -> Setting:
         """That of a trajectory with these values of the parameters of the kick."""
         scene = with_values(with_values(self.scene, self.names, shared.values), self.history, row)
         return Setting(scene, self.method, shared)
@@ -66,7 +66,7 @@ class TrajectoryKernels:
     """The kernels for a batch, with the data of its groups."""
 
     def __init__(self, task: Task, shared: Flattened, pool: Executor):
-        self.of_task = OfTask(
+        self.of_task = TaskConstants(
             task.scene, task.names, task.history, tuple(task.states.values()), task.method, task.limits.energy
         )
         # Without the matrices of `Propagation`, which have a kernel of their own.

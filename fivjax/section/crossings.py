@@ -93,7 +93,7 @@ def to_crossing(
     """
     none, zero = jnp.zeros((), jnp.int32), jnp.zeros((), start.y.dtype)
     contact = Contact(start.contact.status.astype(jnp.int32), start.contact.direction)
-    # How long is waited for a return moves with the scene, the return's time does not move with that.
+    # The longest wait for a return depends on the scene; the time of the return does not, so the wait has no derivative.
     longest = jax.lax.stop_gradient(longest)
     begin = _Way(start.y, contact, kick, longest, none, none, none, zero)
     begin = depending_on((mechanics, longest), begin)

@@ -28,7 +28,7 @@ from ..steppers.section import FADED
 from .about_sliding import longest_return, mechanics_about_sliding
 from .by_kernel import SectionKernels, section_kernels
 from .crossings import Point, to_crossing
-from .free_directions import directions_of_several, free_coordinates, jumped_to, section_row
+from .free_directions import directions_of_several, free_on_section, jumped_to, section_row
 
 # Number of states in a block: small, because often there are few states.
 BLOCK = 32
@@ -193,7 +193,7 @@ class ReturnMaps:
         size = len(self.weights)
         found = np.zeros((len(Status), size), bool)
         for status in Status:
-            found[status, free_coordinates(size // 2, self.tangential, self.normal, status)] = True
+            found[status, free_on_section(size // 2, self.tangential, self.normal, status)] = True
         return found
 
     def returns(self, group, at: Section, crossings, kept: int = 1, peaks: bool = False) -> Images:

@@ -29,7 +29,7 @@ from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.kernel_scope import has_kernel
-from .event_margins import DECISIONS, DECISIONS_OF_SEVERAL, LOOKS, Look, look_along, margin_from_cone
+from .event_margins import DECISIONS, DECISIONS_OF_SEVERAL, LOOKS, AdvanceMargins, advance_margins, margin_from_cone
 
 GUARDS = {
     (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
@@ -113,10 +113,10 @@ def _follow(args, over: Float[Array, " k"]):
         y, contact, left = now
         goes_on = left > over
 
-        def look() -> Look:
-            return look_along(asked.method, mechanics, contact, load, y, left)
+        def look() -> AdvanceMargins:
+            return advance_margins(asked.method, mechanics, contact, load, y, left)
 
-        def none() -> Look:
+        def none() -> AdvanceMargins:
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))
 
         found = jax.lax.cond(goes_on, look, none)
@@ -165,7 +165,7 @@ class _Seen:
         without_slip = (start.status != Status.DETACH) & (start.slip == 0)
         self.decisions += [(float(margin), 0.0, OF_START[2]) for margin in start.at_rest[without_slip]]
 
-    def add(self, status: np.ndarray, look: Look, t: float, begins: bool, arrives: bool) -> bool:
+    def add(self, status: np.ndarray, look: AdvanceMargins, t: float, begins: bool, arrives: bool) -> bool:
         """Add an advance, which `begins` at the start or at a jump of the load. Returns whether it ended in an event."""
         after = np.atleast_1d(look.contact.status)
         at = t + float(look.h)
@@ -201,7 +201,7 @@ class _Seen:
         self.struck, self.before = felt & (after == status), look.guards[-1]
         return bool(fired)
 
-    def _of_contact(self, i: int, status: int, look: Look, t: float, begins: bool) -> list[int]:
+    def _of_contact(self, i: int, status: int, look: AdvanceMargins, t: float, begins: bool) -> list[int]:
         """Add the distances of the guards of one contact inside an advance. Returns the guards that count."""
         # A guard that is a rounding error all the time does not count: with zero friction the friction cone has no width.
         relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
@@ -220,7 +220,7 @@ class _Seen:
                 self.calls.append((key, abs(float(guard[0])), t))
         return relevant
 
-    def _fires(self, i: int, status: int, after: int, look: Look) -> bool:
+    def _fires(self, i: int, status: int, after: int, look: AdvanceMargins) -> bool:
         """Whether an event of this contact ended the advance."""
         if self.several:
             return bool(look.ended[i])

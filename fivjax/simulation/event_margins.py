@@ -28,7 +28,7 @@ DECISIONS_OF_SEVERAL = (
 )
 
 
-class Look(eqx.Module):
+class AdvanceMargins(eqx.Module):
     """One advance, with the guards of each contact at equally spaced instants."""
 
     y: Float[Array, " state"]
@@ -47,7 +47,7 @@ class Look(eqx.Module):
     decisions: Float[Array, "3"]
 
 
-def look_along(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y, h) -> Look:
+def advance_margins(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y, h) -> AdvanceMargins:
     # Just before the end, where the status is still the same.
     shares = jnp.linspace(0.0, 1.0, LOOKS + 1)[1:] * (1 - 1e-9)
     if isinstance(method, EventExact):
@@ -86,7 +86,7 @@ def look_along(method: AbstractStepper, mechanics: Mechanics, contact: Contact, 
         decisions = _decisions_of_several(mechanics, contact, load, after)
     else:
         decisions = _decisions(mechanics, contact, load, states[-1], after.contact, after.y)
-    return Look(
+    return AdvanceMargins(
         after.y,
         after.contact,
         after.h,

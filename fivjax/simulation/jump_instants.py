@@ -22,7 +22,7 @@ from ..steppers.core import Segment, nothing
 Total = TypeVar("Total")
 
 
-class Begun(eqx.Module, Generic[Total]):
+class StartOfRun(eqx.Module, Generic[Total]):
     """Where the motion under the first load begins."""
 
     t: Float[Array, ""]  # s
@@ -49,13 +49,13 @@ def load_before(scene: Scene, t: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def moment(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, h: Float[Array, ""]) -> Segment:
-    """Motion for a time `h` that is zero, but for its derivative."""
+    """A motion of zero duration `h`, which has a derivative by `h` all the same."""
     after = y + jax.lax.stop_gradient(rates(mechanics, contact, load, y)) * h
     none = jnp.zeros((*contact.status.shape, 2), bool)
     return Segment(jnp.zeros_like(h), load, contact, y, advance_between(y, after, none, after, contact, h, mechanics))
 
 
-def begun_at(
+def start_of_run(
     scene: Scene,
     mechanics: Mechanics,
     contact: Contact,
@@ -63,7 +63,7 @@ def begun_at(
     begin: Float[Array, ""],
     total: Total = None,
     observe: Callable[[Total, Segment], Total] = nothing,
-) -> Begun[Total]:
+) -> StartOfRun[Total]:
     """The start of a run at `begin` (s) in the mode `contact`, with its derivative by a jump of the load at that instant.
 
     It is the derivative towards later jumps: the load before the jump acts until then, in the mode which it demands. `observe`
@@ -71,7 +71,7 @@ def begun_at(
     """
     jumps = scene.load.jumps
     if jumps.shape[0] == 0:
-        return Begun(begin, physics.stuck(mechanics, contact, y0), total)
+        return StartOfRun(begin, physics.stuck(mechanics, contact, y0), total)
     at = jnp.max(jnp.where(jumps == begin, jumps, -jnp.inf))
     jumped = jnp.isfinite(at)
     t = jnp.where(jumped, at, begin)
@@ -83,4 +83,4 @@ def begun_at(
         return segment.after.y, observe(total, segment)
 
     y, total = jax.lax.cond(jumped, waited, lambda: (y0, total))
-    return Begun(t, physics.stuck(mechanics, contact, y), total)
+    return StartOfRun(t, physics.stuck(mechanics, contact, y), total)

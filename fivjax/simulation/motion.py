@@ -24,8 +24,8 @@ from ..steppers.event_exact import EventExact, for_derivatives
 from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
-from .jump_instants import Begun, begun_at, load_from, next_jump
-from .rows import grown, settled
+from .jump_instants import StartOfRun, load_from, next_jump, start_of_run
+from .rows import contact_after_jump, grown
 
 
 class MotionAsked(eqx.Module):
@@ -89,7 +89,7 @@ def _followed(args, instants, method: EventExact):
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     mechanics = Mechanics(scene)
     accounts_of = EnergyData(scene) if how.energy else None
-    begin = _begun(scene, mechanics, y0, method, accounts_of)
+    begin = _first_step(scene, mechanics, y0, method, accounts_of)
     none = jnp.zeros((), bool)
 
     def step(now: Step) -> Step:
@@ -126,7 +126,7 @@ def _followed(args, instants, method: EventExact):
         )
         # A row at a jump of the load shows the load and the contact just after it.
         on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
-        contact = settled(mechanics, now.contact, load, y, on_jump)
+        contact = contact_after_jump(mechanics, now.contact, load, y, on_jump)
         row = _row(mechanics, accounts_of, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
         return (now, lost, ending), row
@@ -137,7 +137,9 @@ def _followed(args, instants, method: EventExact):
     return jnp.where(physics.slides_uniquely(mechanics), ending, Ending.PAINLEVE).astype(jnp.int32), rows
 
 
-def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None) -> Step:
+def _first_step(
+    scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None
+) -> Step:
     """A step of no length at the start."""
     none, no = jnp.zeros((), y0.dtype), jnp.zeros((), jnp.int32)
     load = load_from(scene.load, none)
@@ -148,9 +150,9 @@ def _begun(scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, ac
     def enter(ledger, segment: Segment):
         return None if accounts_of is None else accounts.enter(accounts_of, method, mechanics, ledger, segment)
 
-    start = Begun(none, physics.stuck(mechanics, contact, y0), ledger)
+    start = StartOfRun(none, physics.stuck(mechanics, contact, y0), ledger)
     if method.for_deviations:
-        start = begun_at(scene, mechanics, contact, y0, none, ledger, enter)
+        start = start_of_run(scene, mechanics, contact, y0, none, ledger, enter)
     begin = Step(
         t=none,
         y=y0,

@@ -24,7 +24,7 @@ from ..steppers.core import Segment
 from . import energy as accounts
 from .ending import GROWTH
 from .energy import EnergyData, Ledger
-from .jump_instants import Begun, begun_at, load_before, moment
+from .jump_instants import StartOfRun, load_before, moment, start_of_run
 from .stretches import Begin, go_on
 
 # Intervals between saved instants in a part.
@@ -73,7 +73,7 @@ def _parts(scene, method, y0, saved, most, energy) -> Iterator[dict]:
 
 @compiled
 def _at_start(scene: Scene, y0: State, saved: Float[Array, " T"], energy: bool) -> Reached:
-    contact, ledger = begun(scene, y0, saved, EnergyData(scene) if energy else None)
+    contact, ledger = mode_and_ledger_at_start(scene, y0, saved, EnergyData(scene) if energy else None)
     return Reached(y0, contact, ledger, jnp.zeros((), y0.dtype), jnp.asarray(False))
 
 
@@ -128,7 +128,7 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
     y = known(y)
     # A row at a jump of the load shows the load and the contact just after it.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
-    contacts = jax.vmap(lambda c, f, x, now: settled(mechanics, c, f, x, now))(contacts, load, y, on_jump)
+    contacts = jax.vmap(lambda c, f, x, now: contact_after_jump(mechanics, c, f, x, now))(contacts, load, y, on_jump)
     n = scene.structure.size
     friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
         contacts, load, y
@@ -162,7 +162,7 @@ def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array,
     return jnp.max(jnp.abs(weights * y)) > GROWTH * expected
 
 
-def settled(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
+def contact_after_jump(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
     """The contact mode after a jump of the load, if there is a jump `now`."""
 
     def after() -> Contact:
@@ -187,7 +187,7 @@ def states_at(
 
     `derivatives`: differentiable (also by the instants and the load's jumps) in "both" modes, or faster in only "forward" or
     "reverse" mode; None, not at all. In "reverse" mode only the states at the instants are kept; the rest is computed again.
-    `at_start` are the contact mode and the ledger at the start, unless the run begins there (`begun`).
+    `at_start` are the contact mode and the ledger at the start, unless the run begins there (`mode_and_ledger_at_start`).
     """
     mechanics = Mechanics(scene)
     ends = _ends(scene, instants)
@@ -212,13 +212,13 @@ def states_at(
         y = jnp.where(h > 0, moved, still.after.y)
         return (end, y, following, ledger), (y, following, ledger)
 
-    contact0, ledger0 = begun(scene, y0, instants, energy_data) if at_start is None else at_start
+    contact0, ledger0 = mode_and_ledger_at_start(scene, y0, instants, energy_data) if at_start is None else at_start
     # Inside a scan common subexpressions are not merged across the checkpoint anyway.
     step = jax.checkpoint(to_next, prevent_cse=False) if derivatives == "both" else to_next
     if derivatives is None:
-        start = Begun(instants[0], physics.stuck(mechanics, contact0, y0), ledger0)
+        start = StartOfRun(instants[0], physics.stuck(mechanics, contact0, y0), ledger0)
     else:
-        start = begun_at(scene, mechanics, contact0, y0, instants[0], ledger0, enter)
+        start = start_of_run(scene, mechanics, contact0, y0, instants[0], ledger0, enter)
     _, after = jax.lax.scan(step, (start.t, start.y, contact0, start.total), ends)
     rows = jnp.searchsorted(ends, instants[1:], side="right") - 1
 
@@ -228,7 +228,7 @@ def states_at(
     return jax.tree.map(with_start, (y0, contact0, ledger0), after)
 
 
-def begun(
+def mode_and_ledger_at_start(
     scene: Scene, y0: State, instants: Float[Array, " T"], energy_data: EnergyData | None
 ) -> tuple[Contact, Ledger | None]:
     """The contact mode and the ledger of a run that begins at the first of these instants."""

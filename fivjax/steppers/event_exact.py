@@ -26,7 +26,7 @@ from .base import AbstractStepper, Advance, StepperState, Within, advance_betwee
 from .core import follow
 from .guard_roots import implicit_root, march_to_roots, together
 from .law_agreement import agreeing
-from .motion_series import Series, fastest_in_mode, guard_rounding, series_of
+from .motion_series import MotionSeries, fastest_in_mode, guard_rounding, series_of
 from .section import before_section, section_speed
 from .step_length import LONGEST_STEP, attainable, time_unit, trusted
 
@@ -222,7 +222,7 @@ class EventExact(AbstractStepper):
         begin = y, jnp.asarray(h, y.dtype), jnp.asarray(True)
         return jax.lax.while_loop(lambda carry: carry[2], step, begin)[0]
 
-    def _longest(self, mechanics: Mechanics, contact: Contact, series: Series, unit) -> Float[Array, ""]:
+    def _longest(self, mechanics: Mechanics, contact: Contact, series: MotionSeries, unit) -> Float[Array, ""]:
         """The longest step from where a series begins, in units of time, whatever the law of friction says."""
         longest = jnp.minimum(self.dt / unit, trusted(series.states, self.tolerance))
         if not self.for_deviations:
@@ -238,7 +238,9 @@ class EventExact(AbstractStepper):
         tolerance = LOOSER * attainable(self.tolerance, dtype)
         return (tolerance * math.factorial(after)) ** (1.0 / after)
 
-    def _agreeing(self, mechanics: Mechanics, contact: Contact, series: "Series", reach) -> Float[Array, ""] | float:
+    def _agreeing(
+        self, mechanics: Mechanics, contact: Contact, series: "MotionSeries", reach
+    ) -> Float[Array, ""] | float:
         """The share of a step of this length, in units of time, over which friction is that of the law."""
         law = mechanics.friction
         if law.constant:

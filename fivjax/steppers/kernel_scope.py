@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.argument_forms import Form
-from ..kernels.code import written
+from ..kernels.code import traced_source
 from ..kernels.warp_library import is_installed
 from ..model.scene import Scene
 from .base import AbstractStepper
@@ -58,7 +58,7 @@ def _laws_can_be_written(scene: Scene) -> bool:
 @functools.cache
 def _can_be_written(form: Form) -> bool:
     try:
-        written(_values, form, ())
+        traced_source(_values, form, ())
     except NotImplementedError:
         return False
     return True

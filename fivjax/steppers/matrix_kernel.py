@@ -1,6 +1,6 @@
 """The motion of `matrix_motion.cpp` for scenes of one form: with the laws of contact, written out from their traces.
 
-What a mode's end is and what follows stand in `contact`, where the guards may run out in `window`.
+What ends a mode and what follows it is in `contact`; where guards may run out is in `window`.
 """
 
 import functools
@@ -17,7 +17,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics, Status
 from ..contact.rounding import RESTING
 from ..foundation.kept_programs import kept_value
-from ..kernels.scalar_code import scalar_source
+from ..kernels.cpp_code import scalar_source
 from .kernel_matrices import BLOCK, abreast, blocks_of, padded, places_of
 from .propagation import INTERVALS, ORDER
 from .window import bracketed, fastest, first_is_safe, leading

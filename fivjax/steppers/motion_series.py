@@ -14,7 +14,7 @@ from ..contact.rounding import largest_rounding
 from ..foundation.linear_solve import product
 
 
-class Series(NamedTuple):
+class MotionSeries(NamedTuple):
     """Taylor coefficients, in time measured in a unit; and the forces of the mode at the start."""
 
     states: Float[Array, "k state"]
@@ -26,7 +26,7 @@ class Series(NamedTuple):
 
 def series_of(
     mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, order: int, unit: Float[Array, ""]
-) -> Series:
+) -> MotionSeries:
     """Taylor coefficients of the motion in one contact mode, in time measured in `unit` (s).
 
     The physics is linear in the state except for T = σμN, so it maps coefficients to coefficients; the constant terms (load,
@@ -50,12 +50,12 @@ def series_of(
     of_slip = physics.guards_under(changes, contact, zero, zero, one, zero)
     of_gap = physics.guards_under(changes, contact, zero, zero, zero, one)
 
-    def further(state: State, slip, otherwise, divisor):
+    def further(state: State, slip, other_friction, divisor):
         """What follows from one coefficient of the state: the next, and those of the guards and of N."""
         of_displacements, of_velocities = map(product, matrices, physics.measured(changes, state))
         found = of_displacements + of_velocities
         if beside is not None:
-            found = found + product(beside, jnp.ravel(otherwise))
+            found = found + product(beside, jnp.ravel(other_friction))
         acceleration, guards, normal_force = jnp.split(found, (n, n + 2 * count))
         guards = guards.reshape(of_slip.shape) + of_slip * slip[..., None]
         guards = guards + of_gap * physics.gap(changes, state)[..., None]
@@ -76,7 +76,7 @@ def series_of(
         _, rows = jax.lax.scan(next_one, state, np.arange(2.0, order + 2.0, dtype=y.dtype), unroll=True)
         first = y, guards, slip
         states, guards, slips = (jnp.concatenate([one[None], more]) for one, more in zip(first, rows, strict=True))
-        return Series(states, guards, slips, friction[0][None], mode)
+        return MotionSeries(states, guards, slips, friction[0][None], mode)
     next_term = mechanics.friction.in_time(slip, order)
     states, all_guards, slips = [y], [guards], [slip]
     normal_forces = [physics.total_forces(mechanics, *forces)[1]]
@@ -84,19 +84,19 @@ def series_of(
         states.append(state)
         slips.append(physics.slip_speed(changes, contact, state))
         friction.append(next_term(slips, friction))
-        otherwise = contact.direction * sum(
+        other_friction = contact.direction * sum(
             (friction[j] * normal_forces[k - j] for j in range(2, k + 1)), friction[1] * normal_forces[k - 1]
         )
-        state, guards, normal_force = further(state, slips[k], otherwise, k + 1)
+        state, guards, normal_force = further(state, slips[k], other_friction, k + 1)
         all_guards.append(guards)
         normal_forces.append(normal_force)
-    return Series(jnp.stack(states), jnp.stack(all_guards), jnp.stack(slips), jnp.stack(friction), mode)
+    return MotionSeries(jnp.stack(states), jnp.stack(all_guards), jnp.stack(slips), jnp.stack(friction), mode)
 
 
 def fastest_in_mode(mechanics: Mechanics, contact: Contact, mode: ModeForces) -> Float[Array, ""]:
     """A bound on how fast deviations vibrate in a mode, in 1/s: that of the coordinates that it leaves free."""
     mechanics, contact, mode = jax.lax.stop_gradient((mechanics.homogeneous, contact, mode))
-    free = ~physics.held(mechanics, contact)
+    free = ~physics.constrained_coordinates(mechanics, contact)
 
     def largest(matrix):
         rates = jax.vmap(functools.partial(_under, mechanics, contact, mode), in_axes=1, out_axes=1)(matrix)
@@ -106,10 +106,10 @@ def fastest_in_mode(mechanics: Mechanics, contact: Contact, mode: ModeForces) ->
 
 
 def _under(
-    mechanics: Mechanics, contact: Contact, mode: ModeForces, free: Float[Array, " n"], otherwise=None
+    mechanics: Mechanics, contact: Contact, mode: ModeForces, free: Float[Array, " n"], other_friction=None
 ) -> Float[Array, " k"]:
-    """Accelerations in a mode from the free ones; below, the guards of all contacts as far as they depend on forces, and N."""
-    forces = mode.added(mechanics, free, otherwise)
+    """Accelerations in a mode from the free ones; in the rows below, the part of all guards that depends on forces, and N."""
+    forces = mode.added(mechanics, free, other_friction)
     zero = jnp.zeros_like(forces[0])
     guards = physics.guards_under(mechanics, contact, *forces, zero, zero)
     parts = physics.acceleration_under(mechanics, contact, free, *forces), guards, forces[1]

@@ -7,7 +7,7 @@ future. A quiet interval proves nothing: close to the stability limit two modes 
 kick grows for a second before it decays.
 
 - Constant friction: a bound on the sum that includes the slow beat of the modes (`envelope_peak`).
-- Speed-dependent friction: the linear motion with a bound on the remainder (`_used_nonlinearly`).
+- Speed-dependent friction: the linear motion with a bound on the remainder (`_margin_share_nonlinear`).
 """
 
 import equinox as eqx
@@ -140,11 +140,11 @@ def slides_forever(
     deviation: State,
     under_final_load: Bool[Array, ""] | bool,
 ) -> Bool[Array, ""]:
-    """Whether a bound shows that a contact which slides now never stops sliding, see `used_up`."""
-    return used_up(mechanics, modes, contact, deviation, under_final_load) < 1
+    """Whether a bound shows that a contact which slides now never stops sliding, see `margin_share_bound`."""
+    return margin_share_bound(mechanics, modes, contact, deviation, under_final_load) < 1
 
 
-def used_up(
+def margin_share_bound(
     mechanics: Mechanics,
     modes: SlidingModes,
     contact: Contact,
@@ -164,7 +164,7 @@ def used_up(
     sliding = (jnp.all(slides) if mechanics.several else slides) & under_final_load
     sliding = sliding & modes.stable & linear.exists
     if not mechanics.friction.constant:
-        of_all = _used_nonlinearly_together if mechanics.several else _used_nonlinearly
+        of_all = _margin_share_of_several if mechanics.several else _margin_share_nonlinear
         return _where_known(sliding, of_all(modes, modal))
     members = modes.envelope.members
     parts = _parts(modes.pressing, modal, linear.pressing_margin) + _parts(modes.slip, modal, linear.slip_margin)
@@ -271,7 +271,7 @@ def envelope_peak(shares: Complex[Array, " k"] | Pair, envelope: Envelope) -> Fl
     return jnp.where(jnp.isfinite(bound), bound, jnp.inf)
 
 
-def _used_nonlinearly(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
+def _margin_share_nonlinear(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
     r"""The share of what keeps it decaying that a motion uses up, for friction that depends on slip speed.
 
     The norm $E = \sum_k e_k |w_k|$ with $e_k = |s_k| + κ |p_k|$ bounds the change of slip speed by $E$ and that of the
@@ -288,7 +288,7 @@ def _used_nonlinearly(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
     return jnp.maximum(drive * bend * size / rate, size / (linear.reach * linear.slip_margin))
 
 
-def _used_nonlinearly_together(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
+def _margin_share_of_several(modes: SlidingModes, modal: Pair) -> Float[Array, ""]:
     r"""The same for several contacts: $E = \sum_k e_k |w_k|$ with $e_k$ the largest share of a mode in any normal force or slip
     speed, relative to its margin. No slip speed then changes by more than $E$ times its margin, nor does a normal force under
     constant friction. Up to $E$ = `LinearSliding.reach` no normal force reaches zero either, the remainders are at most

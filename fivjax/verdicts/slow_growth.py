@@ -16,7 +16,7 @@ from ..model.sliding import sliding_states
 from .sliding_proof import SlidingModes
 
 
-def slid_on(
+def slide_while_certain(
     mechanics: Mechanics, modes: SlidingModes, contact: Contact, deviation: State, allowed: Bool[Array, ""]
 ) -> tuple[State, Float[Array, ""]]:
     """The deviation from the equilibrium at the end of the time for which sliding is certain, and that time (s).

@@ -12,7 +12,7 @@ from fivjax.attractors.catalogue import Attractors, Catalogue
 from fivjax.attractors.cycles import StableCycle
 from fivjax.attractors.motions import Motions
 from fivjax.attractors.neighbourhood import Neighbourhood
-from fivjax.attractors.tori import holds_one_of
+from fivjax.attractors.tori import contains_cycle
 from fivjax.attractors.tube import Tube
 from fivjax.section.return_maps import Images, Section
 
@@ -105,7 +105,7 @@ def test_no_tube_captures_next_to_another_cycle(away, near):
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     tube, maps = Tube(circle, 0.04), SimpleNamespace(weights=np.ones(2))
     other = SimpleNamespace(points=np.array([[1 + 0.04 * away, 0.0]]))
-    assert holds_one_of(maps, tube, [other]) == near
+    assert contains_cycle(maps, tube, [other]) == near
 
 
 @pytest.mark.slow

@@ -19,8 +19,8 @@ from fivjax.attractors.tori import (
     Torus,
     _in_clusters,
     _on_one_torus,
+    contains_cycle,
     goes_on,
-    holds_one_of,
     is_drifting,
 )
 from fivjax.attractors.tube import Tube
@@ -169,13 +169,15 @@ def test_the_tube_is_entered_from_all_sides_on_its_edge():
 def test_a_start_is_home_with_all_of_its_last_crossings_and_not_with_nearly_all():
     states = circle()
     size = np.mean(np.linalg.norm(states, axis=1))
-    ends = np.stack([states[: 5 * tube.HOME].reshape(tube.HOME, 5, 4)] * 2, axis=1).reshape(tube.HOME, 10, 4)
+    ends = np.stack([states[: 5 * tube.RETURNS_INSIDE].reshape(tube.RETURNS_INSIDE, 5, 4)] * 2, axis=1).reshape(
+        tube.RETURNS_INSIDE, 10, 4
+    )
     about = Tube(states, tube.RADIUS)
-    assert np.all(about.home(ends))
+    assert np.all(about.holds_all(ends))
     ends[3, 7, 1] = 0.6 * tube.RADIUS * size
     others = np.arange(10) != 7
-    np.testing.assert_array_equal(about.home(ends), others)
-    np.testing.assert_array_equal(about.home(np.where(ends == ends[3, 7, 1], np.nan, ends)), others)
+    np.testing.assert_array_equal(about.holds_all(ends), others)
+    np.testing.assert_array_equal(about.holds_all(np.where(ends == ends[3, 7, 1], np.nan, ends)), others)
 
 
 def paper(mu, v, **parts):
@@ -316,8 +318,8 @@ def test_a_set_that_holds_a_known_cycle_is_no_torus():
     on_it = np.array([[4.5, 0.0], [3.5, 0.01]]) / Maps.weights
     for points, expected in ((on_it, True), (on_it * [[1.0, 1.0], [1.2, 1.0]], False)):
         cycle = StableCycle(points, 1.0, 0.5, 1.0, None)  # type: ignore[arg-type]
-        assert holds_one_of(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
-    assert not holds_one_of(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
+        assert contains_cycle(Maps, Tube(ring, tube.RADIUS), [cycle]) == expected  # type: ignore[arg-type]
+    assert not contains_cycle(Maps, Tube(ring, tube.RADIUS), [])  # type: ignore[arg-type]
 
 
 MANY = dict(m1=0.16764470306792142, m2=0.0021060690881965936, k1=727028.5856839971, k2=801398.6615253797)

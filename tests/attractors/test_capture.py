@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fivjax.attractors.neighbourhood import Returned, adapted_norm, neighbourhoods, side_by_side, trial
+from fivjax.attractors.neighbourhood import ReturnImages, adapted_norm, cycle_trial, neighbourhoods, side_by_side
 from fivjax.contact import Status
-from fivjax.section.free_directions import free_coordinates
+from fivjax.section.free_directions import free_on_section
 
 CENTRE = np.array([1.0, 0.5, 0.0, 0.0, 2.0, 0.0])
 WEIGHTS = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
-FREE = free_coordinates(3, tangential=0, normal=2, status=Status.SLIDE)
+FREE = free_on_section(3, tangential=0, normal=2, status=Status.SLIDE)
 SLIDING = int(Status.SLIDE), 1.0
 
 
@@ -23,7 +23,7 @@ def mapped(law, events=lambda x: 0 * x[:, 0], status=Status.SLIDE):
         after = np.repeat(CENTRE[None], len(x), axis=0)
         after[:, FREE] += law(x) / WEIGHTS[FREE]
         images = after, np.full(len(x), status), np.ones(len(x)), events(x).astype(int)
-        return Returned(*(part[None] for part in images))
+        return ReturnImages(*(part[None] for part in images))
 
     return returned
 
@@ -35,13 +35,13 @@ def jacobian_of(matrix):
 
 
 def found(matrix, returned):
-    attempt = trial(CENTRE, *SLIDING, jacobian_of(matrix), WEIGHTS, np.eye(6)[:, FREE])
+    attempt = cycle_trial(CENTRE, *SLIDING, jacobian_of(matrix), WEIGHTS, np.eye(6)[:, FREE])
     return None if attempt is None else neighbourhoods([attempt], returned)[0]
 
 
 def test_the_section_and_the_contact_mode_hold_their_coordinates():
     assert FREE.tolist() == [0, 1, 4]
-    assert free_coordinates(3, 0, 2, Status.DETACH).tolist() == [0, 1, 2, 4, 5]
+    assert free_on_section(3, 0, 2, Status.DETACH).tolist() == [0, 1, 2, 4, 5]
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
@@ -161,7 +161,7 @@ def test_several_cycles_are_checked_at_once_each_by_itself():
     bends, least = [0.0, 3.0, 300.0, 3.0, 40.0], [0.0, 0.0, 0.0, 1.0, 0.0]
     trials = []
     for derivative, share in zip(derivatives, least, strict=True):
-        one = trial(CENTRE, *SLIDING, jacobian_of(derivative), WEIGHTS, np.eye(6)[:, FREE])
+        one = cycle_trial(CENTRE, *SLIDING, jacobian_of(derivative), WEIGHTS, np.eye(6)[:, FREE])
         trials.append(one._replace(smallest=max(one.smallest, share * one.largest)))
 
     def map_of(k):
@@ -173,7 +173,7 @@ def test_several_cycles_are_checked_at_once_each_by_itself():
 
     def returned(chosen, y):
         parts = [map_of(k)(None, y[i : i + 1]) for i, k in enumerate(chosen)]
-        return Returned(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        return ReturnImages(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     together = neighbourhoods(trials, returned)
     assert [one is None for one in together] == [False, False, False, True, True]

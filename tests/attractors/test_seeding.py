@@ -6,7 +6,7 @@ import pytest
 import fivjax as fj
 from fivjax.attractors import search
 from fivjax.maps import plan
-from fivjax.maps.plan import Grid, Listed
+from fivjax.maps.plan import Grid, TrajectoryList
 
 MUS = np.linspace(0.2, 0.227, 7)
 
@@ -22,11 +22,13 @@ def test_every_fourth_value_seeds_those_that_follow():
 
 
 def test_lists_are_seeded_as_grids_are_where_they_have_the_group():
-    listed = Listed({"mu": np.array([0.22, 0.2, 0.2, 0.21]), "c1": np.array([1.0, 1.0, 1.05, 1.05]), "p": np.ones(4)})
+    listed = TrajectoryList(
+        {"mu": np.array([0.22, 0.2, 0.2, 0.21]), "c1": np.array([1.0, 1.0, 1.05, 1.05]), "p": np.ones(4)}
+    )
     np.testing.assert_array_equal(listed.seeding(np.arange(4)), [[0.2, 1.0], [0.2, 1.0], [0.2, 1.0], [0.2, 1.0]])
-    alone = Listed({"mu": np.array([0.22, 0.2]), "c1": np.array([1.0, 1.05])})
+    alone = TrajectoryList({"mu": np.array([0.22, 0.2]), "c1": np.array([1.0, 1.05])})
     np.testing.assert_array_equal(alone.seeding(np.arange(2)), [[0.22, 1.0], [0.2, 1.05]])
-    assert Listed({"p": np.ones(3)}).seeding(np.arange(3)).shape == (3, 0)
+    assert TrajectoryList({"p": np.ones(3)}).seeding(np.arange(3)).shape == (3, 0)
 
 
 @pytest.mark.parametrize(("speed", "agreeing"), [(1.0, 1e-9), (3.0, 1e-3)])

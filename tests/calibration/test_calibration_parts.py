@@ -10,12 +10,12 @@ import fivjax as fj
 from fivjax.calibration.covariance import combinations, covariance_of
 from fivjax.calibration.cycle_misfit import BEATS
 from fivjax.calibration.folding import folded
-from fivjax.calibration.goodness_of_fit import exceeds_noise, what_is_left
+from fivjax.calibration.goodness_of_fit import exceeds_noise, residual_tests
 from fivjax.calibration.least_squares import Evaluated, minimise
 from fivjax.calibration.noise import estimated_noise
 from fivjax.calibration.parameters import FreeParameters
 from fivjax.calibration.problem import Problem
-from fivjax.calibration.search import Search
+from fivjax.calibration.search import FitSearch
 from tests.helpers.recordings import paper
 
 FREQUENCY = 67.456
@@ -92,24 +92,24 @@ def test_white_noise_is_taken_for_noise_and_an_alikeness_within_its_scatter_is_n
     rng = np.random.default_rng(0)
     for _ in range(300):
         left = rng.normal(size=(1111, 2))
-        assert what_is_left(float(np.sum(left**2)), left.size, [left.T], stated=True).is_noise
+        assert residual_tests(float(np.sum(left**2)), left.size, [left.T], stated=True).is_noise
     white = rng.normal(size=1112)
     # A moving average with this weight has a correlation of 0.17 and unit variance.
     weight = 0.18
     alike = ((white[1:] + weight * white[:-1]) / np.sqrt(1 + weight**2))[:, None]
-    found = what_is_left(float(np.sum(alike**2)), alike.size, [alike.T], stated=False)
+    found = residual_tests(float(np.sum(alike**2)), alike.size, [alike.T], stated=False)
     assert 0.13 < found.correlation < 0.21
     assert found.correlated and not found.larger
     # A weak vibration shows in all lags together before it does in the first one.
     vibration = (white[1:] + 0.4 * np.sin(2 * np.pi * np.arange(1111) / 16))[:, None]
-    assert what_is_left(1111.0, 1111, [vibration.T], stated=False).correlated
+    assert residual_tests(1111.0, 1111, [vibration.T], stated=False).correlated
 
 
 def test_left_overs_are_compared_with_a_stated_noise():
     """A third more than what was stated is no chance over 1,111 blocks, with a noise that was estimated it may be."""
-    assert what_is_left(1.25 * 1111, 1111, [], stated=True).larger
-    assert not what_is_left(1.25 * 1111, 1111, [], stated=False).larger
-    assert what_is_left(0.5 * 1111, 1111, [], stated=False).smaller
+    assert residual_tests(1.25 * 1111, 1111, [], stated=True).larger
+    assert not residual_tests(1.25 * 1111, 1111, [], stated=False).larger
+    assert residual_tests(0.5 * 1111, 1111, [], stated=False).smaller
 
 
 def test_a_recording_that_holds_more_than_noise():
@@ -161,7 +161,7 @@ def test_guesses_that_a_law_refuses_are_drawn_towards_the_scene():
     problem = Problem(scene, FreeParameters(scene, ["mu_static", "mu_dynamic"]), ())
     values = [(0.3, 0.2), (0.2, 0.25), (0.4, 0.1)]
     guesses = np.array([problem.parameters.unbounded(pair) for pair in values])
-    found = [np.asarray(problem.parameters.values(guess)) for guess in Search(problem, guesses, ()).guesses]
+    found = [np.asarray(problem.parameters.values(guess)) for guess in FitSearch(problem, guesses, ()).guesses]
     np.testing.assert_allclose(found[1], [np.sqrt(0.3 * 0.2), np.sqrt(0.2 * 0.25)])
     np.testing.assert_allclose([found[0], found[2]], [values[0], values[2]])
 

@@ -10,7 +10,7 @@ import fivjax as fj
 from fivjax.attractors.closing import close
 from fivjax.contact import Contact
 from fivjax.cycles import search
-from fivjax.cycles.around import Round, word
+from fivjax.cycles.one_period import PeriodSegments, word
 from fivjax.cycles.torus import off_the_curve
 from fivjax.section.return_maps import Section
 from tests.helpers import reference
@@ -299,7 +299,7 @@ def test_a_phase_that_an_event_ends_where_the_section_is_counts_twice(contacts, 
     times = np.array([1.0, 2.0, 3.0])
     contact = Contact(status[:3], direction[:3])  # type: ignore[arg-type]
     states, series = np.zeros((3, 4)), np.zeros((3, 17, 4))
-    segments = Round(np.cumsum(times) - times, times, states, contact, ended[:3], series, np.ones(3))
+    segments = PeriodSegments(np.cumsum(times) - times, times, states, contact, ended[:3], series, np.ones(3))
     found = word(segments)
     assert [phase.duration for phase in found] == ([1.0, 2.0, 3.0] if ends else [4.0, 2.0])
     sticking = (fj.Status.SLIDE,) * (contacts - 1) + (fj.Status.STICK,)

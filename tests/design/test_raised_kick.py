@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 import fivjax as fj
-from fivjax.design.least_change import smallest_change
+from fivjax.design.critical_kick import smallest_change
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 

@@ -75,7 +75,7 @@ def test_a_batch_of_trajectories_has_no_lapack():
     assert "while" in of_preparing or "scan" in of_preparing, "elimination is a loop"
     for part in ("matrix", "frictionless"):
         getattr(linear, part)[:] = -np.eye(linear.matrix.shape[-1])
-    shared = flatten(groups.Shared(own, mechanics, prepared, groups.sliding_modes(linear), *rest))
+    shared = flatten(groups.GroupConstants(own, mechanics, prepared, groups.sliding_modes(linear), *rest))
     columns = flatten(np.zeros((2, 1)))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 

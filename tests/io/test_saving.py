@@ -201,7 +201,7 @@ def test_what_is_no_file_is_never_replaced_by_one(tmp_path):
 
 
 def test_what_killed_savers_leave_is_removed_and_what_is_being_written_is_not(tmp_path):
-    handle, living = whole_files._begun(tmp_path, 0o600)
+    handle, living = whole_files._new_locked_file(tmp_path, 0o600)
     with whole_files.own_folder(tmp_path) as folder:
         (tmp_path / ".fivjax.file.part").write_text("left")
         (tmp_path / ".fivjax.folder.part").mkdir()

@@ -10,7 +10,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import fivjax as fj
 from fivjax import contact
-from fivjax.foundation.compiling import less_thought
+from fivjax.foundation.compiling import quick_compiler_options
 from fivjax.foundation.linear_solve import solve
 from fivjax.linear import cea, linearisation, polynomials, routh_hurwitz
 from fivjax.linear.linearisation import linear_sliding
@@ -484,7 +484,7 @@ def test_margin_is_the_product_of_sums_of_eigenvalues():
 def test_a_slope_is_right_with_the_options_that_compile_quickly(of_users, monkeypatch):
     """With level 0 of LLVM's optimisations and its quick choice of instructions XLA makes of this slope a zero."""
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    options = less_thought.__wrapped__() if of_users else {}
+    options = quick_compiler_options.__wrapped__() if of_users else {}
 
     def instability(mu):
         return -cea.margin(belt(), mu)

@@ -17,7 +17,7 @@ from fivjax.attractors.catalogue import Attractors
 from fivjax.maps import checkpoint, job_files, jobs, plan
 from fivjax.maps.job_files import JobState
 from fivjax.maps.matrix_kernels import MatrixKernels
-from fivjax.maps.results import Ended, not_run, record
+from fivjax.maps.results import EndedTrajectories, not_run, record
 from tests.helpers import killed_map
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
@@ -140,7 +140,7 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
 
     verdicts, none = not_run(1, energy=False), np.full(1, np.nan)
     with pytest.raises(KeyboardInterrupt):
-        record(verdicts, np.array([0]), Unreadable(), Ended(np.array([1]), np.array([0]), *[none] * 5))
+        record(verdicts, np.array([0]), Unreadable(), EndedTrajectories(np.array([1]), np.array([0]), *[none] * 5))
     assert verdicts.verdict[0] == fj.Verdict.NOT_RUN
 
 

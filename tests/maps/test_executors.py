@@ -10,7 +10,7 @@ import pytest
 import fivjax as fj
 from fivjax.maps import engine, plan
 from fivjax.maps.executors import Workers, hand_out
-from fivjax.maps.plan import Grid, Listed
+from fivjax.maps.plan import Grid, TrajectoryList
 from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 5), "p": np.linspace(1.0, 3.0, 7), "belt_speed": np.array([1.0, 2.0, 3.0])}
@@ -21,7 +21,7 @@ def test_every_trajectory_is_in_one_job(most):
     """A job that lacked one, or shared one, would leave a hole in the map or write a chunk twice."""
     grid = Grid(AXES)
     some = np.random.default_rng(0).choice(grid.total, 40, replace=False)
-    listed = Listed(grid.columns())
+    listed = TrajectoryList(grid.columns())
     for jobs, places in ((grid.jobs(None, most), np.arange(grid.total)), (grid.jobs(some, most), some)):
         np.testing.assert_array_equal(np.sort(np.concatenate(list(jobs))), np.sort(places))
         assert max(map(len, jobs)) <= most

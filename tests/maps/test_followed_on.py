@@ -118,7 +118,7 @@ def test_the_result_is_that_of_the_instant_of_the_proof():
 def test_who_reaches_a_cycle_with_the_last_step_is_captured(monkeypatch):
     """As many steps as the last trajectory took to its verdict are enough for it."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
-    taken, real = [], jobs.follow
+    taken, real = [], jobs.follow_all
 
     def counted(*args):
         taken.append(args[-1])

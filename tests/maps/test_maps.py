@@ -179,8 +179,10 @@ def test_trajectories_do_not_know_each_other(paper_scene, monkeypatch):
     def decided(mu, p):
         with np.errstate(all="ignore"), jax.enable_x64(True):
             values = {"mu": np.array(mu), "p": np.array(p)}
-            means = engine.Means("", memory=1e9, progress=False)
-            return engine.run_to_verdict(paper_scene, plan.Listed(values), fj.EventExact(), engine.Limits(20.0), means)
+            means = engine.RunOptions("", memory=1e9, progress=False)
+            return engine.run_to_verdict(
+                paper_scene, plan.TrajectoryList(values), fj.EventExact(), engine.Limits(20.0), means
+            )
 
     healthy = whole.sel(mu=0.2)
     # Poison in the history of the load, among others of the same mechanics, and in the mechanics of a neighbour.

@@ -8,7 +8,7 @@ import pytest
 import fivjax as fj
 from fivjax import cli
 from fivjax.contact import Contact, Status
-from fivjax.cycles.around import Phase
+from fivjax.cycles.one_period import Phase
 from fivjax.simulation.ending import Ending
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=3.0, load=fj.Pulse(force=100.0, p=1.2))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
-from fivjax.maps.groups import Task, shared_by
+from fivjax.maps.groups import Task, constants_of
 from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
 from fivjax.section.free_directions import zero_on_section
@@ -23,7 +23,7 @@ def maps():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
         task = Task(scene, Propagation(), ("mu",), (), {}, width=8)
-        shared = shared_by(task, np.array([[0.12], [0.2], [0.227]]))
+        shared = constants_of(task, np.array([[0.12], [0.2], [0.227]]))
         tree = shared.tree
         yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, MatrixKernels(shared, pool), pool)
 

@@ -14,7 +14,7 @@ import fivjax as fj
 from fivjax.contact import Mechanics, Status
 from fivjax.foundation.compiling import compiled
 from fivjax.kernels import kernel
-from fivjax.maps.engine import Limits, Listed, Means, run_to_verdict
+from fivjax.maps.engine import Limits, RunOptions, TrajectoryList, run_to_verdict
 from fivjax.plot import energy as plot_energy
 from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.simulation import energy as accounts
@@ -804,10 +804,10 @@ def test_the_balance_closes_however_little_moves_under_however_high_a_load(paper
     with jax.enable_x64(True):
         outcome = run_to_verdict(
             paper_scene,
-            Listed({name: np.array(values) for name, values in lanes.items()}),
+            TrajectoryList({name: np.array(values) for name, values in lanes.items()}),
             fj.EventExact(),
             Limits(20.0, energy=True),
-            Means("", memory=1e9),
+            RunOptions("", memory=1e9),
         )
     assert outcome.verdict.tolist() == [Verdict.SLIDING, Verdict.SLIDING, Verdict.UNDECIDED]
     energy = outcome.energy

@@ -218,8 +218,8 @@ def test_batch_order_and_blocks_change_nothing(seed):
     def run(values, in_a_job=plan.IN_A_JOB):
         with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
             patch.setattr(plan, "IN_A_JOB", in_a_job)
-            means = engine.Means("", memory=1e9, progress=False)
-            return engine.run_to_verdict(scene, plan.Listed(values), fj.EventExact(), engine.Limits(3.0), means)
+            means = engine.RunOptions("", memory=1e9, progress=False)
+            return engine.run_to_verdict(scene, plan.TrajectoryList(values), fj.EventExact(), engine.Limits(3.0), means)
 
     whole = run(values)
     mixed = run({name: column[order] for name, column in values.items()})

@@ -15,8 +15,8 @@ from fivjax.contact import Mechanics, Status, status_from_forces
 from fivjax.foundation.compiling import compiled
 from fivjax.kernels import kernel as built
 from fivjax.kernels import warp_library
+from fivjax.kernels.cpp_code import scalar_source
 from fivjax.kernels.lane_functions import LaneFunction
-from fivjax.kernels.scalar_code import scalar_source
 from fivjax.kernels.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps import groups as sharing
 from fivjax.maps import matrix_kernels

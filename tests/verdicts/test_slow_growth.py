@@ -12,7 +12,7 @@ from fivjax.linear.linearisation import linear_sliding
 from fivjax.model.sliding import sliding_states
 from fivjax.section.about_sliding import mechanics_about_sliding
 from fivjax.verdicts.sliding_proof import sliding_modes
-from fivjax.verdicts.slow_growth import slid_on
+from fivjax.verdicts.slow_growth import slide_while_certain
 from tests.helpers import reference
 
 STRUCTURE = fj.belt_oscillator()
@@ -30,7 +30,7 @@ def _skipped(scene, contact_direction=1.0, size=1e-5):
         mechanics = mechanics_about_sliding(scene)
         z = jnp.zeros(6).at[sliding_states(3, mechanics.normal)].set(size * np.array([1.0, -0.5, 3.0, 20.0]))
         contact = Contact(np.int32(1), np.float64(contact_direction))
-        y, time = slid_on(mechanics, modes, contact, z, np.bool_(True))
+        y, time = slide_while_certain(mechanics, modes, contact, z, np.bool_(True))
         return linear, mechanics, np.asarray(z), np.asarray(y), float(time)
 
 

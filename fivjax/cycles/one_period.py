@@ -38,7 +38,7 @@ class Phase(NamedTuple):
     duration: float  # s
 
 
-class Round(NamedTuple):
+class PeriodSegments(NamedTuple):
     """The segments of one period, in rows."""
 
     t: Float[np.ndarray, " s"]  # when each begins, s
@@ -50,10 +50,10 @@ class Round(NamedTuple):
     unit: Float[np.ndarray, " s"]  # s
 
 
-class Seen(NamedTuple):
+class PeriodSummary(NamedTuple):
     """Segments, peak speed and harmonics of one period."""
 
-    segments: Round
+    segments: PeriodSegments
     amplitude: float  # m/s
     lines: Complex[np.ndarray, "count n"]  # m/s
 
@@ -81,7 +81,7 @@ def _around(args, numbers):
         moved = _Way(
             after.y, after.contact, jnp.where(after.h >= way.left, 0.0, way.left - after.h), peak, way.count + 1
         )
-        row = Round(period - way.left, after.h, way.y, way.contact, after.ended, series, unit)
+        row = PeriodSegments(period - way.left, after.h, way.y, way.contact, after.ended, series, unit)
         return jax.tree.map(lambda new, old: jnp.where(goes, new, old), moved, way), row
 
     way, rows = jax.lax.scan(segment, begin, numbers)
@@ -91,7 +91,7 @@ def _around(args, numbers):
 _period = KernelFunction(_around)
 
 
-def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float) -> Seen:
+def follow_period(scene: Scene, stepper: EventExact, point: Point, period: float) -> PeriodSummary:
     """Segments, peak tangential speed and harmonics of one period from a point on it."""
     args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
     most = LEAST_SEGMENTS
@@ -100,14 +100,14 @@ def seen_around(scene: Scene, stepper: EventExact, point: Point, period: float) 
         if end.count < most or most > MOST_SEGMENTS or not np.all(np.isfinite(end.y)):
             break
         most *= 4
-    found = Round(*jax.tree.map(lambda row: np.asarray(row)[: int(end.count)], rows))
-    return Seen(found, float(end.peak), harmonics(found, period))
+    found = PeriodSegments(*jax.tree.map(lambda row: np.asarray(row)[: int(end.count)], rows))
+    return PeriodSummary(found, float(end.peak), harmonics(found, period))
 
 
 _gauss_points = functools.cache(leggauss)
 
 
-def harmonics(segments: Round, period: float) -> Complex[np.ndarray, "count n"]:
+def harmonics(segments: PeriodSegments, period: float) -> Complex[np.ndarray, "count n"]:
     r"""Fourier coefficients of the velocities, $v(t) = \mathrm{Re} \sum_h c_h e^{2πiht/T}$, over exactly one period; m/s.
 
     With this many Gauss points, a product of two series is integrated with an error far below that of the series itself.
@@ -124,7 +124,7 @@ def harmonics(segments: Round, period: float) -> Complex[np.ndarray, "count n"]:
     return (2 / period) * waves @ weighted.reshape(len(once), n)
 
 
-def word(segments: Round) -> tuple[Phase, ...]:
+def word(segments: PeriodSegments) -> tuple[Phase, ...]:
     """The contact modes of a cycle in order, with their durations; a mode that the section cuts in two counts once.
 
     Sliding that reverses its direction is two phases. With several contacts, a phase lasts until the mode of one of them ends.
@@ -147,7 +147,9 @@ def word(segments: Round) -> tuple[Phase, ...]:
     return tuple(Phase(modes if several else modes[0], duration) for modes, duration in phases)
 
 
-def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, period: float) -> Complex[np.ndarray, " m"]:
+def floquet_multipliers(
+    scene: Scene, stepper: EventExact, segments: PeriodSegments, period: float
+) -> Complex[np.ndarray, " m"]:
     """Eigenvalues of the monodromy matrix, largest first: one is 1, for the direction along the cycle.
 
     The matrix is computed in the coordinates that the contact mode leaves free: sticking leaves fewer free, so that multipliers
@@ -155,13 +157,13 @@ def floquet_multipliers(scene: Scene, stepper: EventExact, segments: Round, peri
     """
     start = middle_of_longest(segments)
     matrix = _monodromy(scene, stepper, start, period)
-    free = free_coordinates(scene, start.contact.status)
+    free = free_in_mode(scene, start.contact.status)
     values = np.linalg.eigvals(matrix[np.ix_(free, free)]).astype(complex)
     return values[np.argsort(-np.abs(values), kind="stable")]
 
 
-def middle_of_longest(segments: Round) -> Point:
-    """The middle of the longest segment that does not stick: far from events, so that none is met twice or missed."""
+def middle_of_longest(segments: PeriodSegments) -> Point:
+    """The middle of the longest segment that does not stick. It is far from events: a motion from there meets each once."""
     stuck = segments.contact.status == Status.STICK
     moving = np.where(np.any(stuck.reshape(len(stuck), -1), axis=1), 1e-9, 1.0)
     longest = int(np.argmax(moving * segments.h))
@@ -178,7 +180,7 @@ def _monodromy(scene: Scene, stepper: EventExact, start: Point, period: float) -
     return slopes.at.point.y
 
 
-def free_coordinates(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:
+def free_in_mode(scene: Scene, status: Int[np.ndarray, "*contacts"]) -> Int[np.ndarray, " m"]:
     """Indices in the state that a contact mode leaves free."""
     n, held = scene.structure.size, []
     places = contact_coordinates(scene.structure)
