@@ -22,12 +22,12 @@ def rows(path: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
 
 
-MEASURED = rows(DOCS / "measurements.md")
+MOST_WINDOWS = rows(DOCS / "measurements.md")
 
 
 def measured(start: str) -> str:
     """The figure of the row that begins so."""
-    (found,) = [row[1] for row in MEASURED if row[0].startswith(start)]
+    (found,) = [row[1] for row in MOST_WINDOWS if row[0].startswith(start)]
     return found
 
 
@@ -43,7 +43,7 @@ def test_what_kernels_gain_is_as_measured(page):
 
 def test_methods_are_compared_by_the_measured_errors():
     compared = {row[0]: row[1:3] for row in rows(DOCS / "methods.md") if row[0].startswith("`fj.")}
-    assert compared == {row[0]: row[1:3] for row in MEASURED if row[0].startswith("`fj.") and len(row) == 3}
+    assert compared == {row[0]: row[1:3] for row in MOST_WINDOWS if row[0].startswith("`fj.") and len(row) == 3}
     assert len(compared) == 2
 
 
@@ -53,7 +53,7 @@ def test_sizes_of_jobs_are_those_of_the_plan():
 
 
 def test_how_long_motions_are_followed_on_is_as_in_the_code():
-    first, onward = divergence.MEASURED_OVER * divergence.MEASURED, long_run.TIMES * long_run.ONWARD
+    first, onward = divergence.WINDOW_RETURNS * divergence.MOST_WINDOWS, long_run.TIMES * long_run.ONWARD
     assert (round(first, -3), round(first + onward, -4)) == (6000, 40_000)
     assert "for six thousand crossings at most" in text_of(DOCS / "verdicts.md")
     assert "for up to forty thousand crossings" in text_of(ROOT / "fivjax" / "maps" / "bistability.py")

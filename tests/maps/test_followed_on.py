@@ -118,13 +118,13 @@ def test_the_result_is_that_of_the_instant_of_the_proof():
 def test_who_reaches_a_cycle_with_the_last_step_is_captured(monkeypatch):
     """As many steps as the last trajectory took to its verdict are enough for it."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
-    taken, real = [], jobs.follow_all
+    taken, real = [], jobs.advance_all
 
     def counted(*args):
         taken.append(args[-1])
         real(*args)
 
-    monkeypatch.setattr(jobs, "follow", counted)
+    monkeypatch.setattr(jobs, "advance_all", counted)
     axes = {"mu": [0.2], "p": [1.02, 1.2, 1.5, 2.0]}
     expected = fj.bistability_map(scene, progress=False, **axes)
     assert fj.Verdict.LIMIT_CYCLE in expected["verdict"]
