@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .noise import rounding, taper
+from .noise import from_third_differences, robust_deviation, rounding, taper
 
 # The most groups: of phases, many, so that few samples lie beside a jump; and of times. Four of these tell the frequency with
 # nearly the error of all samples: the mean square of their times is 15/16 of that of all.
@@ -135,14 +135,8 @@ def _neighbours(samples) -> int:
 
 
 def _between_neighbours(ordered):
-    """The noise of single samples, from third differences in the order of phases: they hardly contain a waveform of many
-    samples, and their median ignores its jumps."""
-    around = np.concatenate([ordered, ordered[:3]])
-    return np.median(np.abs(np.diff(around, 3, axis=0)), axis=0) / (0.6745 * np.sqrt(20.0))
-
-
-def _robust(left):
-    return np.median(np.abs(left), axis=0) / 0.6745
+    """The noise of single samples, from third differences in the order of phases."""
+    return from_third_differences(np.concatenate([ordered, ordered[:3]]))
 
 
 def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
@@ -151,7 +145,7 @@ def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
     if _neighbours(scaled) > WIDEST * len(scaled):
         return 0.0
     left = _from_neighbours(scaled, np.mod(frequency * t, 1.0))
-    spread = np.maximum(_robust(left), 1e-12)
+    spread = np.maximum(robust_deviation(left), 1e-12)
     weight = taper(len(left))
     spectrum = np.abs(np.fft.rfft(left / spread * weight[:, None], axis=0)) ** 2 / np.sum(weight**2)
     low = np.fft.rfftfreq(len(left), 1 / rate) < 1.5 * frequency

@@ -40,13 +40,20 @@ def taper(count: int) -> Float[np.ndarray, " count"]:
 
 def estimated_noise(samples: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " k"]:
     """Standard deviations of single samples by channel, estimated from the recording."""
-    return np.maximum(np.minimum(_between_samples(samples), _between_lines(samples)), rounding(samples))
+    return np.maximum(np.minimum(from_third_differences(samples), _between_lines(samples)), rounding(samples))
 
 
-def _between_samples(samples):
-    differences = np.abs(np.diff(samples, 3, axis=0))
-    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance; 0.6745 is the median of a normal number's size.
-    return np.median(differences, axis=0) / (0.6745 * np.sqrt(20.0))
+def from_third_differences(samples: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " k"]:
+    """The standard deviation of white noise by channel: third differences hardly contain a waveform of many samples, and their
+    median ignores its jumps.
+    """
+    # The third difference of white noise has 1 + 9 + 9 + 1 times its variance.
+    return robust_deviation(np.diff(samples, 3, axis=0)) / np.sqrt(20.0)
+
+
+def robust_deviation(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " k"]:
+    """The standard deviation of normal numbers about zero, by the median of their sizes: a few large ones hardly change it."""
+    return np.median(np.abs(values), axis=0) / 0.6745
 
 
 def _between_lines(samples):

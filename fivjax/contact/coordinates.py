@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-Places = int | np.ndarray
+from ..model.sliding import Places
 
 
 def spread(columns: Float[Array, "n *contacts"], forces: Float[Array, "*contacts"]) -> Float[Array, " n"]:

@@ -201,7 +201,11 @@ def tangential_corner(structure: Structure) -> np.ndarray:
 
 def time_scale(structure: Structure) -> Float[Array, ""]:
     """ω₀ in rad/s: the root mean square of the uncoupled frequencies of the sliding coordinates, 1 if all are zero."""
-    keep = sliding_coordinates(structure.size, structure.normal)
-    squares = jnp.diagonal(structure.stiffness)[keep] / jnp.diagonal(structure.mass)[keep]
+    return time_scale_of(structure, sliding_coordinates(structure.size, structure.normal))
+
+
+def time_scale_of(structure: Structure, chosen) -> Float[Array, ""]:
+    """The same of the chosen coordinates."""
+    squares = jnp.diagonal(structure.stiffness)[chosen] / jnp.diagonal(structure.mass)[chosen]
     mean = jax.lax.stop_gradient(jnp.mean(squares))
     return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))

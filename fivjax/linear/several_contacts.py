@@ -21,7 +21,7 @@ from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
 from ..model.structure import Structure
 from .gradients import significant_growth
-from .linearisation import linear_sliding, state_matrix
+from .linearisation import linear_sliding, state_matrix, time_scale_of
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
 
 
@@ -79,16 +79,10 @@ def sliding_state_matrix(
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
     # In units of the structure's own frequencies, as `significant_growth` needs it.
     matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
-    scale = _time_scale(structure)
+    scale = time_scale_of(structure, slice(None))
     half = matrix.shape[0] // 2
     units = jnp.concatenate([jnp.ones(half), jnp.full(half, scale)])
     return significant_growth(matrix * units / units[:, None] / scale)
-
-
-def _time_scale(structure: Structure) -> Float[Array, ""]:
-    squares = jnp.diagonal(structure.stiffness) / jnp.diagonal(structure.mass)
-    mean = jax.lax.stop_gradient(jnp.mean(squares))
-    return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
 
 
 def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
@@ -115,7 +109,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     omega = jnp.abs(values[jnp.argmax(values.real)].imag)
     undamped = jnp.all(structure.damping == 0)
     flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
-    code = jnp.where(omega > 1e-6 * _time_scale(structure), flutter, DIVERGENCE)
+    code = jnp.where(omega > 1e-6 * time_scale_of(structure, slice(None)), flutter, DIVERGENCE)
     code = jnp.where(always, ALWAYS, jnp.where(found, code, NEVER))
     return mu, jnp.where(found & ~always, omega, jnp.nan), code
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..foundation.argument_forms import Form
+from ..foundation.plain_trees import PACKAGE
 from ..kernels.code import traced_source
 from ..kernels.warp_library import is_installed
 from ..model.scene import Scene
@@ -16,7 +17,6 @@ from .event_exact import EventExact
 
 # Larger structures and more contacts are left to XLA: their kernels would have more code than they save.
 LARGEST, MOST_CONTACTS = 48, 4
-PACKAGE = __name__.partition(".")[0]
 
 
 def has_kernel(scene: Scene, method: AbstractStepper) -> bool:

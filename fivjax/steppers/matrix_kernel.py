@@ -18,14 +18,15 @@ from ..contact import Contact, Mechanics, Status
 from ..contact.rounding import RESTING
 from ..foundation.kept_programs import kept_value
 from ..kernels.cpp_code import scalar_source
+from .guard_roots import MOST_ROOT_STEPS
 from .kernel_matrices import BLOCK, abreast, blocks_of, padded, places_of
 from .propagation import INTERVALS, ORDER
 from .window import bracketed, fastest, first_is_safe, leading
 
 # The matrices of structures with more degrees of freedom take megabytes for each scene, which are read in every step.
 MOST_COORDINATES = 24
-# Terms of the series in the first steps of Newton's method for a root, how many steps these are, and how many there may be.
-SHORT_TERMS, SHORT_STEPS, MOST_ROOT_STEPS = 6, 2, 60
+# Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
+SHORT_TERMS, SHORT_STEPS = 6, 2
 # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the sample next to it.
 RISE_STEPS, LOWEST_STEPS, PEAK_STEPS = 12, 6, 5
 # What a vector of `window.Bracket` has of both guards: the guess of the root, then what begins at these places.
