@@ -15,8 +15,8 @@ if (to_section) {
     for (int k = 0; k < 2 * N; ++k) y[k] = row[STATE + k];
     mode[0] = row[STATUS];
     mode[1] = row[DIRECTION];
-    int ended = 0, crossed = 0;
-    for (int count = 0; left > 0.0 && crossed < row[CROSSINGS] && count < MOST_TO_CROSSING; ++count) {
+    int ended = 0, crossed = 0, since = 0;
+    while (left > 0.0 && crossed < row[CROSSINGS] && since < MOST_SEGMENTS) {
         Motion::advance(of_group, own, interval, y, mode, 0.0, left, after);
         if (peaks) top = Motion::peak(of_group, interval, y, mode, 0.0, after, top);
         for (int k = 0; k < 2 * N; ++k) y[k] = after.y[k];
@@ -24,7 +24,9 @@ if (to_section) {
         ended += after.ended;
         // No number ends it, too.
         left = after.h < left ? left - after.h : 0.0;
+        ++since;
         if (after.crossed) {
+            since = 0;
             for (int k = 0; k < 2 * N; ++k) past[2 * N * (crossed % kept) + k] = y[k];
             ++crossed;
         }

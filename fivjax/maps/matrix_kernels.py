@@ -19,7 +19,7 @@ from ..kernels.lane_functions import AT_A_TIME, LaneFunction
 from ..kernels.warp_library import gpus_for, warp
 from ..section.about_sliding import mechanics_about_sliding
 from ..section.by_kernel import numbers_in_rows
-from ..section.crossings import MOST_TO_CROSSING
+from ..section.crossings import MOST_SEGMENTS
 from ..steppers.kernel_matrices import matrices
 from ..steppers.matrix_kernel import MechanicsForm, motion_in_cpp
 from .groups import Task, with_values
@@ -51,7 +51,7 @@ NUMBERS = ("width", "to_section", "kept", "peaks", "count_of_jumps", "steps")
 def kernel(form: MechanicsForm) -> LaneFunction:
     """The kernel for scenes of this form: `matrix_kernels.cpp`."""
     columns = {column.name: int(column) for kind in (ReturnColumn, FollowColumn) for column in kind}
-    enums = ", ".join(f"{name} = {value}" for name, value in {**columns, "MOST_TO_CROSSING": MOST_TO_CROSSING}.items())
+    enums = ", ".join(f"{name} = {value}" for name, value in {**columns, "MOST_SEGMENTS": MOST_SEGMENTS}.items())
     text = (Path(__file__).parent / "matrix_kernels.cpp").read_text(encoding="utf-8")
     body = f"{motion_in_cpp(form)}\nenum {{ {enums} }};\n{text}"
     return LaneFunction(body, (*OF_GROUPS, *OF_LANES, "columns"), NUMBERS)

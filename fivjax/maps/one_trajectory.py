@@ -206,12 +206,15 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
         )
     quiet_load = now.last_jump <= now.t
+    # No step takes time any more: because of events at one instant, or because nothing moves by as much as a normal number.
+    stands = now.t <= began
+    by_events = stands & (now.last_event >= now.t)
     bound = margin_share_bound(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
         Verdict.NOT_FINITE,
         jnp.where(
-            now.t <= began,
+            by_events,
             Verdict.TOO_MANY_EVENTS,
             jnp.where(
                 bound < 1,
@@ -220,7 +223,8 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             ),
         ),
     )
-    now = eqx.tree_at(lambda now: (now.verdict, now.bound), now, (verdict.astype(jnp.int8), bound))
+    t = jnp.where(stands & ~by_events, jnp.inf, now.t)
+    now = eqx.tree_at(lambda now: (now.t, now.verdict, now.bound), now, (t, verdict.astype(jnp.int8), bound))
     return _with_sliding(setting, now, quiet_load) if _may_slide_on(setting, now) else now
 
 

@@ -93,6 +93,7 @@ class AbstractFriction(eqx.Module):
 
     def check(self, belt_speed: Array | float = 0.0) -> None:
         """Refuse a law that breaks its contract, where its values are known, on a belt of this speed (m/s)."""
+        self._check_result()
         fastest = float(np.max(np.abs(np.asarray(belt_speed)))) if is_known(belt_speed) else 0.0
         # A law is checked at these shares of the fastest slip that is looked at: so many times the belt's speed, or so many
         # m/s where that is zero or unknown.
@@ -127,6 +128,25 @@ class AbstractFriction(eqx.Module):
             # The largest value at this speed and above.
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
             refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
+
+    def _check_result(self) -> None:
+        """Refuse a law that is no JAX function from a real number to a real number in double precision."""
+        name, more = type(self).__name__, "See `fivjax.AbstractFriction` for what a law promises."
+        with jax.enable_x64(True):
+            speed = jax.ShapeDtypeStruct((), np.dtype("float64"))
+            try:
+                found = jax.eval_shape(self.__call__, speed)
+            except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+                raise TypeError(
+                    f"The friction law `{name}` must be a JAX function, but asks for a value while it is traced. "
+                    f"Use `jax.numpy` in place of NumPy, and `jnp.where` in place of `if`. {more}"
+                ) from error
+        if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != () or found.dtype != speed.dtype:
+            kind = f"{found.dtype} of shape {found.shape}" if isinstance(found, jax.ShapeDtypeStruct) else f"{found!r}"
+            raise TypeError(
+                f"The friction law `{name}` must return one real number in double precision (float64 of shape ()), but returns "
+                f"{kind}. {more}"
+            )
 
     def __repr__(self) -> str:
         return as_call(type(self).__name__, vars(self))

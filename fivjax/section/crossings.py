@@ -22,8 +22,6 @@ from .peak_speed import higher_peak
 
 # The most segments from one point of the section to the next: enough for hundreds of events.
 MOST_SEGMENTS = 4096
-# The most segments from one point of the section to a later one.
-MOST_TO_CROSSING = 64 * MOST_SEGMENTS
 
 
 class Point(eqx.Module):
@@ -45,7 +43,6 @@ class Crossing(NamedTuple):
     point: Point
     time: Float[Array, ""]  # s
     events: Int[Array, ""]
-    segments: Int[Array, ""]
 
 
 class Arrival(NamedTuple):
@@ -71,7 +68,7 @@ class _Way(NamedTuple):
     left: Float[Array, ""]  # of the longest time, s
     crossed: Int[Array, ""]
     events: Int[Array, ""]
-    segments: Int[Array, ""]
+    segments: Int[Array, ""]  # since the last crossing
     peak: Float[Array, ""]
 
 
@@ -85,8 +82,8 @@ def to_crossing(
     kick: Kick | None = None,
     peaks: bool | Bool[Array, ""] = False,
 ) -> tuple[Arrival, Crossing]:
-    """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) or `MOST_TO_CROSSING`
-    segments at most; after a kick, if there is one.
+    """The motion from a start to its `crossings`-th crossing of the section, for a time `longest` (s) at most, with
+    `MOST_SEGMENTS` segments from each crossing to the next; after a kick, if there is one.
 
     Returns its end, and a row for each crossing with one of these `numbers`, of which 1 is the first. They rise, up to
     `crossings` at least. States of rows are NaN where the motion has not been. The largest speed is sought if `peaks` says so.
@@ -118,25 +115,26 @@ def to_crossing(
         # Where it is known, XLA computes nothing for it.
         known = isinstance(peaks, bool)
         peak = jax.lax.cond(peaks, higher, lambda: way.peak) if not known else higher() if peaks else way.peak
+        crosses = after.rise.happened & ~kicked
         return _Way(
             after.y,
             after.contact,
             kick,
             left,
-            way.crossed + (after.rise.happened & ~kicked),
+            way.crossed + crosses,
             way.events + (jnp.any(after.ended) & ~kicked),
-            way.segments + 1,
+            jnp.where(crosses, 0, way.segments + 1),
             peak,
         )
 
     def until(way: _Way, crossed) -> _Way:
         def going(way: _Way):
-            return (way.left > 0) & (way.crossed < crossed) & (way.segments < MOST_TO_CROSSING)
+            return (way.left > 0) & (way.crossed < crossed) & (way.segments < MOST_SEGMENTS)
 
         return jax.lax.while_loop(going, further, way)
 
     def here(way: _Way) -> Crossing:
-        return Crossing(Point(way.y, way.contact), longest - way.left, way.events, way.segments)
+        return Crossing(Point(way.y, way.contact), longest - way.left, way.events)
 
     def row(way: _Way, number):
         number = number.astype(jnp.int32)

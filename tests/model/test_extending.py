@@ -81,6 +81,35 @@ def test_a_law_that_breaks_its_contract_is_refused(law, fragments):
         scene_with(law)
 
 
+@pytest.mark.parametrize(
+    ("result", "fragments"),
+    [
+        (lambda v: np.exp(-v), ["`jax.numpy`", "`jnp.where`"]),
+        (lambda v: 1.0 if v < 0.5 else 0.5, ["`jax.numpy`", "`jnp.where`"]),
+        (lambda v: jnp.exp(-v).astype(jnp.float32), ["float32"]),
+        (lambda v: 1, ["int64"]),
+        (lambda v: jnp.exp(-v)[None], ["(1,)"]),
+        (lambda v: jnp.exp(-v) + 0j, ["complex128"]),
+        (lambda v: (v, v), ["("]),
+    ],
+    ids=["numpy", "if", "single", "whole", "vector", "complex", "two"],
+)
+def test_a_law_is_a_jax_function_of_a_number_to_a_number(result, fragments):
+    """Rejects what ended in errors of JAX and NumPy in the middle of a run."""
+    law = type("Own", (fj.AbstractFriction,), {"__call__": lambda self, slip_speed: result(slip_speed)})
+    with refused(TypeError, "`Own`", *fragments):
+        scene_with(law())
+
+
+def test_a_motion_that_fades_below_all_numbers_has_no_events():
+    """Without bounds on its variation nothing is proved of a law, so a motion is followed until its steps take no time."""
+    law = type("Bare", (Law,), {"variation": fj.AbstractFriction.variation})
+    structure = fj.Structure(np.eye(2), np.diag([0.1, 1.0]), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, law(0.2, 0.01), 0.3, fj.Pulse(1.0, 3.0, duration=2.0))
+    m = fj.bistability_map(scene, p=[1.0, 1.3], t_max=1e5, progress=False)
+    assert m.verdict.values.tolist() == [fj.Verdict.UNDECIDED] * 2 and m.contact_events.values.tolist() == [0, 0]
+
+
 def test_a_law_may_rise_above_its_static_value_but_not_to_painleves_limit():
     """Rejects refusing a viscous branch that only counts at speeds never reached, and running far beyond the limit."""
     scene = scene_with(Law(0.3, 150.0))  # 142.8 at the belt's speed, where the limit is 108.5

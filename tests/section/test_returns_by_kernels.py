@@ -64,6 +64,21 @@ def test_crossings_are_the_series_stepper_s(maps, exactly, starts):
     assert np.all(np.isnan(found.path[:, 0]))
 
 
+def test_a_motion_has_as_many_segments_as_its_returns_need():
+    """Between two returns their number is limited, but not over all: 60,000 returns to a cycle of five events."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=1.0)
+    group, by_series = np.zeros(1, int), ReturnMaps.of(scene)
+    at = by_series.in_contact(group, fj.limit_cycle(scene).points[:1])
+    with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
+        shared = constants_of(Task(scene, Propagation(), ("mu",), (), {}, width=8), np.array([[0.227]]))
+        by_matrices = copy.copy(by_series)
+        by_matrices.kernels = MatrixKernels(shared, pool)
+        for one in (by_series, by_matrices):
+            found = one.returns(group, at, 60_000)
+            assert found.events.tolist() == [300_000]
+            np.testing.assert_allclose(found.at.y, at.y, rtol=1e-9, atol=1e-15)
+
+
 def test_of_no_states_there_are_no_images(maps, exactly, starts):
     group, at = starts
     for one in (maps, exactly):
