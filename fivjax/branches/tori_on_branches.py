@@ -37,7 +37,8 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
 
     **Returns:** a dataset over `point`: `place` (the index on the branch), `parameter`, `kind` ("torus"; "locked", a cycle that
     closes after more crossings of the section; "another cycle"; "none", if no attractor was found), `amplitude` (peak
-    tangential speed, m/s) and `rotation_number` of a torus (turns per return, without sign).
+    tangential speed, m/s) and `rotation_number` of a torus (turns per return, without sign; NaN where
+    its points lie on no closed curve, or on one of more than a dozen pieces).
 
     **Raises:** `ValueError` for an object that is no branch.
 

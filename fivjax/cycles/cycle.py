@@ -44,7 +44,7 @@ class LimitCycle(eqx.Module):
       to the cycle's, and the factor by which distances in it fall in one period (of a torus: the share to which all came back).
     - `residual`, how far the return is from the start, relative to the cycle's size (of a torus, of its points from the curve
       through the others); `return_jacobian`, the derivative of the return map over one period; `rotation_number` of a torus, in
-      turns per return.
+      turns per return (None where its points lie on no closed curve, or on one of more than a dozen pieces).
 
     **Example:**
 

@@ -199,7 +199,8 @@ def _tracks(path: Path, kind: str, table: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _vector(path: Path, name: str, values) -> np.ndarray:
-    array = np.squeeze(np.asarray(values))
+    # A single sample keeps its axis: that there are too few is said of the recording.
+    array = np.atleast_1d(np.squeeze(np.asarray(values)))
     if array.dtype.kind not in "iuf" or array.ndim != 1:
         raise ValueError(
             f"File `{path}`, variable `{name}`: must be a vector of real numbers, but is {arguments.describe(array)}."

@@ -105,7 +105,9 @@ def critical_perturbation(
     arguments.truth("energy", energy)
     arguments.truth("derivatives", derivatives)
     if derivatives:
-        refuse_several_contacts(scene.structure, "`critical_perturbation` with derivatives")
+        refuse_several_contacts(
+            scene.structure, "`critical_perturbation` with derivatives", "Without derivatives it takes several."
+        )
     if derivatives and not isinstance(method, EventExact):
         raise ValueError(
             "Argument `derivatives` needs the method EventExact(), whose trajectories are exact through events."

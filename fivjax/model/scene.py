@@ -307,11 +307,13 @@ def _painleve_friction(structure: Structure):
     return jnp.where(coupling == 0, jnp.inf, compliance[1, 1] / jnp.where(coupling == 0, 1.0, coupling))
 
 
-def refuse_several_contacts(structure: Structure, who: str) -> None:
-    """Refuse anything but one contact at two coordinates; `who`, the function that needs this, is named in the error."""
+def refuse_several_contacts(structure: Structure, who: str, instead: str = "`simulate` takes several.") -> None:
+    """Refuse anything but one contact at two coordinates; `who`, the function that needs this, is named in the error, and what
+    there is `instead`.
+    """
     if len(structure.contacts) > 1:
         raise ValueError(
-            f"{who} takes structures with one contact, but this one has {len(structure.contacts)}. `simulate` takes several."
+            f"{who} takes structures with one contact, but this one has {len(structure.contacts)}. {instead}"
         )
     refuse_vector_contacts(structure, who)
 

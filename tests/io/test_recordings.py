@@ -113,6 +113,7 @@ BAD_FILES = [
     ("x,a0\n0,1\n0.1,2\n", ["no column `t`", "`rate`"]),
     ("t,a0 (furlong)\n0,1\n0.1,2\n", ["`a0`", "'furlong'", "m/s2"]),
     ("t,a0\n", ["1 lines"]),
+    ("t,a0\n0,1\n", ["at least 16 samples", "has 1"]),
 ]
 
 
