@@ -102,7 +102,10 @@ def _following(
 
     def struck():
         reached = affected_by(mechanics, touched) if mechanics.several else True
-        return _resting(mechanics, contact, load, impact(impacting, y_stopped, reached), touched, resolution)
+        # One that rises has landed by rounding, right after a rebound: in one that several impacts have made small nothing else
+        # would end it.
+        rising = touched & (gap_rate(mechanics, y_stopped) >= 0)
+        return _resting(mechanics, contact, load, impact(impacting, y_stopped, reached), touched, rising, resolution)
 
     impacting, inelastic = mechanics, mechanics.restitution == 0
     # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
@@ -172,9 +175,10 @@ def _resting(
     load: Float[Array, ""],
     y: State,
     touched: Bool[Array, "*contacts"],
+    rising: Bool[Array, "*contacts"],
     resolution: Float[Array, ""],
 ) -> State:
-    """The state without rebounds that would end within `resolution` (s)."""
+    """The state without rebounds that would end within `resolution` (s), and without those of `rising` contacts."""
     rate = gap_rate(mechanics, y)
     if mechanics.several:
         # The acceleration before the impact, while the contact was free.
@@ -184,7 +188,7 @@ def _resting(
         if mechanics.rest is not None:
             _, g_tn, g_nn = mechanics.compliance
             fall = fall - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
-    rests = touched & (rate + 0.5 * fall * resolution <= 0)
+    rests = rising | (touched & (rate + 0.5 * fall * resolution <= 0))
     return with_contact_coordinates(
         mechanics,
         y,

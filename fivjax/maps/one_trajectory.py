@@ -198,7 +198,8 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
     `began` is the time (s) at which the present round of steps began.
     """
     scene, mechanics, modes = setting.scene, setting.shared.mechanics, setting.shared.modes
-    grown = jnp.max(jnp.abs(scene.structure.weights * now.y)) > UNBOUNDED_FROM * now.yardstick
+    largest = jnp.max(jnp.abs(scene.structure.weights * now.y))
+    grown = largest > UNBOUNDED_FROM * now.yardstick
     # There is no proof that several contacts stick for ever.
     jammed = jnp.asarray(False)
     if setting.shared.drift is not None:
@@ -206,15 +207,15 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             setting.shared.drift, mechanics.of_totals, now.contact, now.y + modes.linear.equilibrium
         )
     quiet_load = now.last_jump <= now.t
-    # No step takes time any more: because of events at one instant, or because nothing moves by as much as a normal number.
-    stands = now.t <= began
-    by_events = stands & (now.last_event >= now.t)
+    # A motion of less than can be computed with all digits has come to rest: nothing happens any more.
+    limits = jnp.finfo(now.y.dtype)
+    rests = quiet_load & (largest < float(limits.tiny) / float(limits.eps))
     bound = margin_share_bound(mechanics, modes, now.contact, now.y, quiet_load)
     verdict = jnp.where(
         ~jnp.all(jnp.isfinite(now.y)),
         Verdict.NOT_FINITE,
         jnp.where(
-            by_events,
+            (now.t <= began) & ~rests,
             Verdict.TOO_MANY_EVENTS,
             jnp.where(
                 bound < 1,
@@ -223,7 +224,7 @@ def conclude(setting: Setting, began: Float[Array, ""], now: Progress) -> Progre
             ),
         ),
     )
-    t = jnp.where(stands & ~by_events, jnp.inf, now.t)
+    t = jnp.where(rests & (verdict == Verdict.UNDECIDED), jnp.inf, now.t)
     now = eqx.tree_at(lambda now: (now.t, now.verdict, now.bound), now, (t, verdict.astype(jnp.int8), bound))
     return _with_sliding(setting, now, quiet_load) if _may_slide_on(setting, now) else now
 

@@ -29,8 +29,8 @@ ENDING = {
     "parameters",
     Ending.PAINLEVE: "the contact problem has no unique solution at this friction (Painlevé), so the motion is one of several; "
     "lower the friction or the coupling in the mass matrix",
-    Ending.TOO_MANY_EVENTS: "contact events came without end, and the rows from there on are NaN; "
-    "change the restitution or the belt speed a little",
+    Ending.TOO_MANY_EVENTS: "contact events came without end, or thousands of them between two saved rows, and the rows from "
+    "there on are NaN; lower `dt_save`, or change the restitution or the belt speed a little",
     Ending.UNBOUNDED: "the motion grew a billionfold beyond its start, the belt's speed and what the load can cause, and the "
     "rows from there on are NaN; take a smaller step, or lower the friction",
     Ending.STEP_FAILURE: "the fastest vibration needs too many steps between two saved rows, and the rows from there on are "

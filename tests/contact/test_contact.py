@@ -430,6 +430,22 @@ def test_rebounds_come_to_rest_at_the_resolution_only():
     assert (kind, after[3]) == (Status.SLIDE, 0.0)
 
 
+def test_a_rebound_that_rounding_ends_at_once_comes_to_rest():
+    """A step ends at its start, because the gap is zero and its rate as good as zero, though rising. Two contacts that bounced went
+    on so for ever: an impulse that presses cannot take the rate away."""
+    contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+    mass = np.eye(4) + 0.1 * (np.eye(4, k=2) + np.eye(4, k=-2))
+    structure = fj.Structure(mass, np.zeros((4, 4)), np.eye(4), [0.0, -1.0, 0.0, -1.0], contacts=contacts)
+    scene = fj.Scene(structure, fj.Coulomb(0.3), 1.0, fj.ConstantLoad(10.0), restitution=0.67)
+    with jax.enable_x64(True):
+        flying = Contact(jnp.array([Status.DETACH, Status.SLIDE], jnp.int32), jnp.ones(2))
+        y = jnp.array([0.0, 0.0, 0.0, 0.0, 0.4, 8.6e-11, 0.4, 0.0])
+        ended = jnp.array([[True, True], [False, False]])
+        contact, after = _transition(scene, flying, jnp.asarray(10.0), y, ended, jnp.asarray(0.0))
+    assert contact.status.tolist() == [Status.SLIDE, Status.SLIDE]
+    np.testing.assert_array_equal(after[4:], [0.4, 0.0, 0.4, 0.0])
+
+
 @pytest.mark.parametrize("n", [2, 5])
 def test_every_transition_ends_on_the_constraint_of_a_consistent_status(n):
     """After every event the state meets the constraint of its new status exactly, and the forces agree with it."""
