@@ -1,5 +1,6 @@
 """Loops and branches as C++, and which of the numbers that they carry are tangents."""
 
+import weakref
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
@@ -116,8 +117,19 @@ def _carried(body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool
         begin = more
 
 
+# What was found of traced functions, while these are there: loops inside loops are asked again and again.
+_known_wide: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[bool]]] = weakref.WeakKeyDictionary()
+
+
 def wide_results(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
     """Which results of a traced function are wide if these of its operands are: real numbers that depend on one."""
+    known, given = _known_wide.setdefault(jaxpr, {}), tuple(map(bool, wide))
+    if given not in known:
+        known[given] = _wide_results(jaxpr, given)
+    return known[given]
+
+
+def _wide_results(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
     moves = dict(zip(jaxpr.invars, wide, strict=True))
 
     def reads(atom) -> bool:
