@@ -26,17 +26,11 @@ from .motions import Motions
 
 # Returns over which a drift is measured.
 DRIFT_RETURNS = 48
-# A leap is this share of the motion's size at most.
-LONGEST_LEAP = 0.05
 # The longest leaps of motions that grow about the equilibrium, or decay to it, in e-folds. Those that decay soon slide for
 # ever, and are asked after each leap.
 LONGEST_GROWTH, LONGEST_DECAY = np.log(4.0), 0.2
 # A rate of growth changes with size no faster than this power of it.
 POWER = 4.0
-# After a leap the other deviations are no larger beside the drift than before, so that the motion settles so many times sooner.
-SOONER = 8
-# Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
-LEAST_DRIFTS = 4.0
 # A leap over which the drift changes e-fold, by its two latest places, is too long: this part of it is trusted.
 TRUSTED = 0.25
 
@@ -72,6 +66,13 @@ def creep(
     """Which motions creep; and where these are, how much later (s), and after how many more contact events, when they have
     `arrived` (told by their rows and states), or creep no more.
     """
+    # Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
+    least_drifts = 4.0
+    # After a leap the other deviations are no larger beside the drift than before, so that the motion settles so many times
+    # sooner.
+    sooner = 8
+    # A leap is this share of the motion's size at most.
+    longest_leap = 0.05
     group, at = motions
     last = Section(*(np.array(part) for part in at))
     creeps = np.zeros(len(group), bool)
@@ -88,17 +89,17 @@ def creep(
         if not len(rows):
             break
         grows = here.grows
-        longest = np.where(grows, np.where(here.growth > 0, LONGEST_GROWTH, LONGEST_DECAY), LONGEST_LEAP)
+        longest = np.where(grows, np.where(here.growth > 0, LONGEST_GROWTH, LONGEST_DECAY), longest_leap)
         # The first leap is a short one, but worthwhile.
-        first = np.clip(1.5 * LEAST_DRIFTS * length / size, 0.004, LONGEST_LEAP)
+        first = np.clip(1.5 * least_drifts * length / size, 0.004, longest_leap)
         share[rows] = np.where(np.isnan(share[rows]), first, np.minimum(share[rows], longest))
         times = share[rows] * size / length
-        plain = times < LEAST_DRIFTS
+        plain = times < least_drifts
         times[plain] = 0.0
         along = times[:, None] * here.way / maps.weights
         moved = np.where(grows[:, None], here.at.y * np.expm1(times * here.growth)[:, None], along)
         leapt = here.at._replace(y=here.at.y + moved)
-        waits = np.where(grows, settles[rows] // SOONER, settles[rows])
+        waits = np.where(grows, settles[rows] // sooner, settles[rows])
         settled = maps.returns(group[rows], leapt, np.where(plain, 512, waits))
         there = _measure_drift(maps, Motions(group[rows], settled.at))
         with np.errstate(divide="ignore", invalid="ignore"):

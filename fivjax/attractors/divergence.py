@@ -19,10 +19,6 @@ APART = 1e-7
 # Neighbours have parted by so many e-folds since they were closest, as in chaos; or closed in by so many since they were
 # furthest apart, as on a cycle. On a torus they do both by turns, by two or three e-folds.
 PARTED, CLOSED_IN = 30.0, 15.0
-# What may be a torus is followed for longer where neighbours have parted by so many; and is none if they then part by so many.
-SUSPICIOUS, PARTED_ON_TORUS = 4.0, 12.0
-# After so many measurements each it is asked which motions have arrived.
-ARRIVING = 8
 # Which motions have come to something that is known.
 Arrived = Callable[[Motions], Bool[np.ndarray, " m"]]
 # Returns after which a neighbour is brought near again along a motion that is known: what parts slowly is still near then.
@@ -57,6 +53,8 @@ def long_divergence(
     events may be rare. On a torus they do neither. They part exponentially if it is by so many e-folds. Of those that have
     `arrived` on the way it is not asked any further.
     """
+    # After so many measurements each it is asked which motions have arrived.
+    arriving = 8
     group = motions.group
     first = maps.returns(*motions, 1)
     _, time, events, at, beside, _ = _growth(maps, Motions(group, first.at), _beside(first.at))
@@ -79,7 +77,7 @@ def long_divergence(
         with np.errstate(invalid="ignore"):
             furthest = np.fmax(furthest, parted - least)
             left = ((parted - least < chaotic_from) & (most - parted < CLOSED_IN))[running]
-        if arrived is not None and turn % ARRIVING == ARRIVING - 1:
+        if arrived is not None and turn % arriving == arriving - 1:
             left &= ~arrived(Motions(group[running], at))
         running, at, beside = running[left], at.rows(left), beside[left]
         if not len(running):
@@ -98,6 +96,9 @@ def diverges_along(
     """Whether neighbours part exponentially along these motions, by their weighted states on the section in order: chaos that
     is as weak as an e-fold in some hundred returns looks like a torus in all other respects.
     """
+    # What may be a torus is followed for longer where neighbours have parted by so many; and is none if they then part by so
+    # many.
+    suspicious, parted_on_torus = 4.0, 12.0
     states = paths / maps.weights
     beside, since = states[:, 0] * (1 + APART), np.zeros(len(group))
     furthest = np.zeros(len(group))
@@ -111,10 +112,10 @@ def diverges_along(
         with np.errstate(divide="ignore", invalid="ignore"):
             since = np.fmax(since + np.log(distance / apart), 0.0)
         furthest = np.fmax(furthest, since)
-    chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < SUSPICIOUS))
+    chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < suspicious))
     if len(rows):
         at = section_at(states[rows, -1], maps.normal, maps.sliding[group[rows]])
-        chaotic[rows] = long_divergence(maps, Motions(group[rows], at), PARTED_ON_TORUS).chaotic
+        chaotic[rows] = long_divergence(maps, Motions(group[rows], at), parted_on_torus).chaotic
     return chaotic
 
 

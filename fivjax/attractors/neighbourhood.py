@@ -44,8 +44,6 @@ from jaxtyping import Bool, Float, Int
 
 from ..contact import same_mode
 
-# With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
-MARGIN = 1e-6
 # The largest radius tried, relative to the cycle's size.
 LARGEST = 0.5
 # The return map is checked on so many shells of an ellipsoid, each of half the size of the one outside it.
@@ -91,15 +89,17 @@ ReturnMap = Callable[[Int[np.ndarray, " c"], Float[np.ndarray, "c m state"]], Re
 
 def adapted_norm(derivative: Float[np.ndarray, "f f"]) -> tuple[Float[np.ndarray, "f f"], float] | None:
     """A square root of $H$ (see the module's docstring) and the rate γ; None if the largest multiplier is too close to 1."""
+    # With multipliers closer than this to the unit circle, a contraction could not be told from rounding.
+    margin = 1e-6
     if not np.all(np.isfinite(derivative)):
         return None
     largest = np.max(np.abs(np.linalg.eigvals(derivative)), initial=0.0)
-    if largest >= 1 - MARGIN:
+    if largest >= 1 - margin:
         return None
     rate = 0.5 * (1 + largest)
     # The solution is a sum over all powers of the scaled derivative, whose number is doubled again and again.
     power, matrix = derivative / rate, np.eye(len(derivative))
-    # Enough for the slowest decay within the margin: (1 - MARGIN / 2) to the power 2^32 is nothing.
+    # Enough for the slowest decay within the margin: (1 - margin / 2) to the power 2^32 is nothing.
     for _ in range(32):
         matrix, power = matrix + power.T @ matrix @ power, power @ power
         if np.max(np.abs(power), initial=0.0) < np.finfo(float).eps:

@@ -15,17 +15,6 @@ from .special_points import MEETS_SLIDING, Special, between
 
 # Lengths of steps, in the units of the curve (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
-# After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second above.
-SOON, LATER = 3.0, 1.5
-# The angle between the tangents at neighbouring points has at least this cosine.
-STRAIGHT = 0.99
-# Cycles of one parameter whose periods and sizes differ by no more than this share are the same, but for rebounds that are none
-# to speak of.
-SAME = 1e-7
-# Gaps that a branch goes over: beyond one it may come back on itself, again and again.
-MOST_GAPS = 16
-# A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
-SMALL = 0.02
 
 
 class HalfBranch(NamedTuple):
@@ -39,6 +28,13 @@ def follow_branch(
     family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float], most: int
 ) -> HalfBranch:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
+    # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
+    small = 0.02
+    # Gaps that a branch goes over: beyond one it may come back on itself, again and again.
+    most_gaps = 16
+    # After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second
+    # above.
+    soon, later = 3.0, 1.5
     here, tangent = start, start.curve.tangent(start.cycle, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
     points: list[BranchPoint] = []
@@ -47,7 +43,7 @@ def follow_branch(
     def over_a_gap():
         nonlocal gaps
         gaps += 1
-        return _over_a_gap(family, points, start, sense, bounds) if gaps <= MOST_GAPS else None
+        return _over_a_gap(family, points, start, sense, bounds) if gaps <= most_gaps else None
 
     while len(points) < most:
         stage(f"following, {len(points)} cycles so far")
@@ -93,7 +89,7 @@ def follow_branch(
             here, tangent, step = onward
             continue
         points.append(last)
-        if _smallness(curve, following) < SMALL:
+        if _smallness(curve, following) < small:
             end = _where_sliding_is_met(family, last)
             if end is None:
                 return HalfBranch(points, _at(family, last, "the amplitude goes to zero"))
@@ -105,7 +101,7 @@ def follow_branch(
         if len(points) > 8 and _closes(start, here, last):
             return HalfBranch(points, _at(family, last, "the branch is back where it began"))
         easy = following.iterations <= 3
-        step = min(step * ((SOON if step < FIRST else LATER) if easy else 0.7), LONGEST)
+        step = min(step * ((soon if step < FIRST else later) if easy else 0.7), LONGEST)
         here, tangent = with_own_rebounds(family, last, turned)
     return HalfBranch(points, _at(family, here, f"`points` = {most} points are computed"))
 
@@ -116,13 +112,15 @@ def _ahead(
     """The next cycle, the tangent there, and the step to it, which is shortened until there is a cycle and the curve is nearly
     straight up to it. None if there is none, however short the step.
     """
+    # The angle between the tangents at neighbouring points has at least this cosine.
+    straight = 0.99
     # Not beyond the equilibrium, where the amplitude is zero.
     step = min(step, 0.5 * _smallness(curve, here))
     while True:
         following = curve.along(here, tangent, step)
         if following is not None:
             turned = curve.tangent(following, tangent)
-            if turned @ tangent >= STRAIGHT or step <= 1e-3:
+            if turned @ tangent >= straight or step <= 1e-3:
                 return following, turned, step
         elif step <= 4 * SHORTEST:
             return None
@@ -186,6 +184,9 @@ def _smallness(curve: Curve, cycle: ComputedCycle) -> float:
 
 def _met_before(points: list[BranchPoint], last: BranchPoint) -> int | None:
     """Where a branch has turned back, if its latest cycle is one that it has come along before: the last point until then."""
+    # Cycles of one parameter whose periods and sizes differ by no more than this share are the same, but for rebounds that are
+    # none to speak of.
+    same = 1e-7
     if last.real is None:
         return None
     parameters = np.array([point.cycle.parameter for point in points])
@@ -194,13 +195,13 @@ def _met_before(points: list[BranchPoint], last: BranchPoint) -> int | None:
         near = points[k]
         # Between these two points, or nearly so: elsewhere the cycle need not be computed.
         one, other = near.cycle.phases.period, points[k + 1].cycle.phases.period
-        if abs(period - 0.5 * (one + other)) > 1.5 * abs(one - other) + SAME * period:
+        if abs(period - 0.5 * (one + other)) > 1.5 * abs(one - other) + same * period:
             continue
         before = near.curve.at_parameter(near.cycle.u, value)
-        if before is None or abs(before.phases.period - period) > SAME * period:
+        if before is None or abs(before.phases.period - period) > same * period:
             continue
         size, own = (at.phases.size(near.curve.weights) for at in (before, last.cycle))
-        if abs(size - own) <= 10 * SAME * size:
+        if abs(size - own) <= 10 * same * size:
             return int(k + np.argmax(np.abs(parameters[k:] - value)))
     return None
 

@@ -14,11 +14,6 @@ from ..contact import Status
 from .multiple_shooting import Mode, PhaseImages, Phases, images_of_phases, inside
 from .pseudo_arclength import ComputedCycle, Curve, assembled
 
-MOST_ITERATIONS = 12
-EXACT = 1e-13
-# The longest first step, in sizes and periods of the cycle: a phase of thousands of periods takes minutes to follow.
-FIRST_STEP = 4.0
-
 NAMES = {
     (Status.SLIDE, 0): "grazing of N",
     (Status.SLIDE, 1): "grazing of slip",
@@ -104,8 +99,12 @@ def row_of(curve: Curve, phases: Phases, minimum: GuardMinimum, partial: PhaseIm
 
 def grazing_near(curve: Curve, guess: ComputedCycle, minimum: GuardMinimum) -> Grazing | None:
     """The cycle near a guess on which this guard touches zero."""
+    # The longest first step, in sizes and periods of the cycle: a phase of thousands of periods takes minutes to follow.
+    first_step = 4.0
+    exact = 1e-13
+    most_iterations = 12
     u, last = guess.u.copy(), np.inf
-    for iteration in range(MOST_ITERATIONS):
+    for iteration in range(most_iterations):
         phases, parameter = curve.phases(u)
         found, partial = images_up_to_minimum(curve, parameter, phases, minimum)
         residuals, rows = assembled(found, phases)
@@ -125,10 +124,10 @@ def grazing_near(curve: Curve, guess: ComputedCycle, minimum: GuardMinimum) -> G
         shift = -slope / minimum.bend if minimum.bend > 0 else 0.0
         limit = 0.25 * phases.h[minimum.phase]
         shift = float(np.clip(shift, -limit, limit))
-        if (size < EXACT and abs(shift) < 1e-9 * curve.time) or (last < 1e-10 and size > 0.5 * last):
+        if (size < exact and abs(shift) < 1e-9 * curve.time) or (last < 1e-10 and size > 0.5 * last):
             cycle = ComputedCycle(u, rows / sizes[:-1, None], found, phases, parameter, iteration)
             return Grazing(cycle, minimum, row / sizes[-1])
-        if size > (FIRST_STEP if iteration == 0 else 0.5):
+        if size > (first_step if iteration == 0 else 0.5):
             return None
         u, last = u + step, size
         if minimum.bend > 0:

@@ -11,20 +11,18 @@ from .pseudo_arclength import ComputedCycle, Curve, Family
 from .special_points import Special, change_between, grazing_of, name_of, root, vanishing, without
 from .verification import on_section, real_motion
 
-# Halvings that bracket a change of modes before it is computed.
-HALVINGS = 14
 # The most phases of a cycle that is followed: its equations are a matrix of so many states. Ever shorter impacts have more.
 MOST_PHASES = 256
-# Distances beyond a change of modes at which the next modes are determined, as shares of the step.
-BEYOND = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
 
 def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray, " m"], step: float):
     """The change of modes within a step: the special point, and the point, tangent and step with which to go on, if any."""
+    # Halvings that bracket a change of modes before it is computed.
+    halvings = 14
     curve = here.curve
     low, high, ahead = 0.0, step, curve.along(here.cycle, tangent, step)
     valid = here.cycle
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         middle = 0.5 * (low + high)
         cycle = curve.along(here.cycle, tangent, middle)
         if cycle is None:
@@ -76,7 +74,9 @@ def _grazes(curve: Curve, ahead: ComputedCycle, step: float):
 
 def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: ComputedCycle, tangent, step: float):
     """A change beyond which there are more phases."""
-    for share in BEYOND:
+    # Distances beyond a change of modes at which the next modes are determined, as shares of the step.
+    beyond = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+    for share in beyond:
         cycle = curve.along(ahead, tangent, share * step)
         if cycle is None:
             continue

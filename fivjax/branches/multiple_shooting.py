@@ -37,8 +37,6 @@ AT_SECTION = 2
 LOOKS = 48
 # A contact bounces ever less high until it rests. Rebounds shorter than these shares of the period are none to speak of.
 SHORTEST_REBOUNDS = (1e-7, 3e-7)
-# The smallest number of phases that is compiled: few cycles have more.
-LEAST = 16
 
 
 class Mode(NamedTuple):
@@ -170,10 +168,12 @@ def _typed(modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _filled(own, by_kernel: bool):
     """The arrays of all phases; for XLA, which compiles each number of them, filled up to one of few numbers."""
+    # The smallest number of phases that is compiled: few cycles have more.
+    least = 16
     if by_kernel:
         return own
     count = len(jax.tree.leaves(own)[0])
-    fill = np.minimum(np.arange(power_of_4(max(count, LEAST))), count - 1)
+    fill = np.minimum(np.arange(power_of_4(max(count, least))), count - 1)
     return jax.tree.map(lambda leaf: leaf[fill], own)
 
 

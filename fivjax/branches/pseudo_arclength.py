@@ -15,12 +15,6 @@ from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from .multiple_shooting import Mode, PhaseImages, Phases, images, moved_along
 
-MOST_ITERATIONS = 10
-# Newton's method has converged if its next correction would be this small, relative to the cycle's size.
-EXACT = 3e-12
-# If corrections no longer shrink, this is small enough: they are rounding errors.
-CLOSE = 1e-9
-
 
 class Family(NamedTuple):
     """Scenes that differ in one parameter."""
@@ -85,8 +79,13 @@ class Curve:
         self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
     ) -> ComputedCycle | None:
         """The cycle near a guess: in the plane through the guess with this normal, or without a normal the nearest one."""
+        # If corrections no longer shrink, this is small enough: they are rounding errors.
+        close = 1e-9
+        # Newton's method has converged if its next correction would be this small, relative to the cycle's size.
+        exact = 3e-12
+        most_iterations = 10
         target, last = u.copy(), np.inf
-        for iteration in range(MOST_ITERATIONS):
+        for iteration in range(most_iterations):
             residuals, rows, found, phases, parameter = self.system(u)
             if not (np.all(np.isfinite(residuals)) and np.all(np.isfinite(rows))):
                 return None
@@ -99,7 +98,7 @@ class Curve:
             except np.linalg.LinAlgError:
                 return None
             size = float(np.max(np.abs(step)))
-            if size < EXACT or (last < CLOSE and size > 0.5 * last):
+            if size < exact or (last < close and size > 0.5 * last):
                 return ComputedCycle(u, rows, found, phases, parameter, iteration)
             if size > 1.0 or (iteration > 4 and size > last):
                 return None

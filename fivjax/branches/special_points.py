@@ -17,14 +17,6 @@ CORNER = "non-smooth fold"
 MEETS_SLIDING = "amplitude meets the sliding equilibrium"
 # Points at which the return map has a derivative.
 SMOOTH = ("", FOLD, DOUBLING, TORUS, MEETS_SLIDING)
-# Multipliers this close to the real axis count as real.
-REAL = 1e-9
-# How far from the unit circle a multiplier may be found where it passes it.
-ON_CIRCLE = 1e-6
-# At a fold a multiplier is one, to rounding; at one that is not smooth it is so on neither side.
-NEAR_ONE = 1e-4
-# A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability limit.
-LEVEL = 1e-8
 
 
 class Special(NamedTuple):
@@ -53,6 +45,13 @@ class Change(NamedTuple):
 
 def between(curve: Curve, a: ComputedCycle, tangent: Float[np.ndarray, " m"], b: ComputedCycle) -> list[Special]:
     """Folds, period doublings and Neimark–Sacker bifurcations between two neighbouring cycles, in order."""
+    # A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability
+    # limit.
+    level = 1e-8
+    # At a fold a multiplier is one, to rounding; at one that is not smooth it is so on neither side.
+    near_one = 1e-4
+    # How far from the unit circle a multiplier may be found where it passes it.
+    on_circle = 1e-6
     length = float(tangent @ (b.u - a.u))
     found: list[tuple[float, Special]] = []
 
@@ -60,14 +59,14 @@ def between(curve: Curve, a: ComputedCycle, tangent: Float[np.ndarray, " m"], b:
         return {0.0: a, length: b}.get(s) or curve.along(a, tangent, s)
 
     end = curve.tangent(b, tangent)
-    if tangent[-1] * end[-1] < 0 and max(abs(tangent[-1]), abs(end[-1])) > LEVEL:
+    if tangent[-1] * end[-1] < 0 and max(abs(tangent[-1]), abs(end[-1])) > level:
 
         def turning(at: ComputedCycle) -> float:
             return float(curve.tangent(at, tangent)[-1])
 
         s, at = root(cycle, turning, 0.0, length)
         if at is not None:
-            smooth = np.min(np.abs(multipliers_of(at.images) - 1)) <= NEAR_ONE
+            smooth = np.min(np.abs(multipliers_of(at.images) - 1)) <= near_one
             found.append((s, Special(FOLD, curve, at, turns=True) if smooth else Special(CORNER, curve, at)))
     before, after = multipliers_of(a.images), multipliers_of(b.images)
     for name, test in ((DOUBLING, doubling), (TORUS, pairing)):
@@ -77,7 +76,7 @@ def between(curve: Curve, a: ComputedCycle, tangent: Float[np.ndarray, " m"], b:
             if at is not None:
                 which = critical_multiplier(multipliers_of(at.images), name)
                 # Two real multipliers may have the product one, too.
-                if which is not None and abs(abs(which) - 1) <= ON_CIRCLE:
+                if which is not None and abs(abs(which) - 1) <= on_circle:
                     found.append((s, Special(name, curve, at, multiplier=which)))
     return [special for _, special in sorted(found, key=lambda pair: pair[0])]
 
@@ -100,9 +99,11 @@ def pairing(values: Complex[np.ndarray, " m"]) -> float:
 
 def critical_multiplier(values: Complex[np.ndarray, " m"], name: str) -> complex | None:
     """The multiplier that passes the unit circle: at -1, or as one of a pair."""
+    # Multipliers this close to the real axis count as real.
+    real = 1e-9
     if name == DOUBLING:
         return complex(values[np.argmin(np.abs(values + 1))])
-    upper = values[values.imag > REAL * np.abs(values)]
+    upper = values[values.imag > real * np.abs(values)]
     return complex(upper[np.argmin(np.abs(np.abs(upper) - 1))]) if len(upper) else None
 
 

@@ -14,8 +14,6 @@ from ..section.return_maps import ReturnMaps, Section
 from ..steppers.event_exact import EventExact
 from .multiple_shooting import AT_SECTION, LOOKS, Mode, Phases, inside, phases_around
 
-# The most crossings of the section in one period.
-MOST_CROSSINGS = 24
 # A motion on the cycle returns to its start within this share of its size.
 BACK = 1e-6
 
@@ -74,8 +72,10 @@ def _point(mode: Mode, y: Float[np.ndarray, " state"]) -> Point:
 
 def crossings_of(maps: ReturnMaps, point: Point) -> int | None:
     """How often a cycle crosses the section until it returns to the given point; None if it does not return."""
+    # The most crossings of the section in one period.
+    most_crossings = 24
     y = maps.weights * np.asarray(point.y)
-    _, path = maps.path(np.zeros(1, int), Section.of(point), MOST_CROSSINGS)
+    _, path = maps.path(np.zeros(1, int), Section.of(point), most_crossings)
     with np.errstate(invalid="ignore"):
         back = np.flatnonzero(np.linalg.norm(maps.weights * path[0] - y, axis=1) <= BACK * np.linalg.norm(y))
     return int(back[0]) + 1 if len(back) else None

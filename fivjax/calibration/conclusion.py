@@ -15,10 +15,6 @@ from .problem import Problem
 from .result import FITTED, Calibration, FitOutcome
 from .search import LEAST_KEPT, FitSearch
 
-# There is a signal if a fit explains more than this energy per fitted number, in units of the noise variance.
-SIGNIFICANT = 25.0
-# A model does not fit if it leaves more than this share of the signal's energy.
-MOST_LEFT = 0.1
 # A cycle whose disturbances grow by more than this factor in a period is unstable.
 UNSTABLE = 1.001
 
@@ -104,13 +100,15 @@ def _stated(recordings) -> bool:
 
 
 def _outcome(search: FitSearch, problem: Problem, left: ResidualTests, models) -> FitOutcome:
+    # A model does not fit if it leaves more than this share of the signal's energy.
+    most_left = 0.1
     if not _has_signal(search, problem, models):
         return FitOutcome.NO_SIGNAL
     if any(np.mean(np.asarray(m.kept)) < LEAST_KEPT for m in problem.misfits):
         return FitOutcome.TOO_SLOW
     if problem.cycles and not np.isfinite(search.best.at.cost):
         return FitOutcome.NO_CYCLE
-    if np.isfinite(search.best.at.cost) and not left.is_noise and _share_left(problem, models) > MOST_LEFT:
+    if np.isfinite(search.best.at.cost) and not left.is_noise and _share_left(problem, models) > most_left:
         return FitOutcome.DOES_NOT_FIT
     if not search.best.arrived:
         return FitOutcome.NOT_CONVERGED
@@ -131,11 +129,13 @@ def _left(search: FitSearch, problem: Problem, found: np.ndarray, models) -> Res
 
 def _has_signal(search: FitSearch, problem: Problem, models) -> bool:
     """Whether any recording has more than noise in it, or a fit explains more energy than fitting noise would."""
+    # There is a signal if a fit explains more than this energy per fitted number, in units of the noise variance.
+    significant = 25.0
     for mine, model in zip(problem.misfits, models, strict=True):
         measured, sigma = np.asarray(mine.means), np.asarray(mine.sigma)
         before = measured - measured.mean(axis=0) if isinstance(mine, CycleMisfit) else measured
         explained = np.sum((before / sigma) ** 2) - np.sum(((measured - model) / sigma) ** 2)
-        if explained > SIGNIFICANT * (len(search.best.x) + mine.projected):
+        if explained > significant * (len(search.best.x) + mine.projected):
             return True
         if exceeds_noise(measured, sigma):
             return True

@@ -12,13 +12,12 @@ from ..model.sliding import contact_coordinates
 from ..model.structure import Structure
 from .shooting import Cycle, first_tangential
 
-# A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
-CLOSED = 1e-7
-
 
 def is_closed(correction: float) -> bool:
     """Whether a correction of this relative size is the last one needed."""
-    return correction <= CLOSED
+    # A cycle is closed when its correction is this small, relative to its size: the next one would be rounding.
+    closed = 1e-7
+    return correction <= closed
 
 
 def predicted(tangential: int, moved: Float[Array, " j"], about) -> tuple[Cycle, ...]:

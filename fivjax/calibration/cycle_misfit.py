@@ -27,10 +27,6 @@ ROUGH_FREQUENCY, ROUGH_LINES, ROUGH_FRACTIONS = 1e-3, 0.05, 0.05
 BEATS = 0.01
 # Phases farther apart than this (turns) do not show a waveform.
 MOST_APART = 1 / 24
-# Samples this many times as far from an event as the next sample are left out, too: the event may move a little during a fit.
-BESIDE = 2.0
-# The most harmonics that a low-pass lets through.
-MOST_THROUGH = 64
 
 
 class CycleMisfit(AbstractMisfit):
@@ -149,7 +145,10 @@ class CycleMisfit(AbstractMisfit):
         return jnp.where(jnp.any(jnp.isnan(after.events.changes)), jnp.nan, values)
 
     def _touched(self, changes, landings, cycle: Cycle) -> Bool[Array, "B k"]:
-        reach = BESIDE * self.apart * cycle.period
+        # Samples this many times as far from an event as the next sample are left out, too: the event may move a little during
+        # a fit.
+        beside = 2.0
+        reach = beside * self.apart * cycle.period
         # The mean over neighbouring phases is not the waveform's value at their middle if it jumps or bends between them.
         accelerations, velocities = self.sampled.jumping(self.channels, slopes=True)
         near = [jnp.any(part < reach, axis=0)[:, None] for part in (changes, landings)]
@@ -174,6 +173,8 @@ def _referred(lines: Complex[Array, "h k"]) -> Complex[Array, "h k"]:
 
 def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene) -> CycleMisfit:
     """A recording of a limit cycle, folded into one period, ready to be compared."""
+    # The most harmonics that a low-pass lets through.
+    most_through = 64
     modes, interval = sliding_frequencies(scene.replace(**recording.known)), 1 / recording.rate
     # Around the sliding modes, because a guess with a spring wrong by 30 % has a frequency wrong by 16 %.
     fold = folded(recording.values, recording.rate, 0.6 * modes.min(), 1.6 * modes.max(), recording.noise)
@@ -181,8 +182,8 @@ def misfit_of_cycle(recording: Recording, method: AbstractStepper, scene: Scene)
     fractions = np.array([value or (0.0, np.inf) for value in (recording.sticking, recording.detached)])
     response = None
     if recording.filter is not None:
-        highest = bandwidth(recording.filter, MOST_THROUGH * fold.frequency)
-        count = int(np.clip(np.ceil(highest / fold.frequency), len(fold.lines), MOST_THROUGH))
+        highest = bandwidth(recording.filter, most_through * fold.frequency)
+        count = int(np.clip(np.ceil(highest / fold.frequency), len(fold.lines), most_through))
         response = jnp.asarray(recording.filter(fold.frequency * np.arange(1, count + 1)), complex)
     return CycleMisfit(
         means=jnp.asarray(fold.means),

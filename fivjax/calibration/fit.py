@@ -30,11 +30,6 @@ from .result import Calibration, FitOutcome
 from .search import FitSearch
 from .waveform_misfit import misfit_of_waveform, starts_unknown
 
-# The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
-SCREENED = 32
-# Blocks per period of the highest sliding mode of the scene that the fit starts from.
-BLOCKS_PER_PERIOD = 16
-
 
 @in_double_precision
 def calibrate(
@@ -84,6 +79,8 @@ def calibrate(
         >>> fit.outcome.name
         'CONVERGED'
     """
+    # The least number of starts for limit cycles: to find a scene that vibrates similarly to the measured one.
+    screened = 32
     arguments.instance("scene", scene, Scene, "a Scene")
     refuse_vector_contacts(scene.structure, "`calibrate`")
     recordings = (data,) if isinstance(data, Recording) else tuple(data) if isinstance(data, list | tuple) else data
@@ -123,7 +120,7 @@ def calibrate(
         return not_tried(problem, recordings, FitOutcome.BEATS)
     if cycles:
         frequencies = [float(cycle.frequency) for cycle in problem.cycles]
-        half = max(int(starts), SCREENED) // 2
+        half = max(int(starts), screened) // 2
         # A limit cycle needs two modes of similar frequency, but its own frequency may be somewhat lower.
         near = near_frequencies(parameters, scene, frequencies, half, float(spread), seed)
         around = latin_hypercube(parameters, scene, half, float(spread), seed)
@@ -140,9 +137,11 @@ def calibrate(
 
 def _blocks(scene: Scene, recording: Recording, k: int, rate: float | None, parameters: int) -> Averaged:
     """Recording k averaged over blocks; refused if there are too few."""
+    # Blocks per period of the highest sliding mode of the scene that the fit starts from.
+    blocks_per_period = 16
     if rate is None:
         fastest = float(sliding_frequencies(scene).max(initial=0.0))
-        rate = BLOCKS_PER_PERIOD * fastest if fastest > 0 else recording.rate
+        rate = blocks_per_period * fastest if fastest > 0 else recording.rate
     if round(recording.rate / rate) > len(recording.t):
         raise ValueError(
             f"Recording {k} is too short: not one block at {rate:g} per second. Raise `rate`, or record for longer."

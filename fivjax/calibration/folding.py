@@ -21,14 +21,6 @@ from .noise import from_third_differences, robust_deviation, rounding, taper
 # nearly the error of all samples: the mean square of their times is 15/16 of that of all.
 PHASES, TIMES = 2048, 4
 MOST_HARMONICS = 8
-# Neighbours in phase whose median is the waveform; more of them where there are many samples.
-NEIGHBOURS = 9
-# The residuals of harmonics alone find the frequency roughly, those of neighbours exactly.
-BY_HARMONICS, BY_NEIGHBOURS = 3, 3
-# The widest that neighbours may lie, in turns, whose differences tell a beat: over more, a waveform bends.
-WIDEST = 1 / 16
-# Scatters of the noise's power that sidebands exceed.
-ABOVE_SCATTER = 5.0
 
 
 class Folded(NamedTuple):
@@ -56,13 +48,15 @@ def folded(
 
     Unless the `noise` of samples is given by channel, it is estimated from neighbours in phase.
     """
+    # The residuals of harmonics alone find the frequency roughly, those of neighbours exactly.
+    by_harmonics, by_neighbours = 3, 3
     t = (np.arange(len(samples)) - 0.5 * (len(samples) - 1)) / rate
     size = samples.std(axis=0)
     scaled = (samples - samples.mean(axis=0)) / np.where(size > 0, size, 1.0)
     frequency = _strongest(scaled, 1 / rate, lowest, highest)
     count = max(1, min(MOST_HARMONICS, len(samples) // 8))
-    for k in range(BY_HARMONICS + BY_NEIGHBOURS):
-        frequency += _correction(scaled, t, frequency, count, by_neighbours=k >= BY_HARMONICS)
+    for k in range(by_harmonics + by_neighbours):
+        frequency += _correction(scaled, t, frequency, count, by_neighbours=k >= by_harmonics)
         frequency = float(np.clip(frequency, lowest, highest))
     phases = np.mod(frequency * t, 1.0)
     order = np.argsort(phases, kind="stable")
@@ -131,7 +125,9 @@ def _from_neighbours(samples, phases):
 
 
 def _neighbours(samples) -> int:
-    return min(NEIGHBOURS + 2 * (len(samples) // 2000), 2 * ((len(samples) - 1) // 4) + 1)
+    # Neighbours in phase whose median is the waveform; more of them where there are many samples.
+    neighbours = 9
+    return min(neighbours + 2 * (len(samples) // 2000), 2 * ((len(samples) - 1) // 4) + 1)
 
 
 def _between_neighbours(ordered):
@@ -142,7 +138,11 @@ def _between_neighbours(ordered):
 def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
     """How much a vibration beats: what neighbours in phase differ by, below one and a half times its frequency and above its
     noise, relative to its fundamental. Few samples do not tell."""
-    if _neighbours(scaled) > WIDEST * len(scaled):
+    # Scatters of the noise's power that sidebands exceed.
+    above_scatter = 5.0
+    # The widest that neighbours may lie, in turns, whose differences tell a beat: over more, a waveform bends.
+    widest = 1 / 16
+    if _neighbours(scaled) > widest * len(scaled):
         return 0.0
     left = _from_neighbours(scaled, np.mod(frequency * t, 1.0))
     spread = np.maximum(robust_deviation(left), 1e-12)
@@ -151,7 +151,7 @@ def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
     low = np.fft.rfftfreq(len(left), 1 / rate) < 1.5 * frequency
     bins = np.sum(low) * left.shape[1]
     # The taper makes neighbouring lines alike: half of them count.
-    noise = bins * (1 + ABOVE_SCATTER * np.sqrt(2.0 / bins))
+    noise = bins * (1 + above_scatter * np.sqrt(2.0 / bins))
     between = max(np.sum(spectrum[low]) - noise, 0.0) * 2 / len(left)
     waves = _waves(np.mod(frequency * t, 1.0), count)
     shares = np.linalg.lstsq(waves, scaled / spread, rcond=None)[0]

@@ -20,9 +20,6 @@ LAGS = 16
 IMPROBABLE = 1e-6
 # What is left of a recording without noise is rounding, which is alike from block to block.
 ROUNDING = 1e-6
-# Where the noise is estimated from the recording, so little of its power may be the estimate's own: a waveform without noise
-# bends from sample to sample.
-OF_ESTIMATE = 1e-2
 
 
 class ResidualTests(NamedTuple):
@@ -52,10 +49,13 @@ def residual_tests(
     """The tests, from the sum of squared residuals and its degrees of freedom, and from the residual waveforms of recordings,
     one for each channel; `stated`: whether the noise was given.
     """
+    # Where the noise is estimated from the recording, so little of its power may be the estimate's own: a waveform without
+    # noise bends from sample to sample.
+    of_estimate = 1e-2
     misfit = squares / freedom
     # The relative error of a variance is twice that of a standard deviation.
     scatter = np.hypot(np.sqrt(2.0 / freedom), 0.0 if stated else 2 * ESTIMATE_ERROR)
-    least = ROUNDING if stated else OF_ESTIMATE
+    least = ROUNDING if stated else of_estimate
     found = [_likeness(column) for left in waveforms for column in left if len(column) > 3 and misfit > least]
     correlation, correlated = max(found, key=lambda one: (one[1], abs(one[0])), default=(0.0, False))
     return ResidualTests(

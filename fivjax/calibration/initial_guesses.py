@@ -10,11 +10,6 @@ from ..linear.linearisation import linear_sliding
 from ..model.scene import Scene
 from .parameters import FreeParameters
 
-# Number of scenes whose sliding modes are computed, for each one that is followed to its limit cycle.
-TRIED_PER_GUESS = 128
-# Two sliding modes are sought this close to the measured frequency (relative), because limit cycles arise from mode coupling.
-CLOSE = 0.03
-
 
 def latin_hypercube(
     parameters: FreeParameters, scene: Scene, count: int, spread: float, seed: int
@@ -35,11 +30,16 @@ def near_frequencies(
     A guess that is too low by the share `spread` has to be multiplied by `1/(1 - spread)`, so guesses are drawn up to that
     factor. If fewer than `count` have two modes close to the frequency, those that come closest are taken.
     """
+    # Two sliding modes are sought this close to the measured frequency (relative), because limit cycles arise from mode
+    # coupling.
+    close = 0.03
+    # Number of scenes whose sliding modes are computed, for each one that is followed to its limit cycle.
+    tried_per_guess = 128
     from scipy.stats import qmc
 
     own = _own_values(parameters, scene)
     widest = -np.log1p(-spread)
-    shares = qmc.LatinHypercube(len(own), rng=seed).random(TRIED_PER_GUESS * count)
+    shares = qmc.LatinHypercube(len(own), rng=seed).random(tried_per_guess * count)
     tried = _unbounded(parameters, own * np.exp(widest * (2 * shares - 1)))
     matrices = np.asarray(state_matrices(parameters, scene, jnp.asarray(tried)))
     modes = np.abs(np.linalg.eigvals(matrices).imag) / (2 * np.pi)
@@ -48,7 +48,7 @@ def near_frequencies(
         # Both eigenvalues of a pair count, so the second nearest mode has index 2.
         away = np.sort(np.abs(modes - frequency), axis=1)[:, min(2, modes.shape[1] - 1)]
         apart = np.maximum(apart, away / frequency)
-    order = np.argsort(np.maximum(apart, CLOSE), kind="stable")[: count - 1]
+    order = np.argsort(np.maximum(apart, close), kind="stable")[: count - 1]
     return np.concatenate([parameters.unbounded(own)[None], tried[order]])
 
 

@@ -12,10 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Singular values, in units of the noise per unit of the unknowns, below which a combination is not identifiable.
-TOLD = 1.0
-# The longest step in any one unknown (a factor of e for most parameters); longer ones are refused without evaluation.
-LONGEST_STEP = 1.0
 # A fit may end this many times farther from the minimum than `tolerance`, because SciPy's own criterion is the gain.
 SLACK = 10.0
 
@@ -58,6 +54,8 @@ def minimise(
     `evaluate` takes a point, and the `about` of the best point before it (at first the argument `about`). Unknowns should be of
     order one. Steps to points that are not `allowed` are refused, as those that are too long: a shorter one is tried.
     """
+    # The longest step in any one unknown (a factor of e for most parameters); longer ones are refused without evaluation.
+    longest_step = 1.0
     from scipy.optimize import least_squares
 
     x0 = np.asarray(x0, float)
@@ -68,7 +66,7 @@ def minimise(
 
     def residual(moved):
         nonlocal tried, last
-        if np.any(np.abs(moved - stayed) > LONGEST_STEP) or not allowed(x0 + moved):
+        if np.any(np.abs(moved - stayed) > longest_step) or not allowed(x0 + moved):
             return np.full_like(best.residual, np.inf)
         if not np.array_equal(moved, last):
             tried, last = evaluate(x0 + moved, best.about), np.array(moved)
@@ -110,5 +108,7 @@ def minimise(
 
 def _left(at: Evaluated) -> float:
     """The component of the residuals along identifiable combinations."""
+    # Singular values, in units of the noise per unit of the unknowns, below which a combination is not identifiable.
+    told = 1.0
     left, singular, _ = np.linalg.svd(at.jacobian, full_matrices=False)
-    return float(np.linalg.norm((left.T @ at.residual)[singular > TOLD]))
+    return float(np.linalg.norm((left.T @ at.residual)[singular > told]))

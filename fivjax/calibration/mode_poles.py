@@ -10,11 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-# The most rows of the Hankel matrix: enough to separate two modes that beat within the recording, few enough to be fast.
-MOST_ROWS = 240
-# A pole has more than this energy, in units of what noise adds to a fit of one more pole.
-ABOVE_NOISE = 25.0
-
 
 class Poles(NamedTuple):
     """Poles with positive frequency, the strongest first."""
@@ -31,11 +26,15 @@ def strongest_poles(
 
     Modes of parts that are not measured do not show. If the noise `sigma` is given, poles within it are left out.
     """
+    # A pole has more than this energy, in units of what noise adds to a fit of one more pole.
+    above_noise = 25.0
+    # The most rows of the Hankel matrix: enough to separate two modes that beat within the recording, few enough to be fast.
+    most_rows = 240
     size = np.sqrt(np.mean(means**2, axis=0))
     if not np.all(size > 0):
         return Poles(np.zeros(0, complex), np.zeros((0, means.shape[1]), complex), 0.0)
     signals = means / size
-    length = min(len(signals) // 2, MOST_ROWS)
+    length = min(len(signals) // 2, most_rows)
     windows = np.lib.stride_tricks.sliding_window_view(signals, length, axis=0)  # (B - length + 1, k, length)
     hankel = windows.transpose(1, 2, 0).reshape(signals.shape[1] * length, -1)
     # Only the left subspace is needed, so the smaller Gram matrix is enough; the precision lost by squaring is far below noise.
@@ -58,6 +57,6 @@ def strongest_poles(
     order = np.argsort(-energy)
     if sigma is not None:
         # A pole has two real numbers, and two more for each channel. Its conjugate carries as much energy.
-        least = ABOVE_NOISE * (2 + 2 * len(size)) * float(np.mean((sigma / size) ** 2))
+        least = above_noise * (2 + 2 * len(size)) * float(np.mean((sigma / size) ** 2))
         order = order[2 * energy[order] ** 2 > least]
     return Poles(upper[order], (shares[: len(upper)] * size)[order], 1.0 - float(np.mean(left**2)))

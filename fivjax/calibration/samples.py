@@ -16,11 +16,6 @@ from jaxtyping import Array, Complex, Float, Int
 from ..io.low_pass import bandwidth, memory
 from ..io.recordings import Averaged, Channel, Recording
 
-# Fine steps per period of the highest frequency that a filter lets through.
-FINE = 16
-# The most fine steps for one sample.
-FINEST = 64
-
 
 class LowPassGrid(NamedTuple):
     """A low-pass on a grid of fine steps, from before the first block to after the last, so that it may ring."""
@@ -86,11 +81,15 @@ def sampled(recording: Recording, blocks: Averaged) -> Sampled:
 
 
 def _through(recording: Recording, blocks: Averaged) -> LowPassGrid:
+    # The most fine steps for one sample.
+    finest = 64
+    # Fine steps per period of the highest frequency that a filter lets through.
+    fine = 16
     response, interval = recording.filter, 1 / recording.rate
     assert response is not None
-    passed = bandwidth(response, FINEST * recording.rate / FINE)
+    passed = bandwidth(response, finest * recording.rate / fine)
     # An odd number, so that the samples' instants are middles of fine steps.
-    finer = 2 * int(np.clip(np.ceil(FINE * passed * interval), 1, FINEST) // 2) + 1
+    finer = 2 * int(np.clip(np.ceil(fine * passed * interval), 1, finest) // 2) + 1
     step = interval / finer
     ringing = int(np.ceil(memory(response, step) / step))
     samples = len(blocks.means) * blocks.per_block

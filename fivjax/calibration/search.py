@@ -28,8 +28,6 @@ from .waveform_misfit import KickMisfit
 
 # Number of guesses that go on from the coarse residuals to the waveform, beside the scene's own parameters.
 KEPT = 4
-# The most guesses of a limit cycle that are fitted, until one explains the recording; and steps to bring one to the frequency.
-MOST_IN_TURN, FREQUENCY_STEPS = 16, 2
 # Guesses this close in every parameter (relative) count as the same.
 ALIKE, ALIKE_CYCLES = 0.01, 0.05
 # A guess that no scene takes is moved half the way to the scene's own parameters, so many times at most.
@@ -41,8 +39,6 @@ EARLY_TOLERANCE, FINAL_TOLERANCE = 0.1, 1e-2
 MOST_EVALUATIONS = 60
 # The least share of a recording that a fit compares: where more is next to jumps, the rate is too low for the contact's events.
 LEAST_KEPT = 0.5
-# A candidate is given up after a window if its sum of squares, relative to the best, is larger than this.
-HOPELESSLY_WORSE = 25.0
 
 
 class Candidate(NamedTuple):
@@ -94,10 +90,13 @@ class FitSearch:
 
         A scene far from the answer may have no limit cycle, and no derivative leads to one.
         """
+        # The most guesses of a limit cycle that are fitted, until one explains the recording; and steps to bring one to the
+        # frequency.
+        most_in_turn, frequency_steps = 16, 2
         found: list[tuple[float, Candidate]] = []
         for guess in map(self.problem.first, self.guesses):
             x, about = guess, None
-            for _ in range(1 + FREQUENCY_STEPS):
+            for _ in range(1 + frequency_steps):
                 if not self.problem.is_scene(x):
                     break
                 at = self.problem.compared(x, guess, WINDOWS[0], about)
@@ -109,7 +108,7 @@ class FitSearch:
                 step = -np.linalg.lstsq(at.jacobian[rows], at.residual[rows], rcond=1e-2)[0]
                 x, about = x + np.clip(step, -0.5, 0.5), at.about
         found.sort(key=lambda one: one[0])
-        kept = _distinct([one.x for _, one in found], ALIKE_CYCLES)[:MOST_IN_TURN]
+        kept = _distinct([one.x for _, one in found], ALIKE_CYCLES)[:most_in_turn]
         # If no guess has a limit cycle, the fit ends with the scene's own parameters and an outcome that says so.
         return [one for _, one in found if any(one.x is x for x in kept)] or [
             Candidate(self.problem.first(self.guesses[0]), None)
@@ -164,11 +163,13 @@ class FitSearch:
 
     def _fitted(self, candidates: list[Candidate], share: float) -> list[Candidate]:
         """Fits from all candidates, the best first; `best` is that of the last call."""
+        # A candidate is given up after a window if its sum of squares, relative to the best, is larger than this.
+        hopelessly_worse = 25.0
         tolerance = EARLY_TOLERANCE if share < WINDOWS[-1] else FINAL_TOLERANCE
         found = [self.fit_from(one, share, tolerance) for one in candidates]
         found.sort(key=self.cost)
         self.best = found[0]
-        good = [one for one in found if self.cost(one) <= HOPELESSLY_WORSE * self.cost(self.best)]
+        good = [one for one in found if self.cost(one) <= hopelessly_worse * self.cost(self.best)]
         kept = _distinct([one.x for one in good])
         return [Candidate(one.x, one.at.about) for one in good if any(one.x is x for x in kept)]
 

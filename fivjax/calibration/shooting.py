@@ -37,16 +37,10 @@ from ..steppers.event_exact import for_derivatives
 from ..steppers.kernel_scope import has_kernel
 from .inside import advance_with_channels, jumps, terms_of
 
-# A motion is followed for so many periods before it counts as nearly periodic.
-SETTLING_PERIODS = 80
 # Then its state is sampled so often per expected period, to see where it returns to itself.
 LOOKS = 48
 # The shortest and the longest period tried, relative to the expected one.
 SHORTEST, LONGEST = 0.6, 1.7
-# A motion returns to itself if it comes as close as this, relative to its size.
-CLOSED = 0.02
-# The most contact events in a period beside which samples can be told.
-MOST_EVENTS = 64
 
 
 class Cycle(NamedTuple):
@@ -114,8 +108,12 @@ def guess_limit_cycle(scene: Scene, method: AbstractStepper, frequency: Float[Ar
 
     Its state where the tangential velocity rises through zero, and the time after which it is closest to that state again.
     """
+    # A motion returns to itself if it comes as close as this, relative to its size.
+    closed = 0.02
+    # A motion is followed for so many periods before it counts as nearly periodic.
+    settling_periods = 80
     n, tangential, longest = scene.structure.size, first_tangential(scene.structure), int(LONGEST * LOOKS) + 1
-    instants = (SETTLING_PERIODS + jnp.arange(2 * longest + 2) / LOOKS) / frequency
+    instants = (settling_periods + jnp.arange(2 * longest + 2) / LOOKS) / frequency
     q, _ = steady_sliding(scene, scene.load.final)
     normal = jnp.asarray(np.isin(np.arange(n), contact_coordinates(scene.structure)[1]))
     along = jnp.arange(n) == tangential
@@ -141,7 +139,7 @@ def guess_limit_cycle(scene: Scene, method: AbstractStepper, frequency: Float[Ar
         # A motion that has died out is no cycle.
         moves = jnp.any(rises) & (jnp.max(jnp.abs(speed)) > 1e-3 * jnp.max(jnp.abs(scene.belt_speed)))
         period = jnp.where(moves, (back + share[back] - begin) / (LOOKS * frequency), jnp.nan)
-        returns = distance[back] < CLOSED * jnp.max(jnp.where(tried, distance, 0.0))
+        returns = distance[back] < closed * jnp.max(jnp.where(tried, distance, 0.0))
         off = jnp.abs(period * frequency - 1.0) + jnp.where(returns, 0.0, LONGEST)
         return jnp.where(moves, off, jnp.inf), Cycle(y, jax.tree.map(lambda leaf: leaf[begin], contacts), period)
 
@@ -176,6 +174,8 @@ def around(scene: Scene, method: AbstractStepper, cycle: Cycle, count: int) -> O
 
 def _once_around(args, _):
     """An `OnePeriod` without its lines and impulses, and the integrals that these are made of."""
+    # The most contact events in a period beside which samples can be told.
+    most_events = 64
     scene, cycle, how = args
     mechanics, load = Mechanics(scene), scene.load.final
     method, count, codes = how.method, how.count, jnp.array([Status.STICK, Status.DETACH])
@@ -192,17 +192,17 @@ def _once_around(args, _):
         turns = 2 * jnp.pi * jnp.arange(1, count + 1) * (end / cycle.period)
         impulses = impulses + jnp.stack([jnp.cos(turns), jnp.sin(turns)], axis=1)[..., None] * jump
         changed, landed = jumps(segment.contact, segment.after.contact)
-        end, here = jax.lax.stop_gradient(end), (jnp.arange(MOST_EVENTS) == seen) & changed
+        end, here = jax.lax.stop_gradient(end), (jnp.arange(most_events) == seen) & changed
         changes, landings = jnp.where(here, end, changes), jnp.where(here & landed, end, landings)
         lines = lines + _integrals(within, segment.t, cycle.period, count)
         return lines, impulses, spent, seen + changed, changes, landings
 
-    zeros, none = jnp.zeros((count, 2, scene.structure.size)), jnp.full(MOST_EVENTS, jnp.inf)
+    zeros, none = jnp.zeros((count, 2, scene.structure.size)), jnp.full(most_events, jnp.inf)
     total = (zeros, zeros, jnp.zeros(2), jnp.zeros((), jnp.int32), none, none)
     after = follow(method, mechanics, cycle.contact, load, cycle.y, cycle.period, total=total, observe=add, kind="lax")
     *sums, spent, seen, changes, landings = after.total
     # With more events than can be noted, nothing is known of them.
-    noted = Events(jnp.where(seen <= MOST_EVENTS, changes, jnp.nan), landings)
+    noted = Events(jnp.where(seen <= most_events, changes, jnp.nan), landings)
     y = jnp.where(after.enough, after.y, jnp.nan)
     return (OnePeriod(y, after.contact, None, None, spent / cycle.period, noted), *sums), ()
 

@@ -24,11 +24,6 @@ from .noise import noise_of_means
 from .responses import Response, response_of
 from .samples import Sampled, sampled
 
-# The least share of the signal's energy that poles must explain to count as those of a small motion.
-LEAST_EXPLAINED = 0.7
-# The share of a recording from whose beginning an unknown start is guessed.
-BEGINNING = 0.15
-
 
 class AbstractWaveformMisfit(AbstractMisfit):
     """A recording that is compared block by block; far from the answer, by the poles and shapes of its small motion."""
@@ -158,17 +153,21 @@ def _closest_start(scene: Scene, mine: KickMisfit) -> Float[np.ndarray, " u"]:
 @compiled
 def _weighted_waves(scene: Scene, mine: KickMisfit):
     """The beginning of the recording, the free motions that may explain it as columns, and the equilibrium."""
+    # The share of a recording from whose beginning an unknown start is guessed.
+    beginning = 0.15
     linear = linear_sliding(scene)
     waves = free_waves(scene, linear.frictionless, mine.sampled, mine.channels)
     # Friction at a standstill shifts the position about which it vibrates.
     waves = jnp.concatenate([waves, zeros_of_displacements(mine.channels, len(mine.means))], axis=2)
-    weight = window(mine.edges, jnp.asarray(BEGINNING))[:, None] / mine.sigma
+    weight = window(mine.edges, jnp.asarray(beginning))[:, None] / mine.sigma
     columns = (weight[..., None] * waves).reshape(-1, waves.shape[-1])
     return columns, (weight * mine.means).ravel(), linear.equilibrium[jnp.array(mine.free)]
 
 
 def misfit_of_waveform(recording: Recording, blocks: Averaged, method: AbstractStepper, scene: Scene) -> AbstractMisfit:
     """A recording of a small motion or of a kick, averaged over blocks, ready to be compared."""
+    # The least share of the signal's energy that poles must explain to count as those of a small motion.
+    least_explained = 0.7
     known = {name: jnp.asarray(value) for name, value in recording.known.items()}
     sigma = noise_of_means(recording, blocks)
     width = blocks.edges[1] - blocks.edges[0]
@@ -181,7 +180,7 @@ def misfit_of_waveform(recording: Recording, blocks: Averaged, method: AbstractS
     # Padded to the largest number of poles, so that all recordings of this length share compiled programs.
     values = np.full(modes, np.nan, complex)
     shapes = np.full((len(values), len(recording.channels)), np.nan, complex)
-    if found.explained > LEAST_EXPLAINED:
+    if found.explained > least_explained:
         values[: len(found.values)], shapes[: len(found.values)] = found.values, found.shapes
     common: dict = {
         "edges": jnp.asarray(blocks.edges),

@@ -12,9 +12,6 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
     from ..steppers.base import AbstractStepper
 
-# The default friction coefficient, and the default decay factor of Eq. 1 (s/m).
-MU, DECAY = 0.227, 0.5
-
 
 @dataclasses.dataclass(frozen=True)
 class SceneOptions:
@@ -69,10 +66,12 @@ class SceneOptions:
         )
 
     def _friction(self):
+        # The default friction coefficient, and the default decay factor of Eq. 1 (s/m).
+        mu, decay = 0.227, 0.5
         of_falling = {"--mu-static": self.mu_static, "--mu-dynamic": self.mu_dynamic}
         given = [option for option, value in {**of_falling, "--decay": self.decay}.items() if value is not None]
         if not given:
-            return fj.Coulomb(MU if self.mu is None else self.mu)
+            return fj.Coulomb(mu if self.mu is None else self.mu)
         missing = [option for option, value in of_falling.items() if value is None]
         if missing:
             raise ValueError(
@@ -83,7 +82,7 @@ class SceneOptions:
             raise ValueError(
                 f"Option `--mu` is of constant friction and `{given[0]}` of friction that falls with speed; give one of them."
             )
-        return fj.ExponentialDecay(self.mu_static, self.mu_dynamic, DECAY if self.decay is None else self.decay)
+        return fj.ExponentialDecay(self.mu_static, self.mu_dynamic, decay if self.decay is None else self.decay)
 
 
 @dataclasses.dataclass(frozen=True)

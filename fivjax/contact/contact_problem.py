@@ -31,8 +31,6 @@ from .mode_forces import mode_matrix
 
 STICK, FORWARD, BACKWARD, OPEN = range(4)
 NONE = -1
-# Combinations are tried for up to this many contacts: of 256 few are allowed.
-MOST_ENUMERATED = 4
 # A condition counts as met if it is violated by no more than this share of the terms in it.
 TIE = {"float64": 1e-12, "float32": 1e-5}
 
@@ -105,8 +103,10 @@ def _judged(problem: ContactProblem, state: Int[Array, " c"]) -> Float[Array, " 
 
 def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
     """The admissible states of all contacts, or the states that come closest to it; `start` is a guess."""
+    # Combinations are tried for up to this many contacts: of 256 few are allowed.
+    most_enumerated = 4
     problem, start = jax.lax.stop_gradient((problem, start))
-    return (enumerated if len(start) <= MOST_ENUMERATED else pivoted)(problem, start)
+    return (enumerated if len(start) <= most_enumerated else pivoted)(problem, start)
 
 
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:

@@ -16,8 +16,6 @@ from .mode_forces import ModeForces, by_status
 # A guard starts at zero, up to rounding, if its first Taylor coefficient is no larger than this share of all of them together.
 # The other two shares are for the next two coefficients, which are differences that cancel less well where a status begins.
 SHARES = {"float64": (1e-12, 1e-9, 1e-9), "float32": (5e-6, 1e-4, 1e-4)}
-# Or if it is no larger than this many roundings of the terms that it is a sum of.
-ROUNDINGS = 64
 # Rebounds shorter than this share of the time in which the fastest vibration advances by about one rad count as rest. Not of an
 # advance: what follows from a rebound more or less is far above rounding, and would depend on where advances end.
 RESTING = {"float64": 1e-8, "float32": 1e-4}
@@ -25,7 +23,9 @@ RESTING = {"float64": 1e-8, "float32": 1e-4}
 
 def largest_rounding(sizes: Array) -> Array:
     """Bound on the rounding error of sums whose largest terms have these sizes (see `magnitudes`)."""
-    return ROUNDINGS * jnp.finfo(sizes.dtype).eps * sizes
+    # Or if it is no larger than this many roundings of the terms that it is a sum of.
+    roundings = 64
+    return roundings * jnp.finfo(sizes.dtype).eps * sizes
 
 
 def zero_at_start(

@@ -22,10 +22,6 @@ from .one_period import Phase, floquet_multipliers, follow_period, word
 MARGIN = 1e-9
 
 
-# So many phases of the word are printed.
-PRINTED_PHASES = 12
-
-
 class LimitCycle(eqx.Module):
     """A periodic motion, stable or not, or a torus, computed on the Poincaré section.
 
@@ -142,14 +138,16 @@ class LimitCycle(eqx.Module):
         return {**lines, "impact_loss": float(np.asarray(ledger.impact)[-1])}
 
     def __str__(self) -> str:
+        # So many phases of the word are printed.
+        printed_phases = 12
         stability = "stable" if self.stable else f"unstable in {self.unstable_directions} direction(s)"
         if self.in_family:
             stability = "one of a family: a second multiplier is 1"
         modes = " ".join(
-            f"{_named(phase.status)} {1e3 * phase.duration:.4g} ms" for phase in self.word[:PRINTED_PHASES]
+            f"{_named(phase.status)} {1e3 * phase.duration:.4g} ms" for phase in self.word[:printed_phases]
         )
-        if len(self.word) > PRINTED_PHASES:
-            modes += f" … and {len(self.word) - PRINTED_PHASES} more"
+        if len(self.word) > printed_phases:
+            modes += f" … and {len(self.word) - printed_phases} more"
         size = f"{self.frequency:.6g} Hz, peak tangential speed {self.amplitude:.6g} m/s"
         head = f"limit cycle ({self.kind}, {stability}): {size}"
         if self.kind == "torus":

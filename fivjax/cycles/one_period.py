@@ -27,8 +27,6 @@ from ..steppers.kernel_scope import has_kernel
 HARMONICS = 16
 # A number of crossings that is never reached.
 NEVER = np.int32(np.iinfo(np.int32).max)
-# Rows for the segments of a period at first; more where they are not enough.
-LEAST_SEGMENTS = 64
 
 
 class Phase(NamedTuple):
@@ -93,8 +91,10 @@ _period = KernelFunction(_around)
 
 def follow_period(scene: Scene, stepper: EventExact, point: Point, period: float) -> PeriodSummary:
     """Segments, peak tangential speed and harmonics of one period from a point on it."""
+    # Rows for the segments of a period at first; more where they are not enough.
+    least_segments = 64
     args = ByMethod(stepper), scene, jax.tree.map(known_to_numpy, point), float(period)
-    most = LEAST_SEGMENTS
+    most = least_segments
     while True:
         end, rows = _period(args, np.arange(float(most)), by_kernel=has_kernel(scene, stepper))
         if end.count < most or most > MOST_SEGMENTS or not np.all(np.isfinite(end.y)):

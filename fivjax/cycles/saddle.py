@@ -23,9 +23,6 @@ from .search import MOST_CROSSINGS, NoLimitCycle, limit_cycle
 POINTS = 96
 # A trajectory that is undecided after so many times `POINTS` points of the section counts as one that stays away from sliding.
 MOST_LOOKS = 60
-# How close to each other the neighbours on either side of the boundary begin, relative to the cycle's size; and how well the
-# path of both must repeat for Newton's method to begin there. Closer ones take longer to find, and follow the boundary longer.
-NARROW = ((1e-8, 1e-2), (1e-14, 1e-1))
 # States between two neighbours that are followed to find which are the next.
 FEW = 2
 # Neighbours have separated once they differ by this share of their size; then the search begins anew between them.
@@ -58,6 +55,10 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
         >>> saddle.unstable_directions
         1
     """
+    # How close to each other the neighbours on either side of the boundary begin, relative to the cycle's size; and how well
+    # the path of both must repeat for Newton's method to begin there. Closer ones take longer to find, and follow the boundary
+    # longer.
+    narrow = ((1e-8, 1e-2), (1e-14, 1e-1))
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("cycle", cycle, LimitCycle | None, "a limit cycle, such as `fivjax.limit_cycle(scene)`, or None")
@@ -70,7 +71,7 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
     for number in range(ROUNDS):
         stage(f"tracking the edge, round {number + 1}")
         paths = None
-        for share, repeated in NARROW:
+        for share, repeated in narrow:
             low, high = fates.narrowed(low, high, share)
             paths = fates.together(low, high)
             found = fates.saddle_near(paths, repeated)

@@ -34,8 +34,6 @@ from .torus import limit_cycle_of_torus
 # moved by these multiples of the belt's: at 1 the contacts stick. The further ones only where the first meet nothing.
 LOADS, SPEEDS = (0.0, 1.2, 1.5, 2.0, 3.0, 4.5, 6.0), (1.0,)
 FURTHER_LOADS, FURTHER_SPEEDS = (0.5, 10.0, 20.0), (-4.0, -2.0, -1.0, 2.0, 4.0)
-# Strengths of pulses, in final loads, from whose ends motions are followed if all cycles are asked for.
-KICKS = (0.0, 0.9, 1.2, 1.6, 2.2, 3.0, 4.5, 6.0)
 # Where these meet nothing either: shares of the belt speed at which a cycle is sought that is then followed to the whole of
 # it, in so many steps.
 SLOWER, STEPS = (0.7, 0.4), 6
@@ -137,11 +135,13 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
 
 def _kicked(scene: Scene) -> list[Trajectory]:
     """The scene's motion under its load, up to the end of the pulse; of several strengths."""
+    # Strengths of pulses, in final loads, from whose ends motions are followed if all cycles are asked for.
+    kicks = (0.0, 0.9, 1.2, 1.6, 2.2, 3.0, 4.5, 6.0)
     if not isinstance(scene.load, Pulse) or float(scene.load.duration) <= 0:
         return []
     # Steps end there: a row at a jump of the load is the state that the kick has left behind.
     end = float(scene.load.start + scene.load.duration)
-    return [simulate(scene.replace(p=float(p)), end, end, derivatives="none") for p in KICKS]
+    return [simulate(scene.replace(p=float(p)), end, end, derivatives="none") for p in kicks]
 
 
 class Met(NamedTuple):

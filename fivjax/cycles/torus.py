@@ -26,10 +26,6 @@ from .one_period import follow_period, word
 
 # Points of the curve; and returns in a window of which harmonics and the word are given.
 POINTS, WINDOW = 2304, 96
-# Returns over which Lyapunov exponents are computed; the first of them align the basis of deviations, and are left out.
-EXPONENT_RETURNS, ALIGNING = 384, 64
-# Neighbours on the curve are closer than this share of its size, except at jumps; and the largest number of jumps.
-JUMP, MOST_JUMPS = 0.05, 12
 
 
 def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitCycle:
@@ -70,13 +66,15 @@ def _curve(
     """The points of one trajectory in the order of their phases on a closed curve, the turns per return, and the median
     distance of a point from the curve through the others, relative to the curve's size. None, and NaN, if they lie on no curve.
     """
+    # Neighbours on the curve are closer than this share of its size, except at jumps; and the largest number of jumps.
+    jump, most_jumps = 0.05, 12
     weighted = weights * returns
     size = np.mean(np.linalg.norm(weighted, axis=-1))
     rotation = _rotation(weighted)
     order = np.argsort(np.mod(rotation * np.arange(len(returns)), 1.0), kind="stable")
     path = weighted[order]
     steps = np.linalg.norm(np.diff(np.concatenate([path, path[:1]]), axis=0), axis=-1) / size
-    if np.sum(steps > JUMP) > MOST_JUMPS:
+    if np.sum(steps > jump) > most_jumps:
         return returns, None, float("nan")
     return returns[order], rotation, float(np.median(off_the_curve(path)) / size)
 
@@ -124,12 +122,14 @@ def _rotation(weighted: Float[np.ndarray, "k state"]) -> float:
 
 def _lyapunov_exponents(maps: ReturnMaps, start: Section) -> Float[np.ndarray, " m"]:
     """Exponents of the return map along a trajectory, largest first, per return."""
+    # Returns over which Lyapunov exponents are computed; the first of them align the basis of deviations, and are left out.
+    exponent_returns, aligning = 384, 64
     weights, basis, logs, at = maps.weights, np.eye(len(maps.weights)), [], [start]
-    for _ in range(EXPONENT_RETURNS - 1):
+    for _ in range(exponent_returns - 1):
         at.append(maps.returns(np.zeros(1, int), at[-1], 1).at)
     along = Section(*(np.concatenate(parts) for parts in zip(*at, strict=True)))
-    _, _, derived = maps.derived(np.zeros(EXPONENT_RETURNS, int), along, 1)
+    _, _, derived = maps.derived(np.zeros(exponent_returns, int), along, 1)
     for jacobian in derived:
         basis, upper = np.linalg.qr((weights[:, None] * jacobian / weights) @ basis)
         logs.append(np.log(np.maximum(np.abs(np.diag(upper)), 1e-300)))
-    return np.sort(np.mean(logs[ALIGNING:], axis=0))[::-1][:4]
+    return np.sort(np.mean(logs[aligning:], axis=0))[::-1][:4]

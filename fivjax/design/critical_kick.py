@@ -30,8 +30,6 @@ MET, SETTLED = 1e-6, 1e-3
 # A step is taken if it gains this share of its prediction, or ends this near to the target (as a share of the rise); the most
 # halvings of a step.
 KEPT, NEAR, HALVINGS = 0.2, 0.02, 5
-# A step predicted to gain less than this share of what is missing is not tried.
-PROMISING = 1e-2
 # Width of the brackets with which Newton's method begins.
 BRACKET = 1e-4
 
@@ -123,6 +121,8 @@ def raise_critical_perturbation(
         >>> raised.reached  # doctest: +SLOW
         True
     """
+    # A step predicted to gain less than this share of what is missing is not tried.
+    promising = 1e-2
     names, start, low, high = _checked(scene, by, free, bounds)
     arguments.whole_number("steps", steps, minimum=2)
     size = np.abs(start)
@@ -160,7 +160,7 @@ def raise_critical_perturbation(
         if met and (beside_kink or length <= SETTLED * np.linalg.norm(here.r)):
             break
         promised, missing = here.slopes @ ahead, abs(aim - here.p)
-        if length <= 1e-9 or (not met and abs(promised) < PROMISING * missing):
+        if length <= 1e-9 or (not met and abs(promised) < promising * missing):
             break
         following, share = None, 1.0
         for _ in range(HALVINGS):

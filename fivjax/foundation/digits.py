@@ -2,14 +2,14 @@
 
 # What `:g` prints.
 ORDINARY = 6
-# With these, different numbers in double precision look different.
-MOST = 17
 
 
 def apart(*values: float, digits: int = ORDINARY) -> tuple[str, ...]:
     """The numbers as text, those that differ looking different: "1.70809" and "1.7080901", not "1.70809" twice."""
+    # With these, different numbers in double precision look different.
+    most = 17
     numbers = [float(value) for value in values]
-    for count in range(digits, MOST + 1):
+    for count in range(digits, most + 1):
         texts = tuple(f"{number:.{count}g}" for number in numbers)
         if len(set(texts)) >= len({number for number in numbers if number == number}):
             break

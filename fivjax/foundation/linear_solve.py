@@ -14,13 +14,13 @@ from jaxtyping import Array, Inexact
 
 # Larger systems are eliminated in a loop: written out, they would take longer to compile than to solve.
 LARGEST = 4
-# Products with vectors up to this length are written as sums over columns.
-LARGEST_BY_COLUMNS = 12
 
 
 def product(matrix: Inexact[Array, "m n"], vector: Inexact[Array, " n"]) -> Inexact[Array, " m"]:
     """A matrix times a vector. Small ones as a sum over columns: in a batch this becomes one fused loop over trajectories."""
-    if len(vector) > LARGEST_BY_COLUMNS:
+    # Products with vectors up to this length are written as sums over columns.
+    largest_by_columns = 12
+    if len(vector) > largest_by_columns:
         return matrix @ vector
     total = matrix[:, 0] * vector[0]
     for j in range(1, len(vector)):

@@ -19,8 +19,6 @@ except ImportError:  # Windows, where a file that is open cannot be removed
     fcntl = None
 
 PREFIX, SUFFIX = ".fivjax.", ".part"
-# Where a file system has no locks, what has not changed for so long was left (s).
-LONG_AGO = 86400.0
 
 
 def write_whole(path: Path, content: bytes, like: os.stat_result | None = None, private: bool = False) -> None:
@@ -123,6 +121,8 @@ def _still_there(handle: int, path: Path) -> bool:
 
 
 def _remove_if_left(path: Path) -> None:
+    # Where a file system has no locks, what has not changed for so long was left (s).
+    long_ago = 86400.0
     if fcntl is None:
         path.unlink()
         return
@@ -138,7 +138,7 @@ def _remove_if_left(path: Path) -> None:
         except BlockingIOError:
             return
         except OSError:
-            if time.time() - there.st_mtime < LONG_AGO:
+            if time.time() - there.st_mtime < long_ago:
                 return
         if of_folder:
             shutil.rmtree(path)

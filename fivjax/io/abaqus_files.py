@@ -18,10 +18,6 @@ from scipy import sparse
 from ..foundation.digits import apart
 from .file_matrix import FileMatrix, Label, from_entries, text_of
 
-# The two entries of a symmetric pair may differ by what a file rounds, and by what is lost in sums of much larger entries, as a
-# share of what the diagonal has.
-PRINTED, NOISE = 1e-6, 1e-9
-
 
 def matrices(path: Path) -> dict[str, FileMatrix]:
     """The matrices of an Abaqus `.mtx` file by name: one, by the file's, or `STIFFNESS` and `MASS` of a substructure."""
@@ -89,6 +85,9 @@ def _one_of_each(place: str, rows, columns, values, lines) -> tuple[np.ndarray, 
 
     **Raises:** `ValueError` for a pair whose two entries differ.
     """
+    # The two entries of a symmetric pair may differ by what a file rounds, and by what is lost in sums of much larger entries,
+    # as a share of what the diagonal has.
+    printed, noise = 1e-6, 1e-9
     table, index = np.unique(np.concatenate([rows, columns]), axis=0, return_inverse=True)
     i, j = index.ravel()[: len(rows)], index.ravel()[len(rows) :]
     upper, lower = np.flatnonzero(i < j), np.flatnonzero(i > j)
@@ -100,7 +99,7 @@ def _one_of_each(place: str, rows, columns, values, lines) -> tuple[np.ndarray, 
     own[i[i == j]] = np.abs(values[i == j])
     a, b = values[first], values[second]
     differ = np.abs(a - b) > np.maximum(
-        PRINTED * np.maximum(np.abs(a), np.abs(b)), NOISE * np.sqrt(own[i[first]] * own[j[first]])
+        printed * np.maximum(np.abs(a), np.abs(b)), noise * np.sqrt(own[i[first]] * own[j[first]])
     )
     if np.any(differ):
         k = np.argmax(differ)

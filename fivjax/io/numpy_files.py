@@ -17,8 +17,6 @@ import numpy as np
 from .reading_limits import check_declared, check_length, unreadable
 
 KIND = "NumPy"
-# Longest header, and how deep its brackets may go.
-HEADER, DEPTH = 100_000, 8
 
 
 def load_array(path: Path) -> np.ndarray:
@@ -94,13 +92,15 @@ def _array(path: Path, where: str, content: bytes) -> np.ndarray:
 
 def _header(content: bytes) -> tuple[np.dtype, tuple[int, ...], Literal["C", "F"], int]:
     """Type, shape and order of the numbers, and where they begin."""
+    # Longest header, and how deep its brackets may go.
+    header, depth = 100_000, 8
     magic = b"\x93NUMPY"
     if not content.startswith(magic):
         raise ValueError("it holds no arrays of numbers")
     width = {1: 2, 2: 4, 3: 4}[content[6]]
     begin = 8 + width + int.from_bytes(content[8 : 8 + width], "little")
     text = content[8 + width : begin]
-    if begin > len(content) or len(text) > HEADER or _depth(text) > DEPTH:
+    if begin > len(content) or len(text) > header or _depth(text) > depth:
         raise ValueError("its header is cut off, or too long")
     # Python 2 wrote an L behind whole numbers.
     literal = ast.literal_eval(re.sub(r"(\d)L\b", r"\1", text.decode("utf-8" if content[6] == 3 else "latin-1")))

@@ -43,8 +43,6 @@ INTERFACE = {
     "wp_llvm_set_cpu_block_runtime": (ctypes.c_void_p,),
 }
 TEXTS = ("wp_warp_clang_version", "wp_llvm_version", "wp_get_cpu_target_triple", "wp_get_host_cpu_features")
-# Room for what is compiled, in bytes: where the disk is full, the compiler ends the whole process.
-ROOM = 2**26
 # The functions of C that code may call, of one number and of two; Warp calls them so on GPUs.
 ANGLES = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
 OF_ONE = (*ANGLES, "sqrt", "cbrt", "exp", "log", "erf", "erfc", "floor", "ceil", "round", "rint")
@@ -158,6 +156,8 @@ def _compiled(own: Compiler, code: str, flags: str, kept: Path | None) -> bytes:
 
 def _with_room(failures: list[str], kept: Path | None) -> Iterator[Path]:
     """Folders that have room for compiling; why others have not is added to the failures."""
+    # Room for what is compiled, in bytes: where the disk is full, the compiler ends the whole process.
+    room = 2**26
     try:
         temporary = [Path(tempfile.gettempdir())]
     except OSError as error:
@@ -169,9 +169,9 @@ def _with_room(failures: list[str], kept: Path | None) -> Iterator[Path]:
         try:
             with own_folder(parent) as probe, open(probe / "room", "wb", buffering=0) as file:
                 if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(file.fileno(), 0, ROOM)
+                    os.posix_fallocate(file.fileno(), 0, room)
                 else:
-                    file.write(bytes(ROOM))
+                    file.write(bytes(room))
         except OSError as error:
             failures.append(f"{parent}: {error.strerror or error}")
             continue

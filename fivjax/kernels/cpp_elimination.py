@@ -8,9 +8,6 @@ from .cpp_arrays import Value
 from .cpp_numbers import WIDE
 from .cpp_writer import Writer
 
-# Smaller systems are written out: in many of them zeros are known, and leave little.
-LEAST = 4
-
 # `linear_solve.eliminated`, in place: the right sides become the solutions.
 TEXT = """
 const auto {name} = [](double* matrix, {kind}* right) __attribute__((noinline)) {{
@@ -41,8 +38,10 @@ const auto {name} = [](double* matrix, {kind}* right) __attribute__((noinline)) 
 
 def _eliminated(writer: Writer, equation, operands: list[Value]) -> list[Value]:
     """The solutions for all right sides (columns)."""
+    # Smaller systems are written out: in many of them zeros are known, and leave little.
+    least = 4
     matrix, right = operands
-    if not is_elimination(equation) or matrix.shape[0] < LEAST or writer.is_wide(matrix):
+    if not is_elimination(equation) or matrix.shape[0] < least or writer.is_wide(matrix):
         called = within(equation.params)
         assert called is not None
         return writer.run(called.jaxpr, called.consts, operands)

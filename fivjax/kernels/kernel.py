@@ -17,12 +17,6 @@ from .lane_functions import AT_A_TIME, LaneFunction
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
 
-# Directions side by side in one kernel: as few of these as serve, or several calls with the most.
-WIDTHS = (1, 2, 4, 8, 16)
-# And no more than so many numbers, because a thread's stack holds them.
-MOST_SIDE_BY_SIDE = 2**14
-# Trajectories that are shared out among threads if the caller has none of its own: to wake them takes as long as some steps.
-LEAST_IN_THREADS = 32
 # The arrays of every kernel, with their axes: over trajectories, then as said.
 GIVEN = {"given": 2, "dots": 3, "instants": 2}  # numbers; numbers and directions; instants
 FOUND = {"ends": 2, "rows": 2, "end_dots": 3, "row_dots": 3}
@@ -49,8 +43,12 @@ class Groups(NamedTuple):
 
 def width_for(directions: int, numbers: int) -> int:
     """How many directions a kernel has side by side, for so many to come and so many numbers that it is given."""
-    most = max((width for width in WIDTHS if width * numbers <= MOST_SIDE_BY_SIDE), default=1)
-    return min(next((width for width in WIDTHS if width >= directions), WIDTHS[-1]), most)
+    # And no more than so many numbers, because a thread's stack holds them.
+    most_side_by_side = 2**14
+    # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
+    widths = (1, 2, 4, 8, 16)
+    most = max((width for width in widths if width * numbers <= most_side_by_side), default=1)
+    return min(next((width for width in widths if width >= directions), widths[-1]), most)
 
 
 class Kernel:
@@ -103,9 +101,12 @@ class Kernel:
 
     def launch(self, places: Addresses, pool: Executor | None = None, groups: Groups | None = None) -> None:
         """The same on the CPU for arrays at these places, in as many threads as there are cores."""
+        # Trajectories that are shared out among threads if the caller has none of its own: to wake them takes as long as some
+        # steps.
+        least_in_threads = 32
         lanes = places[len(GIVEN)][1][0]
         shared = [] if groups is None else [(array.ctypes.data, array.shape) for array in groups]
-        alone = lanes == 1 or (pool is None and lanes < LEAST_IN_THREADS)
+        alone = lanes == 1 or (pool is None and lanes < least_in_threads)
         parts = 1 if alone else min(lanes, AT_A_TIME * workers())
         self.of_lanes.in_parts(_told(places, shared), lanes, parts, pool)
 

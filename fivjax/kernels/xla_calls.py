@@ -11,8 +11,6 @@ from collections.abc import Callable, Sequence
 import jax
 
 _POINTER, _NUMBER, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
-# The version of the interface that is meant here; XLA says which versions it still understands.
-MAJOR, MINOR = 0, 1
 # A question about the handler itself; and the stage in which a program runs.
 ABOUT_HANDLER, RUNS = 1, 3
 INTERNAL_ERROR = 13
@@ -96,13 +94,15 @@ def called_by_xla(
 
     `function` is told where the arrays are, then the results, which it writes; their content is arbitrary before.
     """
+    # The version of the interface that is meant here; XLA says which versions it still understands.
+    major, minor = 0, 1
 
     def handler(call) -> int | None:
         call = call.contents
         extension = ctypes.cast(call.extension, ctypes.POINTER(_Extension))
         if extension and extension.contents.kind == ABOUT_HANDLER:
             about = ctypes.cast(extension, ctypes.POINTER(_AboutHandler)).contents.metadata.contents
-            about.version.major, about.version.minor = MAJOR, MINOR
+            about.version.major, about.version.minor = major, minor
             return None
         if call.stage != RUNS:
             return None

@@ -29,13 +29,6 @@ from .stable_manifold import Saddle, critical_kick, saddle_of
 if TYPE_CHECKING:
     import xarray as xr
 
-# Relative distance of the two kicks shown from the critical one.
-BESIDE = 1e-7
-# A crossing is shown if the part of its distance from the saddle normal to the plane is less than this share.
-FLAT = 0.5
-# Rounds of narrowing down the manifold, and states inside a bracket in each.
-ROUNDS, INSIDE = 2, 15
-
 
 @reported("boundary section")
 @in_own_coordinates
@@ -72,6 +65,8 @@ def boundary_section(
         >>> bool(abs(plane["manifold"].sel(stable=0.0)) < 0.05)  # doctest: +SLOW
         True
     """
+    # Relative distance of the two kicks shown from the critical one.
+    beside = 1e-7
     import xarray as xr
 
     arguments.instance("scene", scene, Scene, "a Scene")
@@ -102,7 +97,7 @@ def boundary_section(
     along_p = directions_of(scene, ("p",))
     sides = [
         kicked(scene.replace(p=critical.p * (1 + by)), EventExact(), along_p, MOST_CROSSINGS)
-        for by in (-BESIDE, BESIDE)
+        for by in (-beside, beside)
     ]
     paths = [_path(side, weights, origin, left / size, right * size) for side in sides]
     longest = max(map(len, paths))
@@ -137,16 +132,20 @@ def _directions(saddle: Saddle, weights: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _path(path: Crossings, weights: np.ndarray, origin: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The crossings in the plane's coordinates, in order; NaN while they are far from the plane."""
+    # A crossing is shown if the part of its distance from the saddle normal to the plane is less than this share.
+    flat = 0.5
     away = weights * path.y[: path.count] - origin
     inside = away @ left.T
     beside = np.linalg.norm(away - inside @ right, axis=-1)
-    return np.where((beside < FLAT * np.linalg.norm(away, axis=-1))[:, None], inside, np.nan)
+    return np.where((beside < flat * np.linalg.norm(away, axis=-1))[:, None], inside, np.nan)
 
 
 def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
     """The coordinate at which each row of verdicts changes between sliding and a limit cycle, narrowed down; if there are
     several changes, the one closest to zero.
     """
+    # Rounds of narrowing down the manifold, and states inside a bracket in each.
+    rounds, inside = 2, 15
     low, high = np.full((2, len(axis)), np.nan)
     for row, values in enumerate(verdict):
         flips = np.flatnonzero(_changes(values))
@@ -154,8 +153,8 @@ def _manifold(axis: np.ndarray, verdict: np.ndarray, verdicts) -> np.ndarray:
             place = flips[np.argmin(np.abs(axis[flips] + axis[flips + 1]))]
             low[row], high[row] = axis[place], axis[place + 1]
     known = np.flatnonzero(np.isfinite(low))
-    for _ in range(ROUNDS if len(known) else 0):
-        inner = np.linspace(low[known], high[known], INSIDE + 2, axis=1)
+    for _ in range(rounds if len(known) else 0):
+        inner = np.linspace(low[known], high[known], inside + 2, axis=1)
         found = verdicts(np.broadcast_to(axis[known, None], inner.shape), inner)
         changes = _changes(found)
         place, rows = np.argmax(changes, axis=1), np.arange(len(known))

@@ -28,9 +28,6 @@ from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .critical_derivatives import differentiable, with_derivatives
 
-# Points inside a bracket that are tried at once: with more points there are fewer rounds, and rounds take the time.
-POINTS_PER_ROUND = 15
-
 
 @reported("critical kicks")
 @in_own_coordinates
@@ -257,6 +254,8 @@ def _narrowed(
     the narrowing. Second result: which rows have a verdict that contradicts `at_ends` (rows, 2). Of two different verdicts on
     the same kick one is false, so no crossing is stated there.
     """
+    # Points inside a bracket that are tried at once: with more points there are fewer rounds, and rounds take the time.
+    points_per_round = 15
     nothing = np.full(len(brackets), np.nan)
     found = FirstCrossing(nothing, nothing.copy(), nothing.copy(), np.zeros(len(brackets), int))
     contradicted = np.zeros(len(brackets), bool)
@@ -265,7 +264,7 @@ def _narrowed(
     round_ = 0
     while len(open_) and round_ != rounds:
         round_ += 1
-        shares = np.linspace(0, 1, POINTS_PER_ROUND + 2)
+        shares = np.linspace(0, 1, points_per_round + 2)
         p = brackets[open_, :1] + shares * np.diff(brackets[open_])
         chosen = {name: column[open_] for name, column in columns.items()}
         label = f"narrowing {round_}"

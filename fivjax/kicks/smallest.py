@@ -32,8 +32,6 @@ from .stable_manifold import Saddle, critical_kick, saddle_of
 
 # Number of durations at which the bound is evaluated, and of those tried as starts of the search.
 GRID, STARTS = 4096, 24
-# Number of searches, from the starts with the smallest p_crit.
-DESCENTS = 4
 # Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
 OVER = ("p", "duration", "start", "state", "history")
@@ -137,6 +135,8 @@ def smallest_kick(
         >>> bool(1 < kick.certified < kick.p)
         True
     """
+    # Number of searches, from the starts with the smallest p_crit.
+    descents = 4
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")
@@ -178,7 +178,7 @@ def smallest_kick(
     row = scanned.isel(duration=best)
     p, duration = float(row["p_crit"]), float(starts[best])
     if "duration" in free:
-        order = np.argsort(np.where(np.isfinite(scanned["p_crit"]), scanned["p_crit"], np.inf))[:DESCENTS]
+        order = np.argsort(np.where(np.isfinite(scanned["p_crit"]), scanned["p_crit"], np.inf))[:descents]
         tried = [(float(scanned["p_crit"][k]), float(starts[k])) for k in order if np.isfinite(scanned["p_crit"][k])]
         p, duration = min(_descended(scene, *one, float(shortest), float(longest)) for one in tried)
     at = critical_perturbation(

@@ -29,8 +29,6 @@ from .response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned
 # The most trajectories of Newton's method, and the relative change of p at which it has converged.
 MOST_TRAJECTORIES = 12
 EXACT = 1e-13
-# A trajectory is near the saddle if its distance is below this share of the saddle's size.
-NEAR = 0.3
 # The most points of the section in one period of a saddle, and the number of first guesses tried.
 MOST_POINTS, TRIED = 6, 8
 
@@ -104,13 +102,15 @@ class ManifoldDistances(NamedTuple):
 
 def manifold_distances(path: Crossings, saddle: Saddle, weights: Float[np.ndarray, " state"]) -> ManifoldDistances:
     """`F_N` along a trajectory, with the derivative along the first direction."""
+    # A trajectory is near the saddle if its distance is below this share of the saddle's size.
+    near = 0.3
     target = weights * np.asarray(saddle.closed.point.y)
     away = weights * path.y[: path.count] - target
     distance = np.linalg.norm(away, axis=-1) / np.linalg.norm(target)
     status = path.status[: path.count] == int(saddle.closed.point.contact.status)
     # Up to the closest crossing: later the trajectory leaves, and may return on another way.
     closest = int(np.argmin(np.where(status, distance, np.inf)))
-    place = np.flatnonzero((distance < NEAR) & status & (np.arange(path.count) <= closest))
+    place = np.flatnonzero((distance < near) & status & (np.arange(path.count) <= closest))
     slopes = (weights * path.y_parameter[0, : path.count]) @ saddle.left
     return ManifoldDistances(place, distance[place], (away @ saddle.left)[place], slopes[place])
 

@@ -36,10 +36,6 @@ MOST_EVENTS, MOST_TIME = 1024, 20.0
 # Events of two motions are the same if their times differ by no more than this share of the slowest period.
 TOGETHER = 1e-2
 MOST_ITERATIONS = 20
-# Newton's method has converged if its steps are below these, relative to p and to the slowest period.
-EXACT_P, EXACT_T = 1e-13, 1e-8
-# The most touches that are tried; and how far below one the next is sought, relative to p.
-MOST_TOUCHES, JUST_BELOW = 8, 1e-11
 
 
 class GrazingKick(NamedTuple):
@@ -65,6 +61,8 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
 
     **Arguments:** `scene`, whose load is a `Pulse`; `bracket`, values of p on either side; `names` of the parameters.
     """
+    # The most touches that are tried; and how far below one the next is sought, relative to p.
+    most_touches, just_below = 8, 1e-11
     stepper, (low, high) = EventExact(), bracket
     period = float(slowest_period(scene.structure))
     directions = directions_of(scene, ("p", *names))
@@ -74,7 +72,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         return found
 
     below, above, found = events(low), events(high), None
-    for _ in range(MOST_TOUCHES):
+    for _ in range(most_touches):
         parting = _parting(below, above, TOGETHER * period)
         if parting is None:
             return found
@@ -82,7 +80,7 @@ def grazing_kick(scene: Scene, bracket: tuple[float, float], names: tuple[str, .
         if found is None:
             return None
         # Another oscillation may come closer and touch already at a smaller kick.
-        high = found.p * (1 - JUST_BELOW)
+        high = found.p * (1 - just_below)
         above = events(high)
     return None
 
@@ -97,6 +95,8 @@ def _touched(
     period: float,
 ) -> GrazingKick | None:
     """Newton's method in the kick and the time of the touch."""
+    # Newton's method has converged if its steps are below these, relative to p and to the slowest period.
+    exact_p, exact_t = 1e-13, 1e-8
     (place, time, guard), (low, high) = parting, bracket
     p, apart, width = high, 1e-4 * period, high - low
     for taken in range(1, MOST_ITERATIONS + 1):
@@ -110,7 +110,7 @@ def _touched(
         step = -(value + 0.5 * slope * shift) / of_parameters[0]
         if not low - width <= p + step <= high + width or abs(shift) > 0.1 * period:
             return None
-        if abs(step) <= EXACT_P * p and abs(shift) <= EXACT_T * period:
+        if abs(step) <= exact_p * p and abs(shift) <= exact_t * period:
             slopes = {name: float(-of_parameters[k + 1] / of_parameters[0]) for k, name in enumerate(names)}
             return GrazingKick(float(p), slopes, taken, time, place)
         p, time = p + step, time + shift

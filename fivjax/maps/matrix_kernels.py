@@ -26,8 +26,6 @@ from .groups import Task, with_values
 
 # Forms of batches, by what all jobs of a run have in common: a trace takes as long as thousands of returns.
 _FORMS: dict[Any, MechanicsForm] = {}
-# The least steps that are worth a part of a call's work of its own.
-LEAST_STEPS = 4096
 
 
 class ReturnColumn(enum.IntEnum):
@@ -127,6 +125,8 @@ class MatrixKernels:
         **told: int,
     ) -> None:
         """Run the kernel for each of these rows, which are changed in place. A row takes some `each` steps."""
+        # The least steps that are worth a part of a call's work of its own.
+        least_steps = 4096
         count, group = len(group), np.ascontiguousarray(group, np.int32)
         at = np.array(columns, np.int32)
         assert rows.flags.c_contiguous
@@ -134,7 +134,7 @@ class MatrixKernels:
         devices = gpus_for(count)
         if not devices:
             arrays = (*self.of_groups, group, rows, path, at)
-            parts = max(1, min(count, AT_A_TIME * workers(), count * each // LEAST_STEPS))
+            parts = max(1, min(count, AT_A_TIME * workers(), count * each // least_steps))
             self.kernel.in_parts([*(array.ctypes.data for array in arrays), *numbers], count, parts, self.pool)
             return
 

@@ -13,9 +13,6 @@ from ..foundation.linear_solve import solve
 from ..foundation.precision import returning_numpy
 from .structure import Structure
 
-# All subsets of contacts are checked in all directions of slip: at most 65,536 determinants for eight contacts.
-MOST_CONTACTS = 8
-
 
 class Delassus(NamedTuple):
     """The blocks of G, in 1/kg: the acceleration of contact i (row) by a unit force at contact j (column).
@@ -75,6 +72,8 @@ def has_one_solution(g: Delassus, friction: np.ndarray) -> bool:
 
     **Raises:** `ValueError` for more contacts than can be checked, unless the coupling is so small that no check is needed.
     """
+    # All subsets of contacts are checked in all directions of slip: at most 65,536 determinants for eight contacts.
+    most_contacts = 8
     g = Delassus(*map(np.asarray, g))
     count = len(friction)
     scale = 1 / np.sqrt(np.diag(g.normal))
@@ -82,9 +81,9 @@ def has_one_solution(g: Delassus, friction: np.ndarray) -> bool:
     # With a positive definite symmetric part all principal minors are positive.
     if np.linalg.eigvalsh(normal)[0] > np.linalg.norm(coupling * friction, 2):
         return True
-    if count > MOST_CONTACTS:
+    if count > most_contacts:
         raise ValueError(
-            f"Whether friction on {count} contacts leaves one answer cannot be decided for more than {MOST_CONTACTS} contacts "
+            f"Whether friction on {count} contacts leaves one answer cannot be decided for more than {most_contacts} contacts "
             f"that are this strongly coupled in the mass matrix. Lower the friction, or take fewer contacts."
         )
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=count)))

@@ -11,8 +11,6 @@ import numpy as np
 ROUNDING = 1e-6
 # Eigenvalues below this share of the largest of the lowest ones computed are rigid-body modes.
 RIGID = 1e-6
-# How many rows a sentence names.
-NAMED = 5
 # Up to this size matrices are dense.
 DENSE = 400
 
@@ -126,8 +124,10 @@ def _of(count: int, one: str, many: str = "") -> str:
 
 
 def _listing(rows: tuple[str, ...]) -> str:
-    more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
-    return "; ".join(rows[:NAMED]) + more
+    # How many rows a sentence names.
+    named = 5
+    more = f" and {len(rows) - named} more" if len(rows) > named else ""
+    return "; ".join(rows[:named]) + more
 
 
 def check_matrices(

@@ -20,8 +20,6 @@ from ..simulation.trajectory import Trajectory
 if TYPE_CHECKING:
     import xarray as xr
 
-DPI = 100
-
 
 def show(result, **options) -> Figure:
     """The picture of a result.
@@ -95,8 +93,9 @@ def _of_trajectory(run: Trajectory, **options) -> Figure:
 
 def png(figure: Figure) -> bytes:
     """A figure as PNG."""
+    dpi = 100
     written = io.BytesIO()
-    figure.savefig(written, format="png", dpi=DPI)
+    figure.savefig(written, format="png", dpi=dpi)
     return written.getvalue()
 
 

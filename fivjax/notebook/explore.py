@@ -20,11 +20,6 @@ from .map_picture import MapPicture
 from .panels import drawing_panels
 from .sliders import BESIDE, PICTURE, parameters_shown, slider
 
-# Rows per second: 22 per cycle at 68 Hz are enough for a smooth phase plane, and few enough for an immediate response.
-RATE = 1500
-# The time for which the trajectory shown is followed for its verdict, s.
-T_MAX = 10.0
-
 
 def explorer(
     scene: Scene,
@@ -114,11 +109,13 @@ class Explorer:
     @in_double_precision
     def update(self) -> None:
         """Simulate with the values of the sliders, and draw; the verdict follows when it is known."""
+        # Rows per second: 22 per cycle at 68 Hz are enough for a smooth phase plane, and few enough for an immediate response.
+        rate = 1500
         if self._quiet:
             return
         try:
             scene = self.scene.replace(**{name: self._value(name) for name in self.sliders})
-            run = simulate(scene, self.t1, 1 / RATE, energy=True)
+            run = simulate(scene, self.t1, 1 / rate, energy=True)
         except ValueError as error:
             self.said.value = f"<i>{error}</i>"
             return
@@ -172,9 +169,11 @@ class Explorer:
         self.update()
 
     def _judge(self, scene: Scene, lines: list[str]) -> None:
+        # The time for which the trajectory shown is followed for its verdict, s.
+        t_max = 10.0
         name = next(iter(self.sliders))
         try:
-            found = bistability_map(scene, t_max=T_MAX, progress=False, **{name: [float(scene.parameters[name])]})
+            found = bistability_map(scene, t_max=t_max, progress=False, **{name: [float(scene.parameters[name])]})
             first = _in_words((Verdict(int(found["verdict"][0])), float(found["decided_at"][0])))
         except ValueError as error:
             first = f"<i>{error}</i>"

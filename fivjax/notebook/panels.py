@@ -18,8 +18,6 @@ from ..simulation.trajectory import Trajectory
 # The smallest range of a panel's axis, as a share of the load over the mass, the belt speed, the displacement or the energy of
 # steady sliding. Far below it there is only rounding.
 LEAST = 1e-2
-# The distance of the statuses of one contact from those of the next, in a panel where stick and slide are 1 apart.
-APART = 0.5
 
 
 def drawing_panels(t1: float, contacts: int = 1) -> Callable[[Trajectory], bytes]:
@@ -27,6 +25,8 @@ def drawing_panels(t1: float, contacts: int = 1) -> Callable[[Trajectory], bytes
 
     Each of several contacts has its colour, and its row of dots beside each status.
     """
+    # The distance of the statuses of one contact from those of the next, in a panel where stick and slide are 1 apart.
+    apart = 0.5
     figure = Figure(figsize=(8.4, 4.8), dpi=80)
     canvas = FigureCanvasAgg(figure)
     response, status, energy, phase = _axes(figure, t1)
@@ -34,7 +34,7 @@ def drawing_panels(t1: float, contacts: int = 1) -> Callable[[Trajectory], bytes
     waves = [response.plot([], [], color=colour, lw=0.7, label=f"contact {i}")[0] for i, colour in enumerate(colours)]
     dots = [VERMILION] if contacts == 1 else colours
     steps = [status.plot([], [], ".", color=colour, ms=2)[0] for colour in dots]
-    offsets = APART * (np.arange(contacts) - 0.5 * (contacts - 1)) / contacts
+    offsets = apart * (np.arange(contacts) - 0.5 * (contacts - 1)) / contacts
     (mechanical,) = energy.plot([], [], color=BLACK, lw=1.0, label="mechanical energy")
     (contact,) = energy.plot([], [], color=GREEN, lw=1.0, ls="--", label="from the contact, less damping")
     # The last point is marked, so that a motion at rest is visible.

@@ -16,8 +16,6 @@ RANGES = {
     "p": (1.0, 3.0),
     "belt_speed": (0.1, 10.0),
 }
-# The range of a structure's parameters, relative to their values.
-SHARES = (0.5, 1.5)
 # Sliders keep their width; in a narrow notebook the picture moves below them.
 SLIDER = {"width": "330px", "min_width": "330px", "flex": "0 0 auto"}
 BESIDE = {"flex_flow": "row wrap", "align_items": "flex-start"}
@@ -39,7 +37,9 @@ def _kind(name: str) -> str:
 
 def slider(widgets, name: str, value: float, ranges: Mapping, axes: Mapping):
     """A slider for one parameter; its range includes the scene's value and both ends of the map's axis of that name."""
-    low, high = ranges.get(name) or RANGES.get(_kind(name)) or tuple(share * value for share in SHARES)
+    # The range of a structure's parameters, relative to their values.
+    shares = (0.5, 1.5)
+    low, high = ranges.get(name) or RANGES.get(_kind(name)) or tuple(share * value for share in shares)
     reached = [value, *([axes[name][0], axes[name][-1]] if name in axes else [])]
     low, high = float(min(low, *reached)), float(max(high, *reached))
     if low == high:

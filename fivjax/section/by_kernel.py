@@ -13,8 +13,6 @@ from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
 from .crossings import Arrival, ByMethod, Point, motion_to_section
 
-# Returns in all that are shared out among threads.
-LEAST_IN_THREADS = 64
 # Rows of numbers for a kernel are put together for so many bytes at a time.
 AT_A_TIME = 2**26
 
@@ -54,7 +52,9 @@ class SectionKernels:
         return (*_on_section(end), end.at.time), slopes.at.point.y
 
     def _pool_for(self, crossings) -> Executor | None:
-        return self.pool if np.sum(crossings) >= LEAST_IN_THREADS else None
+        # Returns in all that are shared out among threads.
+        least_in_threads = 64
+        return self.pool if np.sum(crossings) >= least_in_threads else None
 
     def _rows(self, group, y, status, direction, crossings, peaks: bool):
         if self.form is None:

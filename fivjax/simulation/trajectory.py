@@ -42,9 +42,6 @@ from .stretches import MODES
 if TYPE_CHECKING:
     import xarray as xr
 
-# The most rows that a trajectory may have: some 20 GB.
-MOST_ROWS = 10**8
-
 
 class Trajectory(eqx.Module):
     """A response in time. Rows are saved instants: the first is t = 0, the last exactly `t1`; `n` is the structure's size.
@@ -202,6 +199,8 @@ def simulate(
         >>> run.displacement.shape, run.meaning
         ((401, 3), 'reached its end')
     """
+    # The most rows that a trajectory may have: some 20 GB.
+    most_rows = 10**8
     method = EventExact() if method is None else method
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.instance("method", method, AbstractStepper, "a stepper, such as EventExact()")
@@ -224,10 +223,10 @@ def simulate(
             scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
         )
     rows = math.ceil(t1 / dt_save - 1e-9)
-    if rows > MOST_ROWS:
+    if rows > most_rows:
         raise ValueError(
             f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
-            f"{MOST_ROWS:.0e}. Save less often, or stop earlier."
+            f"{most_rows:.0e}. Save less often, or stop earlier."
         )
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
     # Events shorten advances, so more may be needed than the interval divided by `dt`.

@@ -32,14 +32,8 @@ from .step_length import LONGEST_STEP, attainable, time_unit, trusted
 
 Stepper = TypeVar("Stepper", bound=AbstractStepper)
 
-# How much larger a step's relative error may be in a derivative than in the motion.
-LOOSER = 10
 # Whether a guard begins at zero is told by what it comes to in so many units of time: some rad of the fastest vibration.
 NEAR = 8.0
-# The share of a step behind a fall of the tangential velocity through zero at which it ends, if there is a rise behind it.
-FALLEN = 1e-3
-# Samples behind the fall that tell.
-SAMPLES = 16
 
 
 class EventExact(AbstractStepper):
@@ -121,6 +115,9 @@ class EventExact(AbstractStepper):
         at_section: bool = False,
     ) -> tuple[Advance, Float[Array, "coefficient state"], Float[Array, ""]]:
         """The same, with the Taylor coefficients of the motion on the way, and the unit of their time, in s."""
+        # The share of a step behind a fall of the tangential velocity through zero at which it ends, if there is a rise behind
+        # it.
+        fallen = 1e-3
         unit = time_unit(mechanics)
         series = series_of(mechanics, contact, load, y, self.order_, unit)
         states = series.states
@@ -151,7 +148,7 @@ class EventExact(AbstractStepper):
             again = jax.lax.cond(
                 fell & (fall < end), lambda: _rises(jax.lax.stop_gradient(scaled[:, count]), fall, end), lambda: False
             )
-            safe = jnp.where(row & fell, jnp.where(again, jnp.minimum(fall + FALLEN, 1.0), 1.0), safe)
+            safe = jnp.where(row & fell, jnp.where(again, jnp.minimum(fall + fallen, 1.0), 1.0), safe)
             fires = fires & (before | ~row)
         first = jnp.min(safe)
         # Guards whose roots differ by rounding only run out together.
@@ -234,8 +231,10 @@ class EventExact(AbstractStepper):
         """By how much (rad) the phase of a vibration may advance in a step: for an angle a, the error of the series is
         a^(order + 1) / (order + 1)!.
         """
+        # How much larger a step's relative error may be in a derivative than in the motion.
+        looser = 10
         after = self.order_ + 1
-        tolerance = LOOSER * attainable(self.tolerance, dtype)
+        tolerance = looser * attainable(self.tolerance, dtype)
         return (tolerance * math.factorial(after)) ** (1.0 / after)
 
     def _agreeing(
@@ -254,7 +253,9 @@ class EventExact(AbstractStepper):
 
 def _rises(speed: Float[Array, " k"], fall: Float[Array, ""], end: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a velocity that falls through zero has risen through it again before the end of a step, by its samples."""
-    values, _ = value_and_slope(speed, fall + (end - fall) * np.arange(1, SAMPLES + 1) / SAMPLES)
+    # Samples behind the fall that tell.
+    samples = 16
+    values, _ = value_and_slope(speed, fall + (end - fall) * np.arange(1, samples + 1) / samples)
     return jnp.any(values >= 0)
 
 

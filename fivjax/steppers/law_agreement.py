@@ -16,8 +16,6 @@ from .step_length import attainable
 # Where they are compared, besides where slip is fastest and slowest: at this many equal parts of the step.
 PARTS = 8
 TURNING_STEPS, NEAR = 5, 1e-4
-# The difference that counts as rounding, in units of the last place of μ.
-ROUNDINGS = 128
 # A step is not cut to less than this share: over so short a time, a kink at its very start has no effect.
 SHORTEST = 1e-8
 MOST_HALVINGS = 80
@@ -36,11 +34,13 @@ def agreeing(
     Where the two part, because the series ends too soon or the law has a kink there, bisection finds the place. The step then
     ends just beyond it, so that the next one begins on the other side of a kink.
     """
+    # The difference that counts as rounding, in units of the last place of μ.
+    roundings = 128
     law, friction, slip, reach = jax.lax.stop_gradient((law, friction, slip, reach))
     mu, u = in_shares(friction, reach), in_shares(slip, reach)
     sliding = contact.status == Status.SLIDE
     eps = float(jnp.finfo(mu.dtype).eps)
-    allowed = max(attainable(tolerance, mu.dtype), ROUNDINGS * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
+    allowed = max(attainable(tolerance, mu.dtype), roundings * eps) * jnp.maximum(jnp.abs(mu[0]), jnp.abs(law.static))
 
     def parted(x: Float[Array, ""], speed: Float[Array, "*contacts"]) -> Bool[Array, ""]:
         # Also below zero, where sliding is over: a kink may lie on the last short way there.

@@ -25,10 +25,6 @@ from .window import bracketed, fastest, first_is_safe, leading
 
 # The matrices of structures with more degrees of freedom take megabytes for each scene, which are read in every step.
 MOST_COORDINATES = 24
-# Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
-SHORT_TERMS, SHORT_STEPS = 6, 2
-# Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the sample next to it.
-RISE_STEPS, LOWEST_STEPS, PEAK_STEPS = 12, 6, 5
 # What a vector of `window.Bracket` has of both guards: the guess of the root, then what begins at these places.
 BRACKET = {"ZEROS": 2, "ENDS": 4, "CROSSES": 6, "SPENT": 8, "DIPS": 10, "BRACKET": 12}
 
@@ -62,6 +58,11 @@ class MechanicsForm(NamedTuple):
 @functools.cache
 def motion_in_cpp(form: MechanicsForm) -> str:
     """The code of `Motion` with all that it refers to."""
+    # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the sample next to
+    # it.
+    rise_steps, lowest_steps, peak_steps = 12, 6, 5
+    # Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
+    short_terms, short_steps = 6, 2
     like = form.mechanics(np.zeros(form.numbers))
     n, normal = like.free_load.shape[0], like.normal
     at = blocks_of(n)
@@ -84,11 +85,11 @@ def motion_in_cpp(form: MechanicsForm) -> str:
         "STICKING": int(Status.STICK),
         "DETACHED": int(Status.DETACH),
         "MOST_ROOT_STEPS": MOST_ROOT_STEPS,
-        "SHORT_STEPS": SHORT_STEPS,
-        "SHORT_TERMS": SHORT_TERMS,
-        "RISE_STEPS": RISE_STEPS,
-        "LOWEST_STEPS": LOWEST_STEPS,
-        "PEAK_STEPS": PEAK_STEPS,
+        "SHORT_STEPS": short_steps,
+        "SHORT_TERMS": short_terms,
+        "RISE_STEPS": rise_steps,
+        "LOWEST_STEPS": lowest_steps,
+        "PEAK_STEPS": peak_steps,
         **BRACKET,
     }
     real = {

@@ -15,9 +15,8 @@ from ..contact.rounding import largest_rounding
 
 # Intervals in a window, a power of two. In a long window the work after an event is wasted; short ones have more overhead.
 INTERVALS = 16
-# The phase of the fastest vibration advances by this much between two samples, rad: guards are nearly cubic there.
-TURN = 0.6
-# Order of the Taylor series within an interval: TURN^16 / 16! is below rounding.
+# Order of the Taylor series within an interval, in which the fastest motion turns by 0.6 (`propagators`): 0.6^16 / 16! is below
+# rounding.
 ORDER = 15
 # Approximate number of rows of all matrices of a scene, per coordinate: for estimates of memory.
 MATRIX_ROWS = 4 * (INTERVALS + ORDER)
@@ -51,10 +50,12 @@ class Propagation(eqx.Module):
 
 def propagators(mechanics: Mechanics) -> Propagators:
     """The matrices for one scene with constant friction."""
+    # The phase of the fastest vibration advances by this much between two samples, rad: guards are nearly cubic there.
+    turn = 0.6
     n = mechanics.free_load.shape[0]
     ways = _ways(mechanics.free_load.dtype)
     generators, guards = jax.vmap(lambda way: _affine(mechanics, way))(ways)
-    interval = TURN / jnp.max(jax.vmap(_spectral_radius)(generators))
+    interval = turn / jnp.max(jax.vmap(_spectral_radius)(generators))
     identity = jnp.broadcast_to(jnp.eye(2 * n + 2, dtype=generators.dtype), generators.shape)
 
     def next_power(power, k):

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 
 from ..contact import Mechanics, State
 
-GOLDEN = 0.5 * (5**0.5 - 1)
 # A state is on the section if the sum of velocities is no larger than this share of the motion.
 ON_SECTION = {"float64": 1e-13, "float32": 1e-6}
 
@@ -32,7 +31,8 @@ FADED = 1e-6
 
 def section_weights(contacts: int) -> Float[np.ndarray, " c"]:
     """The weight of each contact's tangential velocity in the section; 1 for a single contact."""
-    return 1.0 + np.mod(GOLDEN * np.arange(contacts), 1.0)
+    golden = 0.5 * (5**0.5 - 1)
+    return 1.0 + np.mod(golden * np.arange(contacts), 1.0)
 
 
 def section_speed(mechanics: Mechanics, y: State) -> Float[Array, ""]:
