@@ -33,7 +33,7 @@ class BranchPoint(NamedTuple):
         """Whether the real motion has the contact modes with which the cycle was computed, and its events where that has
         them.
         """
-        return _is_real(self.real, self.cycle)
+        return _moves_as_computed(self.real, self.cycle)
 
     @property
     def name(self) -> str:
@@ -86,12 +86,12 @@ def _are_alike(one: BranchPoint, other: BranchPoint, share: float) -> bool:
     return all(abs(b / a - 1) <= share for a, b in (periods, sizes))
 
 
-def is_real(family: Family, cycle: ComputedCycle) -> bool:
+def is_real_motion(family: Family, cycle: ComputedCycle) -> bool:
     """The same of a computed cycle."""
-    return _is_real(real_motion(family.at(cycle.parameter), family.stepper, cycle.phases), cycle)
+    return _moves_as_computed(real_motion(family.at(cycle.parameter), family.stepper, cycle.phases), cycle)
 
 
-def _is_real(real: RealMotion | None, cycle: ComputedCycle) -> bool:
+def _moves_as_computed(real: RealMotion | None, cycle: ComputedCycle) -> bool:
     found = None if real is None else real.phases
     return found is not None and found.has_the_modes_of(cycle.phases) and not risen_to_zero(cycle)
 

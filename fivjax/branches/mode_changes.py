@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..contact import Status
-from .branch_points import BranchPoint, branch_point, is_real, risen_to_zero
+from .branch_points import BranchPoint, branch_point, is_real_motion, risen_to_zero
 from .grazing import NAMES
 from .multiple_shooting import AT_SECTION, Phases
 from .pseudo_arclength import ComputedCycle, Curve, Family
@@ -28,7 +28,7 @@ def change_of_modes(family: Family, here: BranchPoint, tangent: Float[np.ndarray
         if cycle is None:
             high = middle
             continue
-        if is_real(family, cycle):
+        if is_real_motion(family, cycle):
             low, valid = middle, cycle
         else:
             high, ahead = middle, cycle
@@ -86,7 +86,7 @@ def _inserted(family: Family, curve: Curve, valid: ComputedCycle, ahead: Compute
         change = change_between(real.phases.modes, curve.modes)
         longer = Curve(family, real.phases)
         first = longer.corrected(longer.unknowns(real.phases, cycle.parameter))
-        if first is None or not is_real(family, first):
+        if first is None or not is_real_motion(family, first):
             continue
         special, grazing = None, grazing_of(curve, ahead)
         if grazing is not None and _near(curve, grazing.cycle, ahead, step):
@@ -133,7 +133,7 @@ def _removed(family: Family, curve: Curve, valid: ComputedCycle, tangent, phase:
     begin = special.cycle if special.curve is fewer else first
     for length in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
         onward = fewer.along(begin, away, length)
-        if onward is not None and is_real(family, onward):
+        if onward is not None and is_real_motion(family, onward):
             return special, (branch_point(family, fewer, onward), fewer.tangent(onward, away), max(length, 1e-3))
     return special, None
 
@@ -174,7 +174,7 @@ def with_own_rebounds(
         return here, tangent
     curve = Curve(family, phases)
     cycle = curve.corrected(curve.unknowns(phases, here.cycle.parameter))
-    if cycle is None or not is_real(family, cycle):
+    if cycle is None or not is_real_motion(family, cycle):
         return here, tangent
     onward = curve.tangent(cycle, None)
     before, after = (
@@ -194,7 +194,7 @@ def _outward(family: Family, curve: Curve, first: ComputedCycle, tangent, specia
         real = []
         for sign in (1.0, -1.0):
             cycle = curve.along(first, tangent, sign * length)
-            real.append(cycle is not None and is_real(family, cycle))
+            real.append(cycle is not None and is_real_motion(family, cycle))
         if real[0] != real[1]:
             return tangent if real[0] else -tangent
     if special is not None and special.parameter != first.parameter and abs(tangent[-1]) > 1e-12:

@@ -56,7 +56,7 @@ class PeriodSummary(NamedTuple):
     lines: Complex[np.ndarray, "count n"]  # m/s
 
 
-class _Way(NamedTuple):
+class _Carry(NamedTuple):
     y: State
     contact: Contact
     left: Float[Array, ""]  # of the period, s
@@ -69,14 +69,14 @@ def _around(args, numbers):
     how, scene, point, period = args
     mechanics, zero = mechanics_about_sliding(scene), jnp.zeros((), point.y.dtype)
     contact = Contact(point.contact.status.astype(jnp.int32), point.contact.direction)
-    begin = _Way(point.y, contact, period, zero, jnp.zeros((), jnp.int32))
+    begin = _Carry(point.y, contact, period, zero, jnp.zeros((), jnp.int32))
     begin = depending_on(mechanics, begin)
 
-    def segment(way: _Way, number):
+    def segment(way: _Carry, number):
         after, series, unit = how.method.with_series(mechanics, way.contact, zero, way.y, way.left)
         goes = (way.left > 0) & (way.count == number)
         peak = higher_peak(mechanics, series, after.h, after.h / unit, way.peak)
-        moved = _Way(
+        moved = _Carry(
             after.y, after.contact, jnp.where(after.h >= way.left, 0.0, way.left - after.h), peak, way.count + 1
         )
         row = PeriodSegments(period - way.left, after.h, way.y, way.contact, after.ended, series, unit)

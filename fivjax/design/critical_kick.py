@@ -133,7 +133,7 @@ def raise_critical_perturbation(
             changed, p_range=p_range, p_step=p_step, tolerance=BRACKET, derivatives=True, progress=False
         ).isel(belt_speed=0)
         slopes = np.array([float(found["d_p_crit"].sel(parameter=name)) for name in names]) * size
-        return _Step(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
+        return _Iterate(changed, r, float(found["p_crit"]), slopes, _bracket(found), str(found["why_none"].values))
 
     here = first = at(np.zeros(len(names)))
     if not here.is_known:
@@ -182,7 +182,7 @@ def raise_critical_perturbation(
     return _concluded(scene, first, here, target, names, start, taken, why, p_range, p_step)
 
 
-class _Step(NamedTuple):
+class _Iterate(NamedTuple):
     """A scene in the search, with its critical kick."""
 
     scene: Scene

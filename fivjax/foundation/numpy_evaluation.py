@@ -19,7 +19,7 @@ import numpy as np
 from .argument_forms import Form
 from .compiling import compiled, transformed
 from .kept_programs import kept_value
-from .numpy_plans import NoSuchCase, Plan, plan_of
+from .numpy_plans import NoSuchCase, NumpyPlan, numpy_plan_of
 from .plain_trees import NotPlain, from_text, structure_to_text
 from .precision import own_settings
 
@@ -84,7 +84,7 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
         structure, plan = kept_value(traced, form) if _is_named(call) else traced(form)
         if isinstance(structure, str):
             structure, plan = from_text(structure), json.loads(plan)
-        return structure, Plan(plan)
+        return structure, NumpyPlan(plan)
 
     return call
 
@@ -100,7 +100,7 @@ def _traced(function: Callable, form: Form) -> tuple:
         return leaves
 
     with own_settings():
-        plan = plan_of(jax.make_jaxpr(flat)([jax.ShapeDtypeStruct(*array) for array in form.arrays]))
+        plan = numpy_plan_of(jax.make_jaxpr(flat)([jax.ShapeDtypeStruct(*array) for array in form.arrays]))
     try:
         return structure_to_text(structures[-1]), json.dumps(plan)
     except (NotPlain, TypeError):  # of JSON, where an equation is left to JAX

@@ -21,7 +21,7 @@ class NoSuchCase(Exception):
     """NumPy has no function for some values: an index is outside of its array."""
 
 
-class _Step(NamedTuple):
+class _Equation(NamedTuple):
     """An equation, ready to be computed."""
 
     function: Callable  # of a list of operands, to its results
@@ -43,15 +43,15 @@ class _Step(NamedTuple):
             values[own] = result if getattr(result, "dtype", None) == kind else np.asarray(result, kind)
 
 
-class Plan:
-    """A function of a list of arrays, by a plan as `plan_of` gives it."""
+class NumpyPlan:
+    """A function of a list of arrays, by a plan as `numpy_plan_of` gives it."""
 
     def __init__(self, plan: dict[str, Any]):
         self.given, self.ends = plan["given"], plan["ends"]
         self.values: list = [None] * plan["size"]
         for place, kind, shape, content in plan["constants"]:
             self.values[place] = np.frombuffer(bytes.fromhex(content), kind).reshape(shape)
-        self.steps = [_Step.of(*step) for step in plan["steps"]]
+        self.steps = [_Equation.of(*step) for step in plan["steps"]]
         # After each step, the places that nobody reads any more: memory that is used again is faster than new memory.
         read, self.over = set(self.ends), []
         for step in reversed(self.steps):
@@ -71,7 +71,7 @@ class Plan:
         return [values[own] for own in self.ends]
 
 
-def plan_of(traced: ClosedJaxpr) -> dict[str, Any]:
+def numpy_plan_of(traced: ClosedJaxpr) -> dict[str, Any]:
     """The plan of a traced function. What follows from constants alone is computed now, what is the same wherever it stands is
     computed once, and what is called is part of the plan.
     """
@@ -136,7 +136,7 @@ class _Planner:
         types = [np.dtype(variable.aval.dtype).name for variable in equation.outvars]
         step = *_named(equation), reads, writes, types
         if all(self.values[own] is not None for own in reads):
-            _Step.of(*step).taken(self.values)
+            _Equation.of(*step).taken(self.values)
         else:
             self.steps.append(step)
         return writes
@@ -179,13 +179,13 @@ def _parts_of_while(params) -> dict[str, Any]:
     return {
         "asked": params["cond_nconsts"],
         "fixed": params["body_nconsts"],
-        "condition": plan_of(params["cond_jaxpr"]),
-        "body": plan_of(params["body_jaxpr"]),
+        "condition": numpy_plan_of(params["cond_jaxpr"]),
+        "body": numpy_plan_of(params["body_jaxpr"]),
     }
 
 
 def _while(parts: dict[str, Any]) -> Callable:
-    condition, body = Plan(parts["condition"]), Plan(parts["body"])
+    condition, body = NumpyPlan(parts["condition"]), NumpyPlan(parts["body"])
 
     def run(operands: list) -> list:
         asked = operands[: parts["asked"]]
@@ -209,11 +209,11 @@ def _parts_of_scan(params) -> dict[str, Any]:
     shared, carried = of_scan(params)
     shapes = [variable.aval.shape for variable in params["jaxpr"].jaxpr.outvars[carried:]]
     told = {"shared": shared, "carried": carried, "shapes": shapes}
-    return {**told, "length": params["length"], "reverse": params["reverse"], "body": plan_of(params["jaxpr"])}
+    return {**told, "length": params["length"], "reverse": params["reverse"], "body": numpy_plan_of(params["jaxpr"])}
 
 
 def _scan(parts: dict[str, Any]) -> Callable:
-    body, shared, carried = Plan(parts["body"]), parts["shared"], parts["carried"]
+    body, shared, carried = NumpyPlan(parts["body"]), parts["shared"], parts["carried"]
     turns = range(parts["length"])[:: -1 if parts["reverse"] else 1]
 
     def run(operands: list) -> list:
@@ -232,11 +232,11 @@ def _scan(parts: dict[str, Any]) -> Callable:
 
 
 def _parts_of_cond(params) -> dict[str, Any]:
-    return {"branches": [plan_of(branch) for branch in params["branches"]]}
+    return {"branches": [numpy_plan_of(branch) for branch in params["branches"]]}
 
 
 def _cond(parts: dict[str, Any]) -> Callable:
-    branches = [Plan(branch) for branch in parts["branches"]]
+    branches = [NumpyPlan(branch) for branch in parts["branches"]]
     return lambda operands: branches[int(np.clip(int(operands[0]), 0, len(branches) - 1))](operands[1:])
 
 

@@ -14,7 +14,7 @@ from ..foundation.argument_forms import Form
 from ..foundation.jaxprs import of_scan
 from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
-from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers
+from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers
 from .cpp_code import writer
 from .cpp_loops import scan
 from .cpp_numbers import WIDE, kind_of
@@ -198,7 +198,7 @@ class _WriterOfKernel:
         along = {variable for loop in loops for variable in loop.outvars[of_scan(loop.params)[1] :]}
         for variable in (*self.rows, *self.row_dots):
             # Tangents that do not depend on what is perturbed are zero, as their array is from the start.
-            if variable not in along and not (is_known(read(variable)) and not np.any(read(variable))):
+            if variable not in along and not (has_known_numbers(read(variable)) and not np.any(read(variable))):
                 raise NotImplementedError("Rows of a kernel's function must be results of its `scan`.")
         for name, variables, kind in (("ends", self.ends, "double"), ("end_dots", self.end_dots, WIDE)):
             start = 0

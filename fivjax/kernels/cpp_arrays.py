@@ -90,7 +90,7 @@ def of_numbers(value) -> np.ndarray:
     return found
 
 
-def is_known(value: Value) -> bool:
+def has_known_numbers(value: Value) -> bool:
     """Whether all its numbers are."""
     return not isinstance(value, View) and not any(isinstance(entry, str) for entry in value.ravel())
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..foundation.numpy_primitives import gathered_places, scattered_places
-from .cpp_arrays import Value, View, count_of, is_known, natural, of_numbers, reshaped
+from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers, reshaped
 from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
 from .cpp_writer import FEW, Writer
 
@@ -51,7 +51,7 @@ def _dynamic_update_slice(writer: Writer, equation, operands, kind: str) -> Valu
 
 def _gather(writer: Writer, equation, operands, kind: str) -> Value:
     value, places = operands
-    if is_known(places):
+    if has_known_numbers(places):
         found = gathered_places(value.shape, places, equation.params)
         if found is None:
             raise NotImplementedError("Places outside of an array have no C++ here; keep the indices within it.")
@@ -77,13 +77,13 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
 
 
 def _scatter(writer: Writer, equation, operands, kind: str) -> Value:
-    if is_known(operands[1]):
+    if has_known_numbers(operands[1]):
         return _at_known(writer, equation, operands, lambda before, own: own)
     return _put_at(writer, equation, operands, kind, "=")
 
 
 def _scatter_add(writer: Writer, equation, operands, kind: str) -> Value:
-    if not is_known(operands[1]):
+    if not has_known_numbers(operands[1]):
         return _put_at(writer, equation, operands, kind, "+=")
     return _at_known(
         writer, equation, operands, lambda before, own: writer.one("add", BY_NUMBER["add"], [before, own], kind)

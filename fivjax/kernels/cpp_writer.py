@@ -18,7 +18,7 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
 from ..foundation.jaxprs import within
-from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, is_known, natural, of_numbers
+from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
@@ -166,7 +166,7 @@ class Writer:
                 return View(first[1], (start,), value.shape, natural(value.shape), kind)
         key = kind, tuple(map(text_of, entries))
         base = self._computed(key)
-        if base is None and is_known(value) and entries:
+        if base is None and has_known_numbers(value) and entries:
             base = self.name(kind, "a")
             self.put(f"static const {kind} {base}[{len(entries)}] = {{{', '.join(key[1])}}};")
             self._blocks[-1][key] = base
@@ -222,7 +222,7 @@ class Writer:
         if name in MOVING:
             found = MOVING[name](*operands, params)
             return list(map(self.small, found)) if primitive.multiple_results else [self.small(found)]
-        if all(map(is_known, operands)) and sum(part.size for part in operands) < 4096:
+        if all(map(has_known_numbers, operands)) and sum(part.size for part in operands) < 4096:
             return of_known(equation, operands)
         kinds = [kind_of(variable.aval) for variable in equation.outvars]
         if name in MOVING_ENTRIES and not (name == "concatenate" and any(isinstance(x, View) for x in operands)):
@@ -234,7 +234,7 @@ class Writer:
     def by_number(self, name: str, params, operands: list[Value], kind: str) -> Value:
         if name == "select_n":
             which, *cases = operands
-            if is_known(which) and which.size == 1:
+            if has_known_numbers(which) and which.size == 1:
                 return cases[int(self.entries(which).item())]
             if len(cases) != 2:
                 raise NotImplementedError("A choice among more than two values has no C++ here; write `jnp.where`.")
@@ -268,7 +268,7 @@ class Writer:
         """The same for each number."""
         form = keeping_nan(name, form, kind)
         shape = np.broadcast_shapes(*(part.shape for part in operands))
-        if count_of(shape) > FEW and not all(map(is_known, operands)):
+        if count_of(shape) > FEW and not all(map(has_known_numbers, operands)):
             return self._each_in_loops(name, form, operands, kind, shape)
         spread = np.broadcast_arrays(*map(self.entries, operands))
         found = np.empty(shape, object)
@@ -328,7 +328,7 @@ class Writer:
 
     def folded(self, name: str, value: Value, axes, kind: str) -> Value:
         """A reduction over some axes."""
-        if value.size > FEW and not is_known(value):
+        if value.size > FEW and not has_known_numbers(value):
             return self._folded_in_loops(name, self.view(value, kind), axes)
         value = self.entries(value)
         for axis in sorted(axes, reverse=True):

@@ -61,7 +61,7 @@ class Kick(NamedTuple):
     duration: Float[Array, ""]  # s
 
 
-class _Way(NamedTuple):
+class _Carry(NamedTuple):
     y: State
     contact: Contact
     kick: Kick | None  # what is left of it
@@ -92,10 +92,10 @@ def to_crossing(
     contact = Contact(start.contact.status.astype(jnp.int32), start.contact.direction)
     # The longest wait for a return depends on the scene; the time of the return does not, so the wait has no derivative.
     longest = jax.lax.stop_gradient(longest)
-    begin = _Way(start.y, contact, kick, longest, none, none, none, zero)
+    begin = _Carry(start.y, contact, kick, longest, none, none, none, zero)
     begin = depending_on((mechanics, longest), begin)
 
-    def further(way: _Way) -> _Way:
+    def further(way: _Carry) -> _Carry:
         left, kicked = way.left, jnp.zeros((), bool)
         load = jnp.zeros_like(left)
         if way.kick is not None:
@@ -116,7 +116,7 @@ def to_crossing(
         known = isinstance(peaks, bool)
         peak = jax.lax.cond(peaks, higher, lambda: way.peak) if not known else higher() if peaks else way.peak
         crosses = after.rise.happened & ~kicked
-        return _Way(
+        return _Carry(
             after.y,
             after.contact,
             kick,
@@ -127,16 +127,16 @@ def to_crossing(
             peak,
         )
 
-    def until(way: _Way, crossed) -> _Way:
-        def going(way: _Way):
+    def until(way: _Carry, crossed) -> _Carry:
+        def going(way: _Carry):
             return (way.left > 0) & (way.crossed < crossed) & (way.segments < MOST_SEGMENTS)
 
         return jax.lax.while_loop(going, further, way)
 
-    def here(way: _Way) -> Crossing:
+    def here(way: _Carry) -> Crossing:
         return Crossing(Point(way.y, way.contact), longest - way.left, way.events)
 
-    def row(way: _Way, number):
+    def row(way: _Carry, number):
         number = number.astype(jnp.int32)
         way = until(way, jnp.minimum(number, crossings))
         there = (number > 0) & (way.crossed >= number)

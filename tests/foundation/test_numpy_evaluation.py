@@ -13,7 +13,7 @@ from fivjax.foundation import numpy_evaluation
 from fivjax.foundation.blocks import in_threads
 from fivjax.foundation.linear_solve import solve
 from fivjax.foundation.numpy_evaluation import by_numpy
-from fivjax.foundation.numpy_plans import Plan, plan_of
+from fivjax.foundation.numpy_plans import NumpyPlan, numpy_plan_of
 from fivjax.section.about_sliding import sliding_state
 
 RANDOM = np.random.default_rng(3)
@@ -66,10 +66,10 @@ def of_many_kinds(x, k):
 def test_a_plan_is_text_and_gives_the_same():
     with jax.enable_x64(True):
         traced = jax.make_jaxpr(of_many_kinds)(0.0, 0)
-        plan = json.loads(json.dumps(plan_of(traced)))
+        plan = json.loads(json.dumps(numpy_plan_of(traced)))
         for x, k in ((0.5, 1), (-2.0, 3)):
             expected = jax.jit(of_many_kinds)(x, k)
-            found = Plan(plan)([np.asarray(x), np.asarray(k)])
+            found = NumpyPlan(plan)([np.asarray(x), np.asarray(k)])
             for own, other in zip(found, expected, strict=True):
                 assert own.dtype == other.dtype
                 np.testing.assert_allclose(own, other, rtol=1e-14)
@@ -78,10 +78,10 @@ def test_a_plan_is_text_and_gives_the_same():
 def test_what_numpy_does_not_have_is_left_to_jax():
     """As a part of the function, which is then no text; and for indices outside of their array."""
     with jax.enable_x64(True):
-        plan = plan_of(jax.make_jaxpr(lambda x: jax.scipy.special.erf(x) + 1)(0.5))
+        plan = numpy_plan_of(jax.make_jaxpr(lambda x: jax.scipy.special.erf(x) + 1)(0.5))
         with pytest.raises(TypeError, match="serializable"):
             json.dumps(plan)
-        assert Plan(plan)([np.asarray(0.5)])[0] == pytest.approx(1.5204998778)
+        assert NumpyPlan(plan)([np.asarray(0.5)])[0] == pytest.approx(1.5204998778)
         beyond = by_numpy(lambda x, k: x.at[k].get(mode="fill", fill_value=-1.0))
         assert (
             float(beyond(np.arange(3.0), np.asarray(5))) == -1.0 and float(beyond(np.arange(3.0), np.asarray(1))) == 1.0
