@@ -1,11 +1,16 @@
 """Parts of what JAX traces, whichever version of JAX has traced it."""
 
 import functools
+import weakref
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+# What depends on what in traced functions, while these are there: loops inside loops are asked again and again.
+_known_dependence: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[bool]]] = weakref.WeakKeyDictionary()
 
 
 def within(params) -> ClosedJaxpr | None:
@@ -43,3 +48,56 @@ def solution(params, operands: Sequence) -> tuple[ClosedJaxpr, list]:
     ends = np.cumsum(lengths).tolist()
     end = ends[list(lengths._fields).index("solve")]
     return solve, [*operands[end - lengths.solve : end], *operands[ends[-1] :]]
+
+
+def dependent_results(jaxpr: Jaxpr, given: Sequence[bool]) -> list[bool]:
+    """Which results of a traced function depend on those of its operands that are `given`, as real numbers do: an integer or a
+    choice does not change with a small change of a real number.
+    """
+    known, flags = _known_dependence.setdefault(jaxpr, {}), tuple(map(bool, given))
+    if flags not in known:
+        known[flags] = _dependent_results(jaxpr, flags)
+    return known[flags]
+
+
+def carried_dependence(
+    body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool]
+) -> tuple[list[bool], list[bool]]:
+    """Which of the numbers that a loop carries depend on what is given, from its first turn or a later one, and which results of
+    its body.
+    """
+    while True:
+        after = dependent_results(body, [*fixed, *begin, *along])
+        more = [one or other for one, other in zip(begin, after[: len(begin)], strict=True)]
+        if more == begin:
+            return begin, after
+        begin = more
+
+
+def _dependent_results(jaxpr: Jaxpr, given: Sequence[bool]) -> list[bool]:
+    depends = dict(zip(jaxpr.invars, given, strict=True))
+
+    def reads(atom) -> bool:
+        return not isinstance(atom, Literal) and depends.get(atom, False)
+
+    for equation in jaxpr.eqns:
+        flags, name, params = list(map(reads, equation.invars)), equation.primitive.name, equation.params
+        if name == "while":
+            asked, fixed = params["cond_nconsts"], params["body_nconsts"]
+            begin = flags[asked + fixed :]
+            found, _ = carried_dependence(params["body_jaxpr"].jaxpr, flags[asked:][:fixed], begin, [])
+        elif name == "scan":
+            fixed, carried = of_scan(params)
+            body, begin = params["jaxpr"].jaxpr, flags[fixed:][:carried]
+            begin, after = carried_dependence(body, flags[:fixed], begin, flags[fixed + carried :])
+            found = [*begin, *after[carried:]]
+        elif name == "cond":
+            ways = (dependent_results(branch.jaxpr, flags[1:]) for branch in params["branches"])
+            found = [any(each) for each in zip(*ways, strict=True)]
+        elif name != "custom_linear_solve" and isinstance(called := within(params), ClosedJaxpr):
+            found = dependent_results(called.jaxpr, flags)
+        else:
+            found = [any(flags)] * len(equation.outvars)
+        for variable, does in zip(equation.outvars, found, strict=True):
+            depends[variable] = does and jnp.issubdtype(variable.aval.dtype, jnp.inexact)
+    return list(map(reads, jaxpr.outvars))

@@ -14,7 +14,7 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array
 
-from .jaxprs import of_scan, within
+from .jaxprs import carried_dependence, dependent_results, of_scan, within
 
 
 class Series(NamedTuple):
@@ -300,8 +300,7 @@ def _scan(params, operands: list, length: int) -> list:
     constants, carried = of_scan(params)
     body = params["jaxpr"]
     fixed, begin, along = operands[:constants], operands[constants:][:carried], operands[constants + carried :]
-    moving = _moving_carry(body.jaxpr, fixed, begin, along)
-    ends = _moved(body.jaxpr, [*_flags(fixed), *moving, *_flags(along)])
+    moving, ends = carried_dependence(body.jaxpr, _flags(fixed), _flags(begin), _flags(along))
 
     def step(carry, x):
         found = _as_series(_run(body.jaxpr, body.consts, [*fixed, *carry, *x], length), ends, length)
@@ -318,7 +317,7 @@ def _while(params, operands: list, length: int) -> list:
     of_condition, of_body = params["cond_nconsts"], params["body_nconsts"]
     condition, body = params["cond_jaxpr"], params["body_jaxpr"]
     asked, fixed, begin = operands[:of_condition], operands[of_condition:][:of_body], operands[of_condition + of_body :]
-    moving = _moving_carry(body.jaxpr, fixed, begin, [])
+    moving, _ = carried_dependence(body.jaxpr, _flags(fixed), _flags(begin), [])
 
     def going(carry):
         return _run(condition.jaxpr, condition.consts, list(map(_value, [*asked, *carry])), length)[0]
@@ -332,7 +331,8 @@ def _while(params, operands: list, length: int) -> list:
 def _cond(params, operands: list, length: int) -> list:
     index, *rest = operands
     ends = [
-        any(flags) for flags in zip(*(_moved(branch.jaxpr, _flags(rest)) for branch in params["branches"]), strict=True)
+        any(flags)
+        for flags in zip(*(dependent_results(branch.jaxpr, _flags(rest)) for branch in params["branches"]), strict=True)
     ]
 
     def way(branch):
@@ -346,28 +346,3 @@ LOOPS: dict[str, Callable] = {"scan": _scan, "while": _while, "cond": _cond, "se
 
 def _flags(parts: Sequence) -> list[bool]:
     return [isinstance(part, Series) for part in parts]
-
-
-def _moved(jaxpr: Jaxpr, moving: Sequence[bool]) -> list[bool]:
-    """Which results are series if these operands are: real numbers that depend on one."""
-    moves = dict(zip(jaxpr.invars, moving, strict=True))
-
-    def reads(atom) -> bool:
-        return not isinstance(atom, Literal) and moves.get(atom, False)
-
-    for equation in jaxpr.eqns:
-        any_moves = any(map(reads, equation.invars))
-        for variable in equation.outvars:
-            moves[variable] = any_moves and jnp.issubdtype(variable.aval.dtype, jnp.inexact)
-    return list(map(reads, jaxpr.outvars))
-
-
-def _moving_carry(body: Jaxpr, fixed, begin, along) -> list[bool]:
-    """Which of the numbers that a loop carries are series, from its first turn or a later one."""
-    moving = _flags(begin)
-    while True:
-        after = _moved(body, [*_flags(fixed), *moving, *_flags(along)])[: len(moving)]
-        more = [one or other for one, other in zip(moving, after, strict=True)]
-        if more == moving:
-            return moving
-        moving = more

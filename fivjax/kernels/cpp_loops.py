@@ -1,13 +1,11 @@
 """Loops and branches as C++, and which of the numbers that they carry are tangents."""
 
-import weakref
 from collections.abc import Callable, Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr
 
-from ..foundation.jaxprs import of_scan, solution, within
+from ..foundation.jaxprs import carried_dependence, dependent_results, of_scan, solution
 from .cpp_arrays import Value, View, of_text
 from .cpp_numbers import WIDE, base_of, kind_of, same, text_of
 from .cpp_writer import Writer
@@ -77,7 +75,7 @@ def _cond(writer: Writer, equation, operands) -> list[Value]:
         chosen = branches[min(max(int(which), 0), last)]
         return writer.run(chosen.jaxpr, chosen.consts, rest)
     flags = list(map(writer.is_wide, rest))
-    wide = [any(each) for each in zip(*(wide_results(branch.jaxpr, flags) for branch in branches), strict=True)]
+    wide = [any(each) for each in zip(*(dependent_results(branch.jaxpr, flags) for branch in branches), strict=True)]
     found = [
         unset_variable(writer, variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
         for variable, is_wide in zip(equation.outvars, wide, strict=True)
@@ -102,61 +100,9 @@ RULES: dict[str, Callable] = {"while": _while, "scan": _scan, "cond": _cond, "cu
 def _types_carried(writer: Writer, body: Jaxpr, fixed, begin, along, variables) -> tuple[list[str], list[bool]]:
     """The types of what a loop carries, and which of the body's results are wide."""
     wide = list(map(writer.is_wide, begin))
-    wide, after = _carried(body, list(map(writer.is_wide, fixed)), wide, list(map(writer.is_wide, along)))
+    wide, after = carried_dependence(body, list(map(writer.is_wide, fixed)), wide, list(map(writer.is_wide, along)))
     kinds = [WIDE if is_wide else kind_of(variable.aval) for is_wide, variable in zip(wide, variables, strict=True)]
     return kinds, after
-
-
-def _carried(body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool]) -> tuple[list[bool], list[bool]]:
-    """Which of the numbers that a loop carries are wide, from its first turn or a later one, and which of its results."""
-    while True:
-        after = wide_results(body, [*fixed, *begin, *along])
-        more = [one or other for one, other in zip(begin, after[: len(begin)], strict=True)]
-        if more == begin:
-            return begin, after
-        begin = more
-
-
-# What was found of traced functions, while these are there: loops inside loops are asked again and again.
-_known_wide: weakref.WeakKeyDictionary[Jaxpr, dict[tuple[bool, ...], list[bool]]] = weakref.WeakKeyDictionary()
-
-
-def wide_results(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
-    """Which results of a traced function are wide if these of its operands are: real numbers that depend on one."""
-    known, given = _known_wide.setdefault(jaxpr, {}), tuple(map(bool, wide))
-    if given not in known:
-        known[given] = _wide_results(jaxpr, given)
-    return known[given]
-
-
-def _wide_results(jaxpr: Jaxpr, wide: Sequence[bool]) -> list[bool]:
-    moves = dict(zip(jaxpr.invars, wide, strict=True))
-
-    def reads(atom) -> bool:
-        return not isinstance(atom, Literal) and moves.get(atom, False)
-
-    for equation in jaxpr.eqns:
-        flags, name, params = list(map(reads, equation.invars)), equation.primitive.name, equation.params
-        if name == "while":
-            asked, fixed = params["cond_nconsts"], params["body_nconsts"]
-            begin = flags[asked + fixed :]
-            found, _ = _carried(params["body_jaxpr"].jaxpr, flags[asked:][:fixed], begin, [])
-        elif name == "scan":
-            fixed, carried = of_scan(params)
-            begin, after = _carried(
-                params["jaxpr"].jaxpr, flags[:fixed], flags[fixed:][:carried], flags[fixed + carried :]
-            )
-            found = [*begin, *after[carried:]]
-        elif name == "cond":
-            ways = (wide_results(branch.jaxpr, flags[1:]) for branch in params["branches"])
-            found = [any(each) for each in zip(*ways, strict=True)]
-        elif name not in RULES and isinstance(called := within(params), ClosedJaxpr):
-            found = wide_results(called.jaxpr, flags)
-        else:
-            found = [any(flags)] * len(equation.outvars)
-        for variable, is_wide in zip(equation.outvars, found, strict=True):
-            moves[variable] = is_wide and jnp.issubdtype(variable.aval.dtype, jnp.inexact)
-    return list(map(reads, jaxpr.outvars))
 
 
 # ------------------------------------------------------------------------------------ what loops and branches change
