@@ -63,8 +63,8 @@ def dependent_results(jaxpr: Jaxpr, given: Sequence[bool]) -> list[bool]:
 def carried_dependence(
     body: Jaxpr, fixed: list[bool], begin: list[bool], along: list[bool]
 ) -> tuple[list[bool], list[bool]]:
-    """Which of the numbers that a loop carries depend on what is given, from its first turn or a later one, and which results of
-    its body.
+    """Which of the numbers that a loop carries depend on what is given, from its first turn or a later one; and which results
+    of its body.
     """
     while True:
         after = dependent_results(body, [*fixed, *begin, *along])
