@@ -93,6 +93,11 @@ def test_motions_that_creep_along_a_line_of_states_are_on_no_common_torus():
     creeping = np.linspace(0.0, 3.0, 96) + np.zeros((8, 1))
     assert not _on_one_torus(windings(creeping, radius=0.01))
     assert not _on_one_torus(np.where(np.arange(96)[:, None] > 90, np.nan, windings(np.zeros((8, 1)))))
+    # One that passes by is enough, though its mean is that of the others.
+    passing = np.zeros((8, 96))
+    assert _on_one_torus(windings(passing, radius=0.01))
+    passing[-1] = np.linspace(-0.1, 0.1, 96)
+    assert not _on_one_torus(windings(passing, radius=0.01))
 
 
 class Winding:
