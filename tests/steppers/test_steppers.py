@@ -324,7 +324,7 @@ def test_a_law_that_falls_fast_does_not_ask_how_often_the_run_is_saved(law, belt
 
 
 def test_a_motion_takes_no_more_segments_than_it_is_allowed():
-    """A spring swings for ten periods, of which a step covers a part: a few segments leave time over, hundreds none."""
+    """A spring swings for ten periods, of which a step covers a part: a few segments leave time over, thousands none."""
     scene = point_mass(belt_speed=1.0)
     with jax.enable_x64(True):
         mechanics, load, contact = begun(scene, jnp.array([0.5, 0.0, 0.0, 0.0]))
@@ -335,7 +335,7 @@ def test_a_motion_takes_no_more_segments_than_it_is_allowed():
                 LOW_ORDER, mechanics, contact, load, jnp.array([0.5, 0.0, 0.0, 0.0]), 20 * jnp.pi, most=most, kind="lax"
             )
 
-        few, many = (jax.tree.map(np.asarray, after(most)) for most in (3, 1000))
+        few, many = (jax.tree.map(np.asarray, after(most)) for most in (3, 10_000))
     assert not few.enough and 0 < few.left < 20 * np.pi
     assert many.enough and many.left == 0
     np.testing.assert_allclose(many.y, [0.5, 0.0, 0.0, 0.0], atol=1e-9)
