@@ -20,11 +20,11 @@ from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
 from ..section.return_maps import BLOCK, Section, of_block
+from ..simulation.ending import UNBOUNDED_FROM
 from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
 from .groups import GroupConstants, Task, constants_of, with_values
 from .matrix_kernels import MatrixKernels, begin_building
 from .one_trajectory import (
-    UNBOUNDED_FROM,
     Progress,
     Setting,
     conclude,

@@ -14,6 +14,7 @@ from .. import contact as physics
 from ..contact import Contact, State
 from ..model.load import AbstractLoad
 from ..model.scene import Scene, steady_sliding
+from ..simulation.ending import UNBOUNDED_FROM
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
@@ -24,10 +25,6 @@ from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
 from .groups import GroupConstants
-
-# A deviation counts as unbounded if it is this much larger than the equilibrium displacements under the largest load, the
-# belt's motion and the start.
-UNBOUNDED_FROM = 1e9
 
 
 class Progress(eqx.Module):

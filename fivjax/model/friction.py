@@ -28,7 +28,7 @@ class AbstractFriction(eqx.Module):
     r"""A friction law: what `contact` and the verdicts ask of one, and what they rely on.
 
     - `law(v)` is the coefficient at slip speed $v \ge 0$ in m/s: any JAX function that is continuous, with loops, branches
-      and tables if need be. Where it has a kink, steps end there.
+      and tables if need be, from one real number in double precision to another. Where it has a kink, steps end there.
     - `static`, the largest |T|/N that a sticking contact holds, is at least μ(0): a contact with less static than sliding
       friction would chatter without end. Unless defined, it is μ(0). At higher speeds μ may exceed it.
     - `variation(v)` bounds $|μ'|$ and $|μ''|$ at and above $v$ (in s/m and s²/m²): proofs that sliding goes on rest on it.

@@ -20,8 +20,8 @@ class Ending(enum.IntEnum):
     STEP_FAILURE = -8
 
 
-# A motion this much larger than its start, the belt's motion and the effect of the load counts as unbounded.
-GROWTH = 1e9
+# A motion this much larger than its start, the belt's motion and the effect of the largest load counts as unbounded.
+UNBOUNDED_FROM = 1e9
 
 ENDING = {
     Ending.FINISHED: "reached its end",

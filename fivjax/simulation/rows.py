@@ -22,7 +22,7 @@ from ..model.sliding import contact_coordinates
 from ..steppers.base import AbstractStepper
 from ..steppers.core import Segment
 from . import energy as accounts
-from .ending import GROWTH
+from .ending import UNBOUNDED_FROM
 from .energy import EnergyData, Ledger
 from .jump_instants import StartOfRun, load_before, moment, start_of_run
 from .stretches import Begin, go_on
@@ -151,7 +151,7 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
 
 
 def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array, ""], y: State) -> Bool[Array, ""]:
-    """Whether a state is `GROWTH` times larger than the start, the belt's motion and the effect of the highest load."""
+    """Whether a state is `UNBOUNDED_FROM` times larger than the start, the belt's motion and the effect of the highest load."""
     structure = scene.structure
     weights, n = structure.weights, structure.size
     tangential, _ = contact_coordinates(structure)
@@ -159,7 +159,7 @@ def grown(scene: Scene, start: State, t: Float[Array, ""], highest: Float[Array,
     # A free structure is accelerated by a load for as long as it lasts.
     pushed = jnp.max(jnp.abs(structure.load_direction) / weights[n:]) * highest * t
     expected = jnp.max(jnp.abs(weights * start)) + belt + pushed
-    return jnp.max(jnp.abs(weights * y)) > GROWTH * expected
+    return jnp.max(jnp.abs(weights * y)) > UNBOUNDED_FROM * expected
 
 
 def contact_after_jump(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, now) -> Contact:
