@@ -272,22 +272,17 @@ def _all(mechanics: Mechanics, each: Bool[Array, "*contacts"]) -> Bool[Array, ""
     return jnp.all(each) if mechanics.several else each
 
 
-def along_rows(
-    energy_data: EnergyData,
-    mechanics: Mechanics,
-    contacts: Contact,
-    loads: Float[Array, " T"],
-    ys: Float[Array, "T state"],
-    rows: Ledger,
+def energy_of(
+    energy_data: EnergyData, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State, ledger: Ledger
 ) -> Energy:
-    """The ledger of a trajectory, from its rows and the ledger at each of them."""
+    """The energies at one instant, with the ledger up to it."""
     structure = energy_data.structure
     return Energy(
-        kinetic=jax.vmap(lambda y: kinetic_energy(structure, y))(ys),
-        elastic=jax.vmap(lambda y: elastic_energy(structure, y))(ys),
-        power=jax.vmap(lambda c, f, y: powers(energy_data, mechanics, c, f, y))(contacts, loads, ys),
-        ledger=rows,
-        residual=jax.vmap(lambda ledger, y: residual(energy_data, ledger, y))(rows, ys),
+        kinetic=kinetic_energy(structure, y),
+        elastic=elastic_energy(structure, y),
+        power=powers(energy_data, mechanics, contact, load, y),
+        ledger=ledger,
+        residual=residual(energy_data, ledger, y),
     )
 
 

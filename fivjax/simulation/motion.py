@@ -25,7 +25,7 @@ from . import energy as accounts
 from .ending import Ending
 from .energy import EnergyData, Ledger
 from .jump_instants import StartOfRun, load_from, next_jump, start_of_run
-from .rows import contact_after_jump, grown
+from .rows import contact_after_jump, grown, row_of
 
 
 class MotionAsked(eqx.Module):
@@ -127,7 +127,7 @@ def _followed(args, instants, method: EventExact):
         # A row at a jump of the load shows the load and the contact just after it.
         on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
         contact = contact_after_jump(mechanics, now.contact, load, y, on_jump)
-        row = _row(mechanics, accounts_of, contact, load, y, ledger, lost)
+        row = row_of(mechanics, accounts_of, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
         return (now, lost, ending), row
 
@@ -210,28 +210,3 @@ def _at(mechanics: Mechanics, method: EventExact, accounts_of, now: Step, instan
     after = advance_between(now.y, y, none, y, now.contact, instant - now.t, mechanics)
     segment = Segment(now.t, now.load, now.contact, now.y, after)
     return y, accounts.enter(accounts_of, method, mechanics, now.ledger, segment)
-
-
-def _row(mechanics: Mechanics, accounts_of, contact: Contact, load, y: State, ledger, lost) -> dict:
-    n = y.shape[0] // 2
-    friction_force, normal_force = physics.contact_forces(mechanics, contact, load, y)
-    acceleration = physics.acceleration(mechanics, contact, load, y)
-
-    def known(value):
-        return jnp.where(lost, jnp.nan, value)
-
-    energy = None
-    if accounts_of is not None:
-        of_one = jax.tree.map(lambda leaf: leaf[None], (contact, load, y, ledger))
-        energy = jax.tree.map(lambda leaf: leaf[0], accounts.along_rows(accounts_of, mechanics, *of_one))
-    return {
-        "displacement": y[:n],
-        "velocity": y[n:],
-        # What a contact mode forbids is zero whatever the state.
-        "acceleration": known(acceleration),
-        "status": contact.status.astype(jnp.int32),
-        "normal_force": known(normal_force),
-        "friction_force": known(friction_force),
-        "load": load,
-        "energy": energy,
-    }

@@ -122,31 +122,42 @@ def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, 
     unbounded = finite & (jnp.cumsum(beyond) > 0)
     kept = finite & ~unbounded
 
-    def known(rows):
-        return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.nan)
-
-    y = known(y)
+    y = jnp.where(kept[:, None], y, jnp.nan)
     # A row at a jump of the load shows the load and the contact just after it.
     on_jump = jnp.any(saved[:, None] == scene.load.jumps, axis=-1) & (jnp.arange(len(saved)) > 0)
     contacts = jax.vmap(lambda c, f, x, now: contact_after_jump(mechanics, c, f, x, now))(contacts, load, y, on_jump)
-    n = scene.structure.size
-    friction_force, normal_force = jax.vmap(lambda c, f, x: physics.contact_forces(mechanics, c, f, x))(
-        contacts, load, y
-    )
+    rows = jax.vmap(lambda *own: row_of(mechanics, energy_data, *own))(contacts, load, y, ledgers, ~kept)
+    return {"t": saved, **rows, "status": rows["status"].astype(jnp.int8), "grown": unbounded}
+
+
+def row_of(
+    mechanics: Mechanics,
+    energy_data: EnergyData | None,
+    contact: Contact,
+    load: Float[Array, ""],
+    y: State,
+    ledger: Ledger | None,
+    lost: Bool[Array, ""],
+) -> dict:
+    """What a `Trajectory` has at one instant, by name; NaN where the motion has been `lost` before."""
+    n = y.shape[0] // 2
+    friction_force, normal_force = physics.contact_forces(mechanics, contact, load, y)
+
+    def known(value):
+        return jnp.where(lost, jnp.nan, value)
+
     return {
-        "t": saved,
-        "displacement": y[:, :n],
-        "velocity": y[:, n:],
+        "displacement": y[:n],
+        "velocity": y[n:],
         # What a contact mode forbids is zero whatever the state.
-        "acceleration": known(jax.vmap(lambda c, f, x: physics.acceleration(mechanics, c, f, x))(contacts, load, y)),
-        "status": contacts.status.astype(jnp.int8),
+        "acceleration": known(physics.acceleration(mechanics, contact, load, y)),
+        "status": contact.status.astype(jnp.int32),
         "normal_force": known(normal_force),
         "friction_force": known(friction_force),
         "load": load,
-        "grown": unbounded,
         "energy": None
-        if energy_data is None
-        else accounts.along_rows(energy_data, mechanics, contacts, load, y, ledgers),
+        if energy_data is None or ledger is None
+        else accounts.energy_of(energy_data, mechanics, contact, load, y, ledger),
     }
 
 
