@@ -24,7 +24,7 @@ from ..steppers.core import Segment
 from . import energy as accounts
 from .ending import UNBOUNDED_FROM
 from .energy import EnergyData, Ledger
-from .jump_instants import StartOfRun, load_before, moment, start_of_run
+from .jump_instants import StartOfRun, load_before, load_from, moment, start_of_run
 from .stretches import Begin, go_on
 
 # Intervals between saved instants in a part.
@@ -243,11 +243,7 @@ def mode_and_ledger_at_start(
     scene: Scene, y0: State, instants: Float[Array, " T"], energy_data: EnergyData | None
 ) -> tuple[Contact, Ledger | None]:
     """The contact mode and the ledger of a run that begins at the first of these instants."""
-    # The load at a jump itself is not defined.
-    ends = _ends(scene, instants)
-    until = jnp.min(jnp.where(ends > instants[0], ends, jnp.inf))
-    load = scene.load(jnp.where(jnp.isfinite(until), 0.5 * (instants[0] + until), instants[0]))
-    contact = physics.status_from_forces(Mechanics(scene), load, y0)
+    contact = physics.status_from_forces(Mechanics(scene), load_from(scene.load, instants[0]), y0)
     return contact, None if energy_data is None else accounts.open_ledger(energy_data, y0)
 
 
