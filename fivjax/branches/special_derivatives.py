@@ -10,6 +10,7 @@ of values that are exact to rounding.
 import numpy as np
 from jaxtyping import Float
 
+from ..contact import Status
 from ..linear.linearisation import sliding_rates
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of
@@ -50,7 +51,7 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
     if special.multiplier is not None:
         return _of_multiplier(family, special, name, own, slope)
-    if special.row is None:
+    if special.row is None or (name == "restitution" and _ends_a_rebound(family, special)):
         return np.nan
     last, row = 0.0, special.row
     if special.grazing is not None:
@@ -60,8 +61,22 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         row = row_of(curve, cycle.phases, special.grazing.minimum, itself)
     system = np.vstack([own, row])
     sizes = np.max(np.abs(system), axis=1)
-    change = np.linalg.solve(system / sizes[:, None], -np.append(slope, last) / sizes)
+    scaled = system / sizes[:, None]
+    # Where two special points coincide the equations do not tell them apart. Else this is some thousand.
+    if not np.linalg.cond(scaled) < 1e10:
+        return np.nan
+    change = np.linalg.solve(scaled, -np.append(slope, last) / sizes)
     return float(change[-1] * curve.scales[-1])
+
+
+def _ends_a_rebound(family: Family, special: Special) -> bool:
+    """Whether at this point a landing without restitution is about to lift off again. With a little restitution its rebound
+    grows from nothing to a flight, and there is no such point.
+    """
+    if special.grazing is None or np.any(np.asarray(family.scene.restitution) > 0):
+        return False
+    minimum, modes = special.grazing.minimum, special.cycle.phases.modes
+    return minimum.time == 0 and modes[minimum.phase - 1].status == Status.DETACH
 
 
 def _of_stability_limit(family: Family, limit: float, name: str) -> float:
@@ -96,7 +111,15 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
         which = critical_multiplier(multipliers_of(at.images), special.name)
         return np.nan if which is None else abs(which)
 
-    with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)
+    if name == "restitution" and value < by:
+        # No impact has less than none. With a little, a landing that comes to rest does so by ever smaller rebounds, which are
+        # no phases here: what they change of the multipliers is not worked out.
+        modes = cycle.phases.modes
+        if any(a.status == Status.DETACH != b.status for a, b in zip(modes, modes[1:] + modes[:1], strict=True)):
+            return np.nan
+        with_other = (4 * size(0.0, by) - 3 * size(0.0, 0.0) - size(0.0, 2 * by)) / (2 * by)
+    else:
+        with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)
     with_own = (size(step, 0.0) - size(-step, 0.0)) / (2 * step)
     return float(-with_other / with_own * curve.scales[-1])
 

@@ -188,7 +188,9 @@ def _resting(
         if mechanics.rest is not None:
             _, g_tn, g_nn = mechanics.compliance
             fall = fall - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
-    rests = rising | (touched & (rate + 0.5 * fall * resolution <= 0))
+    # One that is about to lift off anyway has no rebound, even if its rate is zero: with restitution it would lift off sooner.
+    at_end = rate + 0.5 * fall * resolution
+    rests = rising | (touched & ((at_end < 0) | ((at_end == 0) & (fall <= 0))))
     return with_contact_coordinates(
         mechanics,
         y,

@@ -314,3 +314,35 @@ def test_the_torus_beside_a_branch_is_what_the_independent_solver_comes_to():
     assert tori["kind"].values[-1] == "torus" and float(tori["parameter"][-1]) == 3.0
     assert float(tori["amplitude"][-1]) == pytest.approx(stored["peak_speed"], rel=2e-3)
     fj.plot.branch(branch, tori=tori)
+
+
+@pytest.mark.slow
+def test_restitution_moves_special_points_where_a_landing_lifts_off_again():
+    """Against the fold of a branch with a little restitution. What has no derivative by it says so: at a landing that is about to
+    lift off again, and of a multiplier where a landing comes to rest."""
+
+    def over_belt_speed(speed, restitution, bounds, start=None):
+        structure, friction = fj.belt_oscillator(k1=99e3), fj.Coulomb(0.2, 0.26)
+        scene = fj.Scene(structure, friction, speed, fj.ConstantLoad(100.0), restitution=restitution)
+        start = start and fj.limit_cycle(scene, start)
+        return fj.continue_cycle(scene, "belt_speed", bounds, start, points=120, derivatives=True)
+
+    branch, share = over_belt_speed(0.6, 0.0, (0.2, 3.0)), 1e-5
+    by_restitution = dict(zip(branch.special.values, branch.d_special.sel(of="restitution").values, strict=True))
+    assert np.isnan(by_restitution["grazing of N: impact inserted"]) and np.isnan(by_restitution["Neimark–Sacker"])
+    fold = int(np.flatnonzero((branch.special.values == "fold") & (branch.parameter.values > 0.9))[0])
+    beside, at = fj.cycle_at(branch, fold - 2), float(branch.parameter[fold - 2])
+    other = over_belt_speed(at, share, (at - 0.02, at + 0.02), beside)
+    moved = other.parameter.values[other.special.values == "fold"] - float(branch.parameter[fold])
+    slope = float(branch.d_special.sel(of="restitution")[fold])
+    assert moved[np.argmin(np.abs(moved))] / share == pytest.approx(slope, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_two_special_points_at_once_have_no_derivatives():
+    """Their equations do not tell them apart: a number of 1e13 came out."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.35, 0.2, 1.0), 1.0, fj.ConstantLoad(100.0))
+    branch = fj.continue_cycle(scene, "belt_speed", (0.1, 4.0), points=120, derivatives=True)
+    both = np.flatnonzero(np.abs(branch.parameter.values - 1.16454938) < 1e-7)
+    assert len(both) and np.all(np.isnan(branch.d_special.values[both]))
+    assert np.nanmax(np.abs(branch.d_special.values)) < 1e4

@@ -430,6 +430,25 @@ def test_rebounds_come_to_rest_at_the_resolution_only():
     assert (kind, after[3]) == (Status.SLIDE, 0.0)
 
 
+@pytest.mark.parametrize("resolution", [0.0, 1e-9])
+def test_a_landing_that_lifts_off_again_does_so_sooner_with_restitution(resolution):
+    """A pull of 4.5 N takes the mass away from the belt, which it meets at 0.5 m/s: its speed away grows by that with restitution,
+    from none. Derivatives lost it where time was resolved exactly."""
+    with jax.enable_x64(True):
+        detached, y = as_contact(Status.DETACH, 1.0), jnp.array([0.0, 0.0, 0.4, -0.5])
+        ended = jnp.array([True, True])
+
+        def after(restitution):
+            scene = belt_block(BLOCK).replace(restitution=restitution)
+            contact, after = _transition(scene, detached, jnp.asarray(-4.5), y, ended, jnp.asarray(resolution))
+            return after[3], contact.status
+
+        rate, slope, status = jax.jvp(after, (jnp.zeros(()),), (jnp.ones(()),), has_aux=True)
+        rate, slope, status = float(rate), float(slope), int(status)
+    assert (rate, status) == (0.0, Status.DETACH)
+    assert slope == pytest.approx(0.5, rel=1e-14)
+
+
 def test_a_rebound_that_rounding_ends_at_once_comes_to_rest():
     """A step ends at its start, because the gap is zero and its rate as good as zero, though rising. Two contacts that bounced went
     on so for ever: an impulse that presses cannot take the rate away."""
