@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 from .coordinates import spread
 from .forces import (
     State,
+    acceleration,
     contact_forces,
     degrees_of_freedom,
     gap,
@@ -107,8 +108,9 @@ def after_brief_flight(mechanics: Mechanics, contact: Contact, load: Float[Array
     else:
         slip = relative_velocity(mechanics, y)
         mu = mechanics.friction(jnp.abs(slip))
-        # After an impact that ended the slip, it is what the flight leaves.
-        left = -(g_tt * tangential_force + g_tn * normal_force) * flight
+        # After an impact that ended the slip, it is what the flight leaves: without contact forces.
+        along = acceleration(mechanics, contact, load, y)[mechanics.tangential]
+        left = (along - g_tt * tangential_force - g_tn * normal_force) * flight
         ending, ending_normal = _ending_slip(mechanics, left, jnp.ones_like(left))
         ends_slip = (slip == 0) & (jnp.abs(ending) <= mu * ending_normal)
         dragging = 1.0 / mechanics.normal_compliance(contact.direction, mu)

@@ -31,7 +31,7 @@ R = TypeVar("R")
 
 
 def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R]:
-    """`compiled`, but the first calls with known values are computed by NumPy; results are then arrays of NumPy.
+    """`compiled`, but the first calls with known values are computed by NumPy; results of all such calls are arrays of NumPy.
 
     With `always`, so are later calls: where it matters that all are rounded alike.
     """
@@ -51,11 +51,11 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
         if (found := latest.get(key)) is None:
             calls[form] += 1
             if calls[form] > REPAID and not always:
-                return otherwise(*args, **kwargs)
+                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
             try:
                 latest[key] = found = computed(form, arrays)
             except NoSuchCase:
-                return otherwise(*args, **kwargs)
+                return jax.tree.map(_numbers, otherwise(*args, **kwargs))
             with contextlib.suppress(KeyError):  # where threads leave out the same
                 while len(latest) > (FEW if always else LATEST):
                     latest.popitem(last=False)
@@ -72,8 +72,7 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
         # As in JAX, what is no number comes without a warning.
         with np.errstate(all="ignore"):
             found = plan(given)
-        # Numbers are NumPy's own, which Python's functions take.
-        return jax.tree.unflatten(structure, [leaf[()] for leaf in found])
+        return jax.tree.unflatten(structure, list(map(_numbers, found)))
 
     # It is kept by this name.
     @functools.wraps(function)
@@ -87,6 +86,11 @@ def by_numpy(function: Callable[P, R], *, always: bool = False) -> Callable[P, R
         return structure, NumpyPlan(plan)
 
     return call
+
+
+def _numbers(array):
+    # Single ones are NumPy's own, which Python's functions take.
+    return np.asarray(array)[()]
 
 
 def _traced(function: Callable, form: Form) -> tuple:

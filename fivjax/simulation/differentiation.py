@@ -29,6 +29,9 @@ from .trajectory import Trajectory, simulate
 # What has a derivative that is not worked out.
 JUMPS_AT_ONCE = "two jumps of the load, which a parameter moves apart,"
 LANDINGS_OF_SEVERAL = "a landing without restitution, of several contacts under this impact law,"
+HELD_BY_STATIC_FRICTION = (
+    "a landing after which static friction alone holds the contact, which the least rebound makes slide,"
+)
 
 
 class Derivatives(eqx.Module):
@@ -188,6 +191,8 @@ def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: Close
     several = len(scene.structure.places) > 1 and scene.impact_law != "coulomb"
     if several and calls.landed and np.any(inelastic):
         return dataclasses.replace(calls, closest=0.0, event=LANDINGS_OF_SEVERAL)
+    if calls.held < 0 and np.any(inelastic):
+        return dataclasses.replace(calls, closest=0.0, event=HELD_BY_STATIC_FRICTION)
     return None
 
 

@@ -29,7 +29,15 @@ from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.kernel_scope import has_kernel
-from .event_margins import DECISIONS, DECISIONS_OF_SEVERAL, LOOKS, AdvanceMargins, advance_margins, margin_from_cone
+from .event_margins import (
+    DECISIONS,
+    DECISIONS_OF_SEVERAL,
+    LOOKS,
+    AdvanceMargins,
+    advance_margins,
+    held_by_sliding,
+    margin_from_cone,
+)
 
 GUARDS = {
     (Status.STICK, 0): "the friction force reaching one edge of the friction cone",
@@ -53,6 +61,7 @@ class ClosestCall(eqx.Module):
     at: float  # s
     event: str
     landed: bool = False  # whether a contact has come back to the belt
+    held: float = np.inf  # smallest relative margin by which the friction of sliding holds one that then sticks
 
 
 def closest_call(
@@ -151,7 +160,7 @@ class _Seen:
         # Distances by guard, in its own unit, and decisions, which are relative already.
         self.calls: list[tuple[tuple[int, int, int], float, float]] = []
         self.decisions: list[tuple[float, float, str]] = []
-        self.events, self.landed = 0, False
+        self.events, self.landed, self.held = 0, False, np.inf
         # Contacts on which another's event has just acted while their own status lasted, and their guards before it.
         self.struck = np.zeros(count, bool)
         self.before = np.zeros((count, 2))
@@ -192,6 +201,7 @@ class _Seen:
             self.decisions += [(float(m), at, name) for m, name in zip(look.decisions, names, strict=True)]
             self.events += 1
             self.landed |= bool(np.any((status == Status.DETACH) & (after != Status.DETACH)))
+            self.held = min(self.held, float(look.held))
         elif arrives:
             # An event at a jump of the load, or at the end, may come before or after it.
             for i, own in enumerate(relevant):
@@ -237,7 +247,7 @@ class _Seen:
 
         closest = [(value / max(self.largest[key], 1e-300), at, name(*key)) for key, value, at in self.calls]
         nearest = min(closest + self.decisions, default=(float("inf"), float("nan"), "none"))
-        return ClosestCall(self.events, *nearest, self.landed)
+        return ClosestCall(self.events, *nearest, self.landed, self.held)
 
 
 @by_numpy
@@ -249,9 +259,7 @@ def _loads(scene: Scene, instants: Float[Array, " k"]) -> Float[Array, " k"]:
 def _start(scene: Scene, load, y) -> tuple[Mechanics, Contact, _Start]:
     mechanics = Mechanics(scene)
     contact = physics.status_from_forces(mechanics, load, y)
-    tangential, normal = physics.contact_forces(mechanics, contact, load, y)
     slip = physics.relative_velocity(mechanics, y)
-    held, need = mechanics.friction(jnp.zeros_like(slip)) * normal, jnp.abs(tangential)
     coupled = jnp.ones((1, 1), bool)
     if mechanics.several:
         at_rest = physics.clearness_of_modes(mechanics, load, y, contact)
@@ -259,6 +267,6 @@ def _start(scene: Scene, load, y) -> tuple[Mechanics, Contact, _Start]:
     else:
         holding = physics.sticking_forces(mechanics, physics.free_acceleration(mechanics, load, y))
         at_rest = margin_from_cone(mechanics.friction.static, *holding)
-    held = (held - need) / jnp.where(held + need > 0, held + need, 1.0)
+    held = held_by_sliding(mechanics, contact, load, y)
     status, slip, held, at_rest = map(jnp.atleast_1d, (contact.status, slip, held, at_rest))
     return mechanics, contact, _Start(status, slip, held, at_rest, coupled)

@@ -45,6 +45,8 @@ class AdvanceMargins(eqx.Module):
     size: Float[Array, "c 2"]  # of the terms that the guards are sums of
     # Relative margins of the decisions at the end; infinite for those that were not needed.
     decisions: Float[Array, "3"]
+    # Relative margin by which the friction of sliding holds a contact that has landed and sticks; infinite if none has.
+    held: Float[Array, ""]
 
 
 def advance_margins(method: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y, h) -> AdvanceMargins:
@@ -86,6 +88,7 @@ def advance_margins(method: AbstractStepper, mechanics: Mechanics, contact: Cont
         decisions = _decisions_of_several(mechanics, contact, load, after)
     else:
         decisions = _decisions(mechanics, contact, load, states[-1], after.contact, after.y)
+    landed = (contact.status == Status.DETACH) & (after.contact.status == Status.STICK)
     return AdvanceMargins(
         after.y,
         after.contact,
@@ -100,7 +103,15 @@ def advance_margins(method: AbstractStepper, mechanics: Mechanics, contact: Cont
         bend[-1],
         size.reshape(-1, 2),
         decisions,
+        jnp.min(jnp.where(landed, held_by_sliding(mechanics, after.contact, load, after.y), jnp.inf)),
     )
+
+
+def held_by_sliding(mechanics: Mechanics, contact: Contact, load, y) -> Float[Array, "*c"]:
+    """The relative margin by which the friction of sliding holds each contact in this mode; below zero it does not."""
+    tangential, normal = physics.contact_forces(mechanics, contact, load, y)
+    held, need = mechanics.friction(jnp.zeros_like(normal)) * normal, jnp.abs(tangential)
+    return (held - need) / jnp.where(held + need > 0, held + need, 1.0)
 
 
 def _decisions(mechanics: Mechanics, contact: Contact, load, before, following: Contact, after) -> Float[Array, "3"]:

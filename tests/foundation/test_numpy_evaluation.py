@@ -37,6 +37,16 @@ def test_as_many_systems_as_unknowns_are_not_taken_for_one():
         assert np.allclose(found, np.linalg.solve(matrix, right.T).T, rtol=1e-10)
 
 
+def test_the_hundred_and_first_call_gives_what_the_first_gives():
+    """Then XLA computes it. Its arrays do not take a list as an index, so a derivative of several contacts failed in a long study."""
+    doubled = by_numpy(lambda x: (2.0 * x, 2.0 * x[0]))
+    with jax.enable_x64(True):
+        for k in range(numpy_evaluation.REPAID + 2):
+            array, number = doubled(np.array([1.0, float(k)]))
+            assert type(array) is np.ndarray and type(number) is np.float64
+            assert array.tolist() == [2.0, 2.0 * k] and number == 2.0
+
+
 def test_a_singular_system_has_no_finite_solution():
     with jax.enable_x64(True):
         assert not np.all(np.isfinite(by_numpy(solve)(np.ones((2, 2)), np.array([1.0, 2.0]))))

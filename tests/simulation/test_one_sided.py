@@ -189,24 +189,40 @@ def test_restitution_at_zero_by_impact_law(law, lost, mode):
     np.testing.assert_allclose(found["restitution"], [change * (t1 - fall), 0.0, change, 0.0], rtol=1e-9, atol=1e-12)
 
 
-def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it():
-    """The impulses of the two impacts lie inside the cone, the forces on its edge: they do not make up for each other."""
-    rng = np.random.default_rng(5)
+def lands_without_slip(seed: int, coupled: float):
+    """A random structure whose first landing ends the slip, and its start."""
+    rng = np.random.default_rng(seed)
     mass, stiffness = (rng.normal(size=(3, 3)) for _ in range(2))
-    mass, stiffness = np.eye(3) + 0.125 * (mass + mass.T), stiffness @ stiffness.T + np.eye(3)
+    mass, stiffness = np.eye(3) + coupled * (mass + mass.T), stiffness @ stiffness.T + np.eye(3)
     structure = fj.Structure(mass, 0.05 * stiffness, stiffness, [0.0, 0.0, -1.0], tangential=0, normal=2)
     y0 = np.array([0.3, 0.2, 0.4]) * rng.uniform(0.2, 1.5, 3), rng.normal(size=3) * 0.3
+    load = fj.Pulse(2.0, 1.0, start=100.0)
+    return lambda e: fj.Scene(structure, fj.Coulomb(0.5, 0.6), 0.3, load, restitution=e), y0
 
-    def scene(e):
-        return fj.Scene(structure, fj.Coulomb(0.5, 0.6), 0.3, fj.Pulse(2.0, 1.0, start=100.0), restitution=e)
+
+@pytest.mark.parametrize(("seed", "coupled", "least"), [(5, 0.125, 0.1), (13, 0.2, 0.05), (53, 0.2, 0.005)])
+def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it(seed, coupled, least):
+    """The impulses of the two impacts lie inside the cone, the forces on its edge: they do not make up for each other. The second
+    impact ends the slip that the flight leaves without any contact force."""
+    scene, y0 = lands_without_slip(seed, coupled)
 
     def end(e):
         run = fj.simulate(scene(e), 4.0, 4.0, FEW, y0=y0)
         return np.concatenate([run.displacement[-1], run.velocity[-1]])
 
     found = by_kernel(scene(0.0), "restitution", y0, 4.0)["restitution"]
-    assert np.abs(found).max() > 0.1
+    assert np.abs(found).max() > least
     np.testing.assert_allclose(found, one_sided(end, 1e-5), atol=1e-6)
+
+
+def test_where_static_friction_alone_holds_what_has_landed_the_least_restitution_makes_it_slide():
+    """However small the rebounds are, each leaves some slip, which the friction of sliding does not end: the motion jumps."""
+    scene, y0 = lands_without_slip(38, 0.2)
+    found = by_kernel(scene(0.0), "restitution", y0, 4.0)
+    assert not found.exist and "static friction alone" in found.reason
+    by_tiny = [fj.simulate(scene(e), 4.0, 4.0, FEW, y0=y0).displacement[-1, 0] for e in (0.0, 1e-7, 1e-5)]
+    assert abs(by_tiny[1] - by_tiny[0]) > 100 * abs(by_tiny[2] - by_tiny[1])
+    assert by_kernel(scene(0.0), "mu", y0, 4.0).exist
 
 
 @pytest.mark.parametrize(("law", "exist"), [("coulomb", True), pytest.param("reset", False, marks=pytest.mark.slow)])
