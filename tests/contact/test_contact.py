@@ -12,6 +12,8 @@ import pytest
 import fivjax as fj
 from fivjax import contact as physics
 from fivjax.contact import Contact, Mechanics, Rest, Status
+from fivjax.contact.contact_problem import enumerated, pivoted
+from fivjax.contact.several_contacts import _mode_problem
 from fivjax.model.scene import steady_sliding
 
 # Sums of a dozen products and one small linear solve with a well-conditioned mass matrix.
@@ -793,6 +795,27 @@ def test_modes_of_several_contacts_are_those_that_the_laws_admit(count):
         assert admissible_modes(scene, load, y) == [modes]
         met.update(modes)
     assert met == {"stick", 1.0, -1.0, "open"}
+
+
+def test_pivoting_finds_from_anywhere_what_trying_all_finds():
+    """Whatever it begins with, and however it gets there: no contact that slips sticks in the end, or slips the other way."""
+    scene, rng, count, n = coupled_contacts(3), np.random.default_rng(8), 3, 6
+    states, loads = rng.normal(size=(400, 2 * n)), rng.uniform(0.5, 3.0, 400)
+    states[:, 1::2] = 0.0  # on the belt
+    states[:, n::2] = np.where(rng.random((400, count)) < 0.5, np.asarray(scene.belt_speed), states[:, n::2])
+    begin = rng.integers(0, 4, (400, count)).astype(np.int32)
+    with jax.enable_x64(True):
+        mechanics = Mechanics(scene)
+
+        @jax.jit
+        @jax.vmap
+        def both(load, y, begin):
+            problem = _mode_problem(mechanics, load, y)
+            return pivoted(problem, begin), enumerated(problem, begin)
+
+        by_pivots, by_all = map(np.asarray, both(jnp.asarray(loads), jnp.asarray(states), jnp.asarray(begin)))
+    np.testing.assert_array_equal(by_pivots, by_all)
+    assert set(by_all.ravel().tolist()) == {0, 1, 2, 3}
 
 
 def test_how_clear_an_impact_is_falls_to_zero_at_the_edge_of_the_cone_whichever_way_it_slips():
