@@ -6,6 +6,7 @@ is one more phase of sticking or detachment, or one more impact. Each sequence o
 continues along the curve for the sequence of modes that the real motion has beyond.
 """
 
+import contextlib
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -118,8 +119,10 @@ def continue_cycle(
     arguments.truth("derivatives", derivatives)
     cycle = limit_cycle(final) if start is None else limit_cycle(final, start)
     if cycle.kind != "periodic" and start is None:
-        # Past a fold, the branch of the saddle cycle leads to the unstable cycle inside the torus.
-        cycle = saddle_cycle(final, cycle)
+        # Past a fold, the branch of the saddle cycle leads to the unstable cycle inside the torus. Where sliding is unstable
+        # there is no saddle cycle.
+        with contextlib.suppress(NoLimitCycle):
+            cycle = saddle_cycle(final, cycle)
     if cycle.kind != "periodic":
         raise NoLimitCycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "

@@ -14,7 +14,7 @@ class StabilityOutcome(enum.StrEnum):
 
 # Why there is no limit, as a sentence.
 WHY = {
-    StabilityOutcome.NEVER_UNSTABLE: "no modes couple and no stiffness is lost, at any μ (several contacts: up to 2)",
+    StabilityOutcome.NEVER_UNSTABLE: "no modes couple and no stiffness is lost, at any μ (several contacts: at any up to 2)",
     StabilityOutcome.ALWAYS_UNSTABLE: "a mode grows already at the smallest friction",
     StabilityOutcome.UNDECIDED: "the search did not come to an end",
 }
