@@ -66,13 +66,13 @@ def creep(
     """Which motions creep; and where these are, how much later (s), and after how many more contact events, when they have
     `arrived` (told by their rows and states), or creep no more.
     """
-    # Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
-    least_drifts = 4.0
+    # A leap is this share of the motion's size at most.
+    longest_leap = 0.05
     # After a leap the other deviations are no larger beside the drift than before, so that the motion settles so many times
     # sooner.
     sooner = 8
-    # A leap is this share of the motion's size at most.
-    longest_leap = 0.05
+    # Leaps of fewer drifts than this are not worthwhile: the motion is followed for some returns instead.
+    least_drifts = 4.0
     group, at = motions
     last = Section(*(np.array(part) for part in at))
     creeps = np.zeros(len(group), bool)

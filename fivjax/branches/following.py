@@ -28,13 +28,13 @@ def follow_branch(
     family: Family, start: BranchPoint, sense: float, bounds: tuple[float, float], most: int
 ) -> HalfBranch:
     """The branch in one direction from a cycle, at first towards larger (`sense` 1) or smaller (-1) values of the parameter."""
-    # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
-    small = 0.02
-    # Gaps that a branch goes over: beyond one it may come back on itself, again and again.
-    most_gaps = 16
     # After a step that converged quickly, the next is longer: by the first factor below the length `FIRST`, by the second
     # above.
     soon, later = 3.0, 1.5
+    # Gaps that a branch goes over: beyond one it may come back on itself, again and again.
+    most_gaps = 16
+    # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
+    small = 0.02
     here, tangent = start, start.curve.tangent(start.cycle, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
     points: list[BranchPoint] = []

@@ -99,10 +99,10 @@ def row_of(curve: Curve, phases: Phases, minimum: GuardMinimum, partial: PhaseIm
 
 def grazing_near(curve: Curve, guess: ComputedCycle, minimum: GuardMinimum) -> Grazing | None:
     """The cycle near a guess on which this guard touches zero."""
+    most_iterations = 12
+    exact = 1e-13
     # The longest first step, in sizes and periods of the cycle: a phase of thousands of periods takes minutes to follow.
     first_step = 4.0
-    exact = 1e-13
-    most_iterations = 12
     u, last = guess.u.copy(), np.inf
     for iteration in range(most_iterations):
         phases, parameter = curve.phases(u)

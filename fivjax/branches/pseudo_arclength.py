@@ -79,11 +79,11 @@ class Curve:
         self, u: Float[np.ndarray, " m"], normal: Float[np.ndarray, " m"] | None = None
     ) -> ComputedCycle | None:
         """The cycle near a guess: in the plane through the guess with this normal, or without a normal the nearest one."""
-        # If corrections no longer shrink, this is small enough: they are rounding errors.
-        close = 1e-9
+        most_iterations = 10
         # Newton's method has converged if its next correction would be this small, relative to the cycle's size.
         exact = 3e-12
-        most_iterations = 10
+        # If corrections no longer shrink, this is small enough: they are rounding errors.
+        close = 1e-9
         target, last = u.copy(), np.inf
         for iteration in range(most_iterations):
             residuals, rows, found, phases, parameter = self.system(u)

@@ -40,6 +40,8 @@ def _derivative(family: Family, special: Special, name: str) -> float:
     curve, cycle = special.curve, special.cycle
     if special.name == MEETS_SLIDING:
         return _of_stability_limit(family, cycle.parameter, name)
+    if name == "restitution" and _is_inelastic(family) and _rebounds_change(special):
+        return np.nan
     direction = parameter_direction(family.scene, name)
     found = images(family.at(cycle.parameter), direction, family.stepper, cycle.phases)
     _, rows = assembled(found, cycle.phases)
@@ -51,7 +53,7 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
     if special.multiplier is not None:
         return _of_multiplier(family, special, name, own, slope)
-    if special.row is None or (name == "restitution" and _ends_a_rebound(family, special)):
+    if special.row is None:
         return np.nan
     last, row = 0.0, special.row
     if special.grazing is not None:
@@ -69,13 +71,25 @@ def _derivative(family: Family, special: Special, name: str) -> float:
     return float(change[-1] * curve.scales[-1])
 
 
-def _ends_a_rebound(family: Family, special: Special) -> bool:
-    """Whether at this point a landing without restitution is about to lift off again. With a little restitution its rebound
-    grows from nothing to a flight, and there is no such point.
+def _is_inelastic(family: Family) -> bool:
+    return float(np.asarray(family.scene.restitution)) == 0
+
+
+def _rebounds_change(special: Special) -> bool:
+    """Whether a special point without restitution has no derivative by it, or none that is worked out.
+
+    With a little restitution a landing that comes to rest does so by ever smaller rebounds, which are no phases here. What they
+    change of multipliers is not worked out; and where the landing is about to lift off again, a rebound grows from nothing to a
+    flight, and there is no such point.
     """
-    if special.grazing is None or np.any(np.asarray(family.scene.restitution) > 0):
+    modes = special.cycle.phases.modes
+    if special.turns:
         return False
-    minimum, modes = special.grazing.minimum, special.cycle.phases.modes
+    if special.multiplier is not None:
+        return any(a.status == Status.DETACH != b.status for a, b in zip(modes, modes[1:] + modes[:1], strict=True))
+    if special.grazing is None:
+        return False
+    minimum = special.grazing.minimum
     return minimum.time == 0 and modes[minimum.phase - 1].status == Status.DETACH
 
 
@@ -112,11 +126,7 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
         return np.nan if which is None else abs(which)
 
     if name == "restitution" and value < by:
-        # No impact has less than none. With a little, a landing that comes to rest does so by ever smaller rebounds, which are
-        # no phases here: what they change of the multipliers is not worked out.
-        modes = cycle.phases.modes
-        if any(a.status == Status.DETACH != b.status for a, b in zip(modes, modes[1:] + modes[:1], strict=True)):
-            return np.nan
+        # No impact has less than none.
         with_other = (4 * size(0.0, by) - 3 * size(0.0, 0.0) - size(0.0, 2 * by)) / (2 * by)
     else:
         with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)

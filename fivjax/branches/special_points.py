@@ -45,13 +45,13 @@ class Change(NamedTuple):
 
 def between(curve: Curve, a: ComputedCycle, tangent: Float[np.ndarray, " m"], b: ComputedCycle) -> list[Special]:
     """Folds, period doublings and Neimark–Sacker bifurcations between two neighbouring cycles, in order."""
+    # How far from the unit circle a multiplier may be found where it passes it.
+    on_circle = 1e-6
+    # At a fold a multiplier is one, to rounding; at one that is not smooth it is so on neither side.
+    near_one = 1e-4
     # A branch at a constant value of the parameter, up to rounding, has no folds: cycles of a linear motion at its stability
     # limit.
     level = 1e-8
-    # At a fold a multiplier is one, to rounding; at one that is not smooth it is so on neither side.
-    near_one = 1e-4
-    # How far from the unit circle a multiplier may be found where it passes it.
-    on_circle = 1e-6
     length = float(tangent @ (b.u - a.u))
     found: list[tuple[float, Special]] = []
 

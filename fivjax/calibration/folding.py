@@ -138,10 +138,10 @@ def _between_neighbours(ordered):
 def _sidebands(scaled, t, frequency: float, count: int, rate: float) -> float:
     """How much a vibration beats: what neighbours in phase differ by, below one and a half times its frequency and above its
     noise, relative to its fundamental. Few samples do not tell."""
-    # Scatters of the noise's power that sidebands exceed.
-    above_scatter = 5.0
     # The widest that neighbours may lie, in turns, whose differences tell a beat: over more, a waveform bends.
     widest = 1 / 16
+    # Scatters of the noise's power that sidebands exceed.
+    above_scatter = 5.0
     if _neighbours(scaled) > widest * len(scaled):
         return 0.0
     left = _from_neighbours(scaled, np.mod(frequency * t, 1.0))

@@ -30,11 +30,11 @@ def near_frequencies(
     A guess that is too low by the share `spread` has to be multiplied by `1/(1 - spread)`, so guesses are drawn up to that
     factor. If fewer than `count` have two modes close to the frequency, those that come closest are taken.
     """
+    # Number of scenes whose sliding modes are computed, for each one that is followed to its limit cycle.
+    tried_per_guess = 128
     # Two sliding modes are sought this close to the measured frequency (relative), because limit cycles arise from mode
     # coupling.
     close = 0.03
-    # Number of scenes whose sliding modes are computed, for each one that is followed to its limit cycle.
-    tried_per_guess = 128
     from scipy.stats import qmc
 
     own = _own_values(parameters, scene)

@@ -26,10 +26,10 @@ def strongest_poles(
 
     Modes of parts that are not measured do not show. If the noise `sigma` is given, poles within it are left out.
     """
-    # A pole has more than this energy, in units of what noise adds to a fit of one more pole.
-    above_noise = 25.0
     # The most rows of the Hankel matrix: enough to separate two modes that beat within the recording, few enough to be fast.
     most_rows = 240
+    # A pole has more than this energy, in units of what noise adds to a fit of one more pole.
+    above_noise = 25.0
     size = np.sqrt(np.mean(means**2, axis=0))
     if not np.all(size > 0):
         return Poles(np.zeros(0, complex), np.zeros((0, means.shape[1]), complex), 0.0)

@@ -81,10 +81,10 @@ def sampled(recording: Recording, blocks: Averaged) -> Sampled:
 
 
 def _through(recording: Recording, blocks: Averaged) -> LowPassGrid:
-    # The most fine steps for one sample.
-    finest = 64
     # Fine steps per period of the highest frequency that a filter lets through.
     fine = 16
+    # The most fine steps for one sample.
+    finest = 64
     response, interval = recording.filter, 1 / recording.rate
     assert response is not None
     passed = bandwidth(response, finest * recording.rate / fine)

@@ -108,10 +108,10 @@ def guess_limit_cycle(scene: Scene, method: AbstractStepper, frequency: Float[Ar
 
     Its state where the tangential velocity rises through zero, and the time after which it is closest to that state again.
     """
-    # A motion returns to itself if it comes as close as this, relative to its size.
-    closed = 0.02
     # A motion is followed for so many periods before it counts as nearly periodic.
     settling_periods = 80
+    # A motion returns to itself if it comes as close as this, relative to its size.
+    closed = 0.02
     n, tangential, longest = scene.structure.size, first_tangential(scene.structure), int(LONGEST * LOOKS) + 1
     instants = (settling_periods + jnp.arange(2 * longest + 2) / LOOKS) / frequency
     q, _ = steady_sliding(scene, scene.load.final)

@@ -23,9 +23,8 @@ class ModeForces(eqx.Module):
     contact: Contact
     signed_friction: Float[Array, "*contacts"]  # σμ
     of_one: "_OneContact | None"
-    inverse: (
-        Float[Array, "k k"] | None
-    )  # the inverse of the system of several contacts: from right-hand sides to (T, N)
+    # Of the linear system of several contacts: from its right-hand sides to (T, N).
+    inverse: Float[Array, "k k"] | None
 
     def __init__(self, mechanics: Mechanics, contact: Contact, mu: Float[Array, "*contacts"]):
         self.contact = contact

@@ -23,7 +23,7 @@ RESTING = {"float64": 1e-8, "float32": 1e-4}
 
 def largest_rounding(sizes: Array) -> Array:
     """Bound on the rounding error of sums whose largest terms have these sizes (see `magnitudes`)."""
-    # Or if it is no larger than this many roundings of the terms that it is a sum of.
+    # So many roundings of the largest of the terms that it is a sum of.
     roundings = 64
     return roundings * jnp.finfo(sizes.dtype).eps * sizes
 

@@ -43,10 +43,10 @@ class Groups(NamedTuple):
 
 def width_for(directions: int, numbers: int) -> int:
     """How many directions a kernel has side by side, for so many to come and so many numbers that it is given."""
-    # And no more than so many numbers, because a thread's stack holds them.
-    most_side_by_side = 2**14
     # Directions side by side in one kernel: as few of these as serve, or several calls with the most.
     widths = (1, 2, 4, 8, 16)
+    # And no more than so many numbers, because a thread's stack holds them.
+    most_side_by_side = 2**14
     most = max((width for width in widths if width * numbers <= most_side_by_side), default=1)
     return min(next((width for width in widths if width >= directions), widths[-1]), most)
 

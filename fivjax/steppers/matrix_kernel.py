@@ -58,11 +58,11 @@ class MechanicsForm(NamedTuple):
 @functools.cache
 def motion_in_cpp(form: MechanicsForm) -> str:
     """The code of `Motion` with all that it refers to."""
+    # Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
+    short_terms, short_steps = 6, 2
     # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the sample next to
     # it.
     rise_steps, lowest_steps, peak_steps = 12, 6, 5
-    # Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
-    short_terms, short_steps = 6, 2
     like = form.mechanics(np.zeros(form.numbers))
     n, normal = like.free_load.shape[0], like.normal
     at = blocks_of(n)
