@@ -61,8 +61,9 @@ def test_an_approach_ends_before_an_unstable_cycle(unstable, nearest):
     x = np.concatenate([np.linspace(0.0, 8.0, 801), unstable + 1e-6 * np.arange(-5, 6)])
     y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
     motions = Motions(np.zeros(len(x), int), Section(y, np.ones(len(x), np.int32), np.ones(len(x))))
-    captured = Catalogue(maps, {0: known}, lambda count: None).captures(motions, np.ones(len(x), bool))  # type: ignore[arg-type]
-    rows = np.array(list(captured), int)
+    catalogue = Catalogue(maps, {0: known}, lambda count: None)  # type: ignore[arg-type]
+    rows = np.array(list(catalogue.captures(motions, np.ones(len(x), bool))), int)
+    np.testing.assert_array_equal(np.flatnonzero(catalogue.has_captured(motions)), np.sort(rows))
     assert np.all(x[rows] > unstable)
     if found is not None:
         assert found.cycle is cycle and np.min(found.tube.states[:, 0]) >= nearest

@@ -18,7 +18,8 @@ def paper(belt_speed: float, mu: float) -> fj.Scene:
 
 
 def benchmark_a(belt_speed: float) -> fj.Scene:
-    structure = fj.Structure(np.eye(2), np.diag([0.1, 0.0]), np.eye(2), np.array([0.0, -1.0]), tangential=0, normal=1)
+    """A unit mass under falling friction. Its contact is at the last coordinate first, unlike that of the belt oscillator."""
+    structure = fj.Structure(np.eye(2), np.diag([0.0, 0.1]), np.eye(2), np.array([-1.0, 0.0]), tangential=1, normal=0)
     return fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), belt_speed, fj.ConstantLoad(1.0))
 
 
@@ -189,7 +190,7 @@ def test_benchmark_a_s_unstable_branch_runs_from_the_hopf_point_to_the_grazing()
     """Both ends have values of their own: a closed form, and a root that an ODE solver found."""
     known = cycles.sliding_cycle(1.5)
     scene = benchmark_a(1.5)
-    branch = fj.continue_cycle(scene, "belt_speed", (1.0, 2.0), ([known["lowest"], 0, 0, 0], 1), derivatives=True)
+    branch = fj.continue_cycle(scene, "belt_speed", (1.0, 2.0), ([0, known["lowest"], 0, 0], 1), derivatives=True)
     assert specials(branch) == ["amplitude meets the sliding equilibrium", "grazing of slip: stick inserted"]
     hopf, grazing = (branch.isel(point=int(i)) for i in np.flatnonzero(branch.special.values != ""))
     assert float(hopf.parameter) == pytest.approx(0.5 * np.log(10.0), abs=1e-12)
@@ -245,10 +246,15 @@ def test_pairs_pass_the_unit_circle_where_their_product_is_one():
 def test_a_branch_of_strongly_stable_cycles_has_no_special_points():
     """Some of its multipliers are zero, of which rounding makes real ones or pairs; all are far inside the unit circle."""
     scene = full_matrices()
-    branch = fj.continue_cycle(scene, "mu", (0.64, 0.69), points=12, start=fj.limit_cycle(scene), progress=False)
+    start = fj.limit_cycle(scene)
+    branch = fj.continue_cycle(scene, "mu", (0.64, 0.69), points=12, start=start, progress=False)
     multipliers = np.asarray(branch["multipliers"])
     assert np.abs(multipliers).max() < 0.7 and np.abs(multipliers[:, 2:]).max() < 1e-12
     assert specials(branch) == []
+    beside = fj.limit_cycle(scene.replace(mu=0.69), start=start)
+    last = int(np.argmax(branch.parameter.values))
+    assert float(branch.period[last]) == pytest.approx(beside.period, rel=1e-9)
+    np.testing.assert_allclose(branch.state.values[last], beside.state, atol=1e-9)
 
 
 def test_where_no_pair_of_multipliers_grows_there_are_no_tori(branch):

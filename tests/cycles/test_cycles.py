@@ -157,6 +157,10 @@ def test_above_the_speed_where_it_loses_stability_the_cycle_is_a_torus():
     coarse = np.median(off_the_curve(path[::2])) / size
     assert torus.residual == pytest.approx(np.median(off_the_curve(path)) / size, rel=1e-6)
     assert torus.residual < 1e-8 and coarse > 8 * torus.residual
+    # Its state is one of them, about equilibrium; they are so far apart.
+    equilibrium = np.append(reference.linear(reference.of_scene(scene)).q_eq, np.zeros(3))
+    away = np.linalg.norm(np.asarray(scene.structure.weights) * (torus.state - equilibrium) - path, axis=1).min()
+    assert away < 1e-3 * size
 
 
 def test_points_of_an_ellipse_lie_on_cubics_to_the_fourth_power_of_their_distance():
@@ -330,6 +334,10 @@ def test_a_locked_torus_is_named_as_the_cycle_that_it_is():
     later = reference.trajectory(start, 1.01 * cycle.period, times=[cycle.period])
     back = np.concatenate([later.q[0] - later.q_eq, later.v[0]])
     np.testing.assert_allclose(back, y, atol=1e-9 * np.max(np.abs(y)))
+    # A point for each crossing, none of them twice.
+    path = np.asarray(structure.weights) * cycle.points
+    apart = np.linalg.norm(path[:, None] - path, axis=-1)[np.triu_indices(len(path), 1)]
+    assert len(path) == 13 and apart.min() > 0.01 * apart.max()
 
 
 def test_newton_s_points_lie_on_the_section_in_spite_of_rounding():

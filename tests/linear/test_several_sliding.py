@@ -1,10 +1,14 @@
 """Linear theory of several sliding contacts: eigenvalues, critical friction and its derivatives."""
 
+import itertools
+
+import jax
 import numpy as np
 import pytest
 from scipy import linalg
 
 import fivjax as fj
+from fivjax.linear.linearisation import LOWEST_SLIP, linear_sliding
 from fivjax.verdicts.sliding_proof import why_withheld
 
 
@@ -102,3 +106,38 @@ def test_one_law_on_belts_of_two_speeds_is_looked_at_for_each_contact():
     steep = fj.ExponentialDecay(0.3, 0.1, 1.0)
     for law in (fj.Coulomb(0.2), steep):
         assert why_withheld(fj.Scene(coupled(), law, np.array([1.0, 2.0]), fj.Pulse(100.0, 1.2))) is None
+
+
+def test_up_to_the_reach_no_contact_of_several_lifts_off():
+    """The exact forces of all contacts, where slips and linear forces deviate by that share: `LinearSliding.reach` and its equation.
+
+    Under steeply falling friction the force of one contact changes with the slip of the others, most by those that bear most.
+    """
+    rng, scenes = np.random.default_rng(5), []
+    speed, sign, corners = np.array([0.4, 0.3]), np.array([1.0, -1.0]), list(itertools.product((-1.0, 1.0), repeat=2))
+    for most, shape in zip(rng.uniform(0.3, 0.9, (40, 2)), rng.normal(size=(40, 5, 5)), strict=True):
+        load, contacts = (
+            np.array([0.0, 0.0, -rng.uniform(0.05, 20.0), -1.0, 0.0]),
+            [fj.ContactPoint(0, 2), fj.ContactPoint(1, 3)],
+        )
+        structure = fj.Structure(shape @ shape.T + np.eye(5), 0.1 * np.eye(5), 1e3 * np.eye(5), load, contacts=contacts)
+        laws = [fj.ExponentialDecay(float(mu), 0.1, decay=5.0) for mu in most]
+        scenes.append((most, fj.Scene(structure, laws, sign * speed, fj.ConstantLoad(10.0))))
+    with jax.enable_x64(True):
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(scene for _, scene in scenes))
+        linear = jax.jit(jax.vmap(linear_sliding))(stacked)
+    bounded = 0
+    for k, (most, scene) in enumerate(scenes):
+        reach, forces = float(linear.reach[k]), np.asarray(linear.pressing_margin[k])
+        if not (linear.exists[k] and linear.solvable[k] and reach > 0):
+            continue
+        bounded += reach < LOWEST_SLIP
+        inverse = np.linalg.inv(np.asarray(scene.structure.mass))
+        friction = lambda v, most=most: sign * (0.1 + (most - 0.1) * np.exp(-5.0 * v))  # noqa: E731
+        handed_on = np.linalg.solve(inverse[2:4, 2:4] + inverse[2:4, :2] * friction(speed), inverse[2:4, :2])
+        for slips, loads in itertools.product(corners, repeat=2):
+            change = friction(speed * (1 + reach * np.array(slips))) - friction(speed)
+            # Constant friction leaves no force within the reach; what is left is due to the other contacts' friction.
+            normal = forces * (1 + 0.999999 * reach * np.array(loads))
+            assert np.all(np.linalg.solve(np.eye(2) + handed_on * change, normal) > 0)
+    assert bounded > 5

@@ -11,7 +11,7 @@ import fivjax as fj
 from fivjax.maps.groups import Task, constants_of
 from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
-from fivjax.section.free_directions import zero_on_section
+from fivjax.section.free_directions import directions_of_several, zero_on_section
 from fivjax.section.return_maps import ReturnMaps, Section, section_at
 from fivjax.steppers.propagation import Propagation
 
@@ -135,3 +135,18 @@ def test_what_is_zero_on_the_section():
     places, status = (np.array([0, 2]), np.array([1, 3])), np.array([[slide, detach], [slide, slide], [detach, detach]])
     several = zero_on_section(4, *places, status)
     assert [np.flatnonzero(row).tolist() for row in several] == [[1, 5], [1, 3, 5, 7], []]
+
+
+def test_free_directions_of_several_contacts_are_those_that_nothing_holds():
+    """Of three contacts one slides, one sticks and one is open; the velocities' weighted sum is zero on the section."""
+    rng, n = np.random.default_rng(1), 7
+    weights, section = rng.uniform(0.5, 2.0, 2 * n), np.zeros(n)
+    tangential, normal = np.array([4, 0, 6]), np.array([2, 5, 1])
+    section[tangential] = 1.0, 0.7, 0.4
+    status = np.array([fj.Status.SLIDE, fj.Status.STICK, fj.Status.DETACH])
+    free = directions_of_several(weights, section, tangential, normal, status)
+    held = [*normal[:2], *(n + normal[:2]), n + tangential[1]]
+    assert free.shape == (2 * n, 2 * n - len(held) - 1)
+    np.testing.assert_allclose(free.T @ free, np.eye(free.shape[1]), atol=1e-14)
+    np.testing.assert_allclose(free[held], 0.0, atol=1e-14)
+    np.testing.assert_allclose(section @ (free / weights[:, None])[n:], 0.0, atol=1e-14)
