@@ -63,3 +63,36 @@ def test_the_kind_is_named_and_both_sides_are_proved():
     assert str(found.kind.values) == "grazing" and not str(found.why_none.values)
     assert float(found.p_crit) == pytest.approx(P_CRIT, abs=1e-9)
     assert float(found.p_crit_high - found.p_crit_low) == pytest.approx(2e-9 * P_CRIT, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not reference.available(), reason="no C++ compiler")
+def test_a_touch_after_lift_offs_is_where_the_independent_solver_begins_to_stick():
+    """The motion lifts off twice in its first swings, and comes to rest on the belt 0.44 s later or only just not."""
+    scene = SCENE.replace(mu=0.2, mu_static=5.0, belt_speed=1.9)
+    found = fj.critical_perturbation(scene, p_range=(1.0, 3.0), p_step=0.02, derivatives=True, progress=False)
+    p_crit = float(found.p_crit[0])
+    touch = grazing_kick(scene, (p_crit * (1 - 1e-6), p_crit * (1 + 1e-6)), ("mu",))
+    assert str(found.kind.values[0]) == "grazing" and touch is not None and touch.events == 4
+    assert touch.p == pytest.approx(p_crit, abs=1e-9)
+
+    def boundary(**changes):
+        guess = touch.p + sum(
+            float(found.d_p_crit.sel(parameter=name)[0]) * (value - float(scene.parameters[name]))
+            for name, value in changes.items()
+        )
+        low, high = guess - 1e-7, guess + 1e-7
+        while high - low > 1e-13:
+            p = 0.5 * (low + high)
+            motion = reference.trajectory(reference.of_scene(scene.replace(p=p, **changes)), touch.time + 0.005)
+            # Of its events only those are counted that begin to stick.
+            sticks = any(after == fj.Status.STICK for _, _, after in motion.events)
+            low, high = (low, p) if sticks else (p, high)
+        return 0.5 * (low + high)
+
+    assert boundary() == pytest.approx(p_crit, abs=1e-11)
+    for name in ("k1", "m2", "c2", "mu", "theta"):
+        value = float(scene.parameters[name])
+        kicks = [boundary(**{name: (1 + by) * value}) for by in (-1e-6, 1e-6)]
+        slope = float(found.d_p_crit.sel(parameter=name)[0])
+        assert slope == pytest.approx((kicks[1] - kicks[0]) / (2e-6 * value), rel=1e-4)
