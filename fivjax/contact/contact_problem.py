@@ -10,10 +10,11 @@ impulses. Each contact is in one of four states; every state demands something, 
 | BACKWARD | $T = -μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≥ 0$ |
 | OPEN | $T = N = 0$ | $a_n ≥ 0$ |
 
-If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties. Up to four contacts combinations
-are tried one after the other (`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to
-sticking. At an event some condition is zero up to rounding, so the state that has just `ended` must be admissible by a clear
-margin, or it would be chosen again.
+If the matrix of sliding is a P-matrix, only one combination is admissible, except for ties and where static friction exceeds
+kinetic friction ($μ_s > μ$): then what can stick does. Up to four contacts combinations are tried one after the other
+(`enumerated`); with more contacts their states are changed one by one (`pivoted`). Ties go to sticking. At an event some
+condition is zero up to rounding, so the state that has just `ended` must be admissible by a clear margin, or it would be chosen
+again.
 """
 
 import itertools
@@ -109,32 +110,63 @@ def settled_states(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Arra
     return (enumerated if len(start) <= most_enumerated else pivoted)(problem, start)
 
 
+class _Search(NamedTuple):
+    """How far `enumerated` has come."""
+
+    number: Int[Array, ""]  # of the combination, -1 for the start
+    asked: Int[Array, ""]  # the contact of which it is asked whether it could stick, -1 before the first
+    own: Float[Array, ""]  # what there is to say against this combination, by now
+    least: Float[Array, ""]
+    best: Int[Array, " c"]
+
+
 def enumerated(problem: ContactProblem, start: Int[Array, " c"]) -> Int[Array, " c"]:
-    """By trying combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking."""
-    every = np.array(sorted(itertools.product(range(4), repeat=len(problem.slips)), key=_preference), np.int32)
-    # A contact that has just lifted off may be admissible on the belt as well; it stays off.
+    """By trying combinations. Ties go to the one that changes the fewest states of `start`, then to the most sticking.
+
+    Where static friction exceeds kinetic friction, several combinations may be admissible: a contact at rest that could stick
+    might slip as well. It sticks, given the states of the others; but what has ended does so.
+    """
+    count = len(problem.slips)
+    every = jnp.asarray(np.array(sorted(itertools.product(range(4), repeat=count), key=_preference), np.int32))
+    # A contact that has just lifted off may be admissible on the belt as well; it stays off. To slip in vain is worse than any
+    # number of changes.
     a_change = 0.1 * TIE[problem.normal.dtype.name]
-    infinite = jnp.asarray(jnp.inf, problem.normal.dtype)
+    in_vain, infinite = 100 * count * a_change, jnp.asarray(jnp.inf, problem.normal.dtype)
+    has_ended, places = problem.ended != NONE, np.arange(count)
+    # What is admissible with one change is better than all others but `start` itself, which is tried first; where a state has
+    # ended, this change costs nothing.
+    enough = jnp.where(jnp.any(has_ended), 0.0, a_change)
+    might_stick = ~problem.slips & ~has_ended & (problem.static > problem.sliding)
 
-    def violation(state):
+    def going(at: _Search):
+        return (at.number < len(every)) & (at.least > enough)
+
+    def step(at: _Search) -> _Search:
+        state = jnp.where(at.number < 0, start, every[jnp.maximum(at.number, 0)])
+        tried = jnp.where(places == at.asked, STICK, state)
         # Most combinations are not allowed, and then their forces need not be worked out.
-        allowed = jnp.all(are_allowed(problem, state))
-        return jax.lax.cond(allowed, lambda: jnp.max(_judged(problem, state)), lambda: infinite)
-
-    def going(carry):
-        # What is admissible with one change is better than all others but `start` itself, which is tried first.
-        number, least, _ = carry
-        return (number < len(every)) & (least > a_change)
-
-    def tried(carry):
-        number, least, best = carry
-        state = jnp.where(number < 0, start, jnp.asarray(every)[jnp.maximum(number, 0)])
-        own = violation(state) + jnp.sum(state != start) * a_change
-        return number + 1, jnp.minimum(own, least), jnp.where(own < least, state, best)
+        violation = jax.lax.cond(
+            jnp.all(are_allowed(problem, tried)),
+            lambda: _judged(problem, tried),
+            lambda: jnp.full(count, infinite),
+        )
+        changed = jnp.sum((state != start) != has_ended) * a_change
+        could_stick = jnp.any((places == at.asked) & (violation == 0))
+        own = jnp.where(at.asked < 0, jnp.max(violation) + changed, at.own + jnp.where(could_stick, in_vain, 0.0))
+        left = might_stick & ((state == FORWARD) | (state == BACKWARD)) & (places > at.asked)
+        asks = jnp.any(left) & (own < at.least)
+        return _Search(
+            jnp.where(asks, at.number, at.number + 1),
+            jnp.where(asks, jax.lax.argmax(left, 0, jnp.int32), -1),
+            own,
+            jnp.where(asks, at.least, jnp.minimum(own, at.least)),
+            jnp.where(~asks & (own < at.least), state, at.best),
+        )
 
     # One after the other: what tries all at once takes long to compile.
-    begin = jnp.full((), -1, jnp.int32), infinite, start
-    return jax.lax.while_loop(going, tried, depending_on(problem, begin))[2]
+    nothing = jnp.full((), -1, jnp.int32)
+    begin = _Search(nothing, nothing, infinite, infinite, start)
+    return jax.lax.while_loop(going, step, depending_on(problem, begin)).best
 
 
 def _preference(states: tuple[int, ...]) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..foundation import arguments
@@ -11,6 +12,7 @@ from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
+from ..model.sliding import sliding_coordinates, sliding_matrices
 from ..model.structure import Structure
 from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
@@ -55,6 +57,27 @@ class StabilityLimit(eqx.Module):
 def matrices_only(structure: Structure) -> Structure:
     """The structure as matrices, without the function that made it: one compiled program serves all structures of a size."""
     return Structure(*structure.matrices, contacts=structure.contacts)
+
+
+def _check_held(structure: Structure) -> None:
+    """Refuse a structure that friction moves ever further: it has no steady sliding whose stability could be lost."""
+    from scipy import linalg
+
+    if not all(map(is_known, structure.matrices)):
+        return
+    own = in_contact_coordinates(structure)
+    tangential, normal = (
+        np.array([getattr(contact, name) for contact in own.contacts]) for name in ("tangential", "normal")
+    )
+    still = np.zeros(()) if len(own.contacts) == 1 else np.zeros(len(own.contacts))
+    mass, _, stiffness = map(np.asarray, sliding_matrices(own, still))
+    squares, modes = linalg.eigh(stiffness, mass)
+    moved = np.abs(modes[np.isin(sliding_coordinates(own.size, normal), tangential)]).max(axis=0)
+    if np.any((squares < 1e-12 * squares[-1]) & (moved > 1e-9 * np.abs(modes).max(axis=0))):
+        raise ValueError(
+            "There is no steady sliding: friction moves a part of the structure that no spring holds. "
+            "Hold it by a spring along the belt."
+        )
 
 
 def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
@@ -103,6 +126,7 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
+    _check_held(structure)
     if not one_contact(structure):
         return _critical_friction_of_several(*_several(structure, direction))
     return _critical_friction(matrices_only(structure), jnp.asarray(float(direction)))
@@ -138,6 +162,7 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
     """
     arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
     check_direction(direction)
+    _check_held(structure)
     if not one_contact(structure):
         return _stability_limit_of_several(*_several(structure, direction))
     return _stability_limit(matrices_only(structure), jnp.asarray(float(direction)))

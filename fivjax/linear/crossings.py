@@ -116,7 +116,7 @@ def _(primals, tangents):
     flutter, coalescence = limit.code == FLUTTER, limit.code == COALESCENCE
     s = jax.lax.complex(jnp.zeros_like(limit.omega), jnp.where(flutter | coalescence, limit.omega, 0.0))
 
-    matrix, matrix_slope = loop.matrix(s), loop.matrix_slope(s)
+    matrix, matrix_slope = jnp.where(limit.code == DIVERGENCE, loop.held, loop.matrix(s)), loop.matrix_slope(s)
     row, row_slope = loop.row(s), loop.row_slope(s)
     x, y = solve(matrix, loop.column.astype(complex)), solve(matrix.T, row)
     value_change = change.row(s) @ x - y @ (change.matrix(s) @ x) + y @ change.column

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from ..foundation.linear_solve import solve
+from ..foundation.matrix_routines import eigenvectors
 from ..model.sliding import sliding_coordinates, sliding_matrices
 from ..model.structure import Structure
 from .linearisation import time_scale
@@ -56,10 +57,18 @@ class Loop(eqx.Module):
         return jax.jvp(self, (s,), (jnp.ones_like(s),))[1]
 
     @property
+    def held(self) -> Float[Array, "m m"]:
+        """The stiffness, with a spring for each rigid-body mode that the loop does not move: L(0) is the same with it."""
+        values, left, right = eigenvectors(self.stiffness)
+        sizes = jnp.abs(values)
+        free = (sizes < 1e-12 * jnp.max(sizes)) & (jnp.abs(left.conj().T @ self.column) < 1e-9)
+        springs = jnp.max(sizes) * (jnp.where(free, left, 0.0) @ right.conj().T).real
+        return self.stiffness + jax.lax.stop_gradient(springs)
+
+    @property
     def limits(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """L(0), the static response, and L(∞), the response to an impulse."""
-        static = self.row_stiffness @ solve(self.stiffness, self.column)
-        return static, self.row_mass @ solve(self.mass, self.column)
+        return self.row_stiffness @ solve(self.held, self.column), self.row_mass @ solve(self.mass, self.column)
 
 
 def friction_loop(structure: Structure, direction: Float[Array, ""]) -> tuple[Loop, Float[Array, ""]]:

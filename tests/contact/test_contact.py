@@ -12,8 +12,8 @@ import pytest
 import fivjax as fj
 from fivjax import contact as physics
 from fivjax.contact import Contact, Mechanics, Rest, Status
-from fivjax.contact.contact_problem import enumerated, pivoted
-from fivjax.contact.several_contacts import _mode_problem
+from fivjax.contact.contact_problem import NONE, STICK, enumerated, pivoted
+from fivjax.contact.several_contacts import _mode_problem, modes_from_forces
 from fivjax.model.scene import steady_sliding
 
 # Sums of a dozen products and one small linear solve with a well-conditioned mass matrix.
@@ -723,18 +723,18 @@ def test_sizes_bound_the_terms_of_guards_and_rates_and_vanish_where_the_status_h
 # --------------------------------------------------------------------------------------- several contacts
 
 
-def coupled_contacts(count):
+def coupled_contacts(count, mu_static=0.3, coupling=0.1):
     """Contacts that the mass matrix couples, weakly enough for sliding to have one answer."""
     rng, n = np.random.default_rng(count), 2 * count
     root, springs = rng.normal(size=(2, n, n))
     structure = fj.Structure(
-        np.eye(n) + 0.1 * root @ root.T / n,
+        np.eye(n) + coupling * root @ root.T / n,
         0.1 * np.eye(n),
         np.eye(n) + springs @ springs.T,
         np.tile([0.0, -1.0], count),
         contacts=[fj.ContactPoint(2 * i, 2 * i + 1) for i in range(count)],
     )
-    laws = [fj.Coulomb(0.3) for _ in range(count)]
+    laws = [fj.Coulomb(0.3, mu_static) for _ in range(count)]
     return fj.Scene(structure, laws, np.linspace(0.5, 1.0, count), fj.ConstantLoad(1.0))
 
 
@@ -816,6 +816,64 @@ def test_pivoting_finds_from_anywhere_what_trying_all_finds():
         by_pivots, by_all = map(np.asarray, both(jnp.asarray(loads), jnp.asarray(states), jnp.asarray(begin)))
     np.testing.assert_array_equal(by_pivots, by_all)
     assert set(by_all.ravel().tolist()) == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_the_contact_whose_limit_is_reached_breaks_away_and_no_other_that_holds(count):
+    """With static friction above kinetic, another one might slip in its place and relieve it. By hand: it slips, and of the
+    others those whose limit is exceeded then."""
+    kinetic, static = 0.3, 0.8
+    scene, rng, n = coupled_contacts(count, static, 0.4), np.random.default_rng(9), 2 * count
+    mass, damping, stiffness, force = map(np.asarray, scene.structure.matrices)
+    inverse = np.linalg.inv(mass)
+
+    def forces(y, released):
+        """T and N where these contacts slip, with the friction that their T had, and all others stick."""
+        free = inverse @ (3.0 * force - damping @ y[n:] - stiffness @ y[:n])
+        matrix, right = inverse.copy(), -free
+        for i, sign in released.items():
+            matrix[2 * i], right[2 * i] = 0.0, 0.0
+            matrix[2 * i, [2 * i, 2 * i + 1]] = 1.0, -sign * kinetic
+        return np.linalg.solve(matrix, right).reshape(count, 2).T
+
+    states, wanted, ends, several = [], [], [], 0
+    while len(states) < 150:
+        # Where T is this share of its limit, which is linear in the displacements along the belt; one contact has reached it.
+        first, y = int(rng.integers(count)), np.zeros(2 * n)
+        share = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 1.0, count), 0.97)
+        share[first] = 1.0
+        y[n::2], share = np.asarray(scene.belt_speed), share * rng.choice([-1, 1], count)
+
+        def missing(places, y=y, share=share):
+            along, across = forces(y + np.append(np.kron(places, [1, 0]), np.zeros(n)), {})
+            return along - share * static * across
+
+        still = missing(np.zeros(count))
+        slopes = np.stack([missing(unit) - still for unit in np.eye(count)], axis=1)
+        y[:n:2] = np.linalg.solve(slopes, -still)
+        if not np.all(forces(y, {})[1] > 0):
+            continue
+        released, (along, across) = {}, forces(y, {})
+        exceeded = np.arange(count) == first
+        while exceeded.any():
+            released |= {int(i): np.sign(along[i]) for i in np.flatnonzero(exceeded)}
+            along, across = forces(y, released)
+            exceeded = np.array([i not in released for i in range(count)]) & (np.abs(along) > static * across)
+        # Which of two follows, if either spares the other, the laws do not say.
+        without = [{k: sign for k, sign in released.items() if k != i} for i in released if i != first]
+        if np.any(across < 0) or any(np.all(abs(t) <= static * p) for t, p in (forces(y, rest) for rest in without)):
+            continue
+        several += len(released) > 1
+        states.append(y)
+        wanted.append([Status.SLIDE if i in released else Status.STICK for i in range(count)])
+        ends.append(np.where(np.arange(count) == first, STICK, NONE))
+    with jax.enable_x64(True):
+        mechanics = Mechanics(scene)
+        stuck = Contact(jnp.full(count, Status.STICK, jnp.int32), jnp.ones(count))
+        of_all = jax.jit(jax.vmap(lambda y, ended: modes_from_forces(mechanics, jnp.asarray(3.0), y, stuck, ended)))
+        found = np.asarray(of_all(jnp.asarray(states), jnp.asarray(ends, jnp.int32)).status)
+    np.testing.assert_array_equal(found, wanted)
+    assert several > 20
 
 
 def test_how_clear_an_impact_is_falls_to_zero_at_the_edge_of_the_cone_whichever_way_it_slips():

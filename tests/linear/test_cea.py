@@ -680,3 +680,26 @@ def test_margin_refuses_what_would_take_for_ever():
     large = fj.Structure(np.eye(n), np.eye(n), np.eye(n), np.ones(n), 0, 1)
     with pytest.raises(ValueError, match="at most 32 coordinates"):
         cea.margin(large, 0.1)
+
+
+def with_a_free_mass(*, tangential: int = 0) -> fj.Structure:
+    """k_x = 1 N/m along the belt, coupled by 2 N/m to the normal direction; the third coordinate has a mass and nothing else."""
+    stiffness = np.array([[1.0, 2.0, 0.0], [2.0, 9.0, 0.0], [0.0, 0.0, 0.0]])
+    return fj.Structure(
+        np.eye(3), np.diag([0.1, 0.0, 0.0]), stiffness, [0.0, -1.0, 0.0], tangential=tangential, normal=1
+    )
+
+
+def test_a_free_mass_beside_it_does_not_hide_divergence():
+    """x'' + c x' + (k_x - μ k_xn) x = 0 loses its stiffness at μ = k_x / k_xn."""
+    limit = fj.cea.stability_limit(with_a_free_mass())
+    assert limit.mu == pytest.approx(0.5, rel=1e-12) and limit.mechanism is fj.cea.Mechanism.DIVERGENCE
+    slopes = fj.cea.sensitivity(with_a_free_mass())
+    assert slopes["stiffness[0,0]"] == pytest.approx(0.5, rel=1e-9)
+    assert slopes["stiffness[0,1]"] == pytest.approx(-0.25, rel=1e-9)
+
+
+def test_what_friction_moves_ever_further_has_no_limit_of_steady_sliding():
+    for limit_of in (fj.cea.critical_friction, fj.cea.stability_limit):
+        with pytest.raises(ValueError, match="friction moves a part of the structure that no spring holds"):
+            limit_of(with_a_free_mass(tangential=2))

@@ -504,3 +504,33 @@ def test_weights_of_the_section_lie_far_apart_however_many_there_are(count):
     weights = np.sort(section_weights(count))
     assert weights[0] == 1.0 and weights[-1] < 2.0
     assert np.min(np.diff(np.append(weights, 2.0))) > 0.5 / count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2, 3, 9, 12, 13])
+def test_the_order_in_which_contacts_are_listed_changes_nothing(seed):
+    """Two to four contacts that the mass matrix couples, some with static friction above kinetic. What breaks away is the contact
+    whose limit is reached, not another one that is listed later and would relieve it."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 5))
+    n = 2 * count + int(rng.integers(0, 2))
+    root, springs = rng.normal(size=(n, n)), rng.normal(size=(n, n))
+    mass = np.eye(n) + 0.05 * (root + root.T) / np.sqrt(n)
+    stiffness = springs @ springs.T / n + np.diag(rng.uniform(0.5, 4.0, n))
+    load, belts = np.zeros(n), rng.uniform(0.05, 0.5, count)
+    load[1 : 2 * count : 2] = -rng.uniform(0.5, 2.0, count)
+    kinetic = rng.uniform(0.1, 0.6, count)
+    static = kinetic + rng.choice([0.0, 0.2, 0.5], count)
+    q, v = 0.4 * rng.normal(size=n), np.zeros(n)
+    q[1 : 2 * count : 2], v[: 2 * count : 2] = 0.0, np.where(rng.random(count) < 0.6, belts, 0.0)
+    motions = []
+    for order in (np.arange(count), np.arange(count)[::-1]):
+        contacts = [fj.ContactPoint(2 * i, 2 * i + 1) for i in order]
+        structure = fj.Structure(mass, 0.02 * mass + 0.01 * stiffness, stiffness, load, contacts=contacts)
+        laws = [fj.Coulomb(float(kinetic[i]), float(static[i])) for i in order]
+        motions.append(
+            fj.simulate(fj.Scene(structure, laws, belts[order], fj.ConstantLoad(1.0)), 15.0, 0.05, y0=(q, v))
+        )
+    listed, turned = motions
+    np.testing.assert_array_equal(turned.status, listed.status[:, ::-1])
+    np.testing.assert_allclose(turned.displacement, listed.displacement, atol=1e-9)
