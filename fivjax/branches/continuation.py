@@ -33,7 +33,7 @@ from ..section.return_maps import ReturnMaps
 from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
 from .branch_points import BranchPoint, point_through
-from .following import follow_branch
+from .following import HalfBranch, follow_branch
 from .multiple_shooting import Mode, Phases, parameter_direction
 from .pseudo_arclength import Family
 from .special_derivatives import derivatives_of_special_points
@@ -88,7 +88,7 @@ def continue_cycle(
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
-    The attributes `begins` and `ends` say in a sentence where each end is, and why.
+    The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once.
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value, and for
     anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
@@ -134,7 +134,9 @@ def continue_cycle(
         raise NoLimitCycle(
             "The cycle to start from lies at a special point, where its equations are singular. Start a little beside it."
         )
-    down, up = (follow_branch(family, first, sense, (low, high), points) for sense in (-1.0, 1.0))
+    down = follow_branch(family, first, -1.0, (low, high), points)
+    # A closed curve is whole by now; its first cycle is its last as well.
+    up = HalfBranch([], down.ending) if down.closed else follow_branch(family, first, 1.0, (low, high), points)
     along = [*reversed(down.points), first, *up.points]
     if derivatives:
         stage("differentiating special points")

@@ -22,6 +22,7 @@ class HalfBranch(NamedTuple):
 
     points: list[BranchPoint]
     ending: str  # why it ends, a sentence
+    closed: bool = False  # whether it has come back to where it began
 
 
 def follow_branch(
@@ -79,13 +80,15 @@ def follow_branch(
         points += [point for point in passed if bounds[0] <= point.cycle.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
             return _to_bound(family, points, here, following.u - here.cycle.u, following, bounds)
-        if (turned_at := _met_before(points, last)) is not None:
+        if (met := _met_before([start, *points], last)) is not None:
+            if met.onwards:
+                return HalfBranch(points, _at(family, start, "the branch is back where it began"), closed=True)
             # What goes on there in truth has other modes: a chain of rebounds that no longer ends, say.
-            points = points[: turned_at + 1]
+            points = points[: met.turned]
             onward = over_a_gap()
             if onward is None:
                 why = "the branch would come back on itself, and nothing else was found to go on"
-                return HalfBranch(points, _at(family, points[-1], why))
+                return HalfBranch(points, _at(family, [start, *points][-1], why))
             here, tangent, step = onward
             continue
         points.append(last)
@@ -98,8 +101,6 @@ def follow_branch(
                 f"At {family.name} = {end.cycle.parameter:.13g} the amplitude meets the sliding equilibrium, whose stability "
                 f"changes there.",
             )
-        if len(points) > 8 and _closes(start, here, last):
-            return HalfBranch(points, _at(family, last, "the branch is back where it began"))
         easy = following.iterations <= 3
         step = min(step * ((soon if step < FIRST else later) if easy else 0.7), LONGEST)
         here, tangent = with_own_rebounds(family, last, turned)
@@ -182,8 +183,15 @@ def _smallness(curve: Curve, cycle: ComputedCycle) -> float:
     return float(np.linalg.norm(cycle.u[: len(curve.of_state)])) if pure else np.inf
 
 
-def _met_before(points: list[BranchPoint], last: BranchPoint) -> int | None:
-    """Where a branch has turned back, if its latest cycle is one that it has come along before: the last point until then."""
+class _Met(NamedTuple):
+    """Where a branch has met itself."""
+
+    onwards: bool  # whether it goes the way that it went then: it is closed
+    turned: int  # the last point before it turned back, if it did
+
+
+def _met_before(points: list[BranchPoint], last: BranchPoint) -> _Met | None:
+    """Where a branch meets itself, if its latest cycle is one that it has come along before."""
     # Cycles of one parameter whose periods and sizes differ by no more than this share are the same, but for rebounds that are
     # none to speak of.
     same = 1e-7
@@ -202,15 +210,9 @@ def _met_before(points: list[BranchPoint], last: BranchPoint) -> int | None:
             continue
         size, own = (at.phases.size(near.curve.weights) for at in (before, last.cycle))
         if abs(size - own) <= 10 * same * size:
-            return int(k + np.argmax(np.abs(parameters[k:] - value)))
+            onwards = (parameters[k + 1] - parameters[k]) * (value - parameters[-1]) > 0
+            return _Met(bool(onwards), int(k + np.argmax(np.abs(parameters[k:] - value))))
     return None
-
-
-def _closes(start: BranchPoint, here: BranchPoint, last: BranchPoint) -> bool:
-    if start.curve.modes != last.curve.modes:
-        return False
-    a, b, c = (point.cycle.u * point.curve.scales / start.curve.scales for point in (here, start, last))
-    return bool(np.linalg.norm(b - a) < np.linalg.norm(c - a) and np.linalg.norm(c - b) < np.linalg.norm(c - a))
 
 
 def _where_sliding_is_met(family: Family, last: BranchPoint) -> BranchPoint | None:

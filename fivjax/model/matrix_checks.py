@@ -12,7 +12,8 @@ from ..foundation.precision import is_known
 def check_matrix(name: str, matrix, *, definite: bool) -> None:
     if not is_known(matrix):
         return
-    array = arguments.numeric_array(name, matrix).astype(np.float64)
+    given = arguments.numeric_array(name, matrix)
+    array = given.astype(np.float64)
     if array.ndim != 2 or array.shape[0] != array.shape[1]:
         raise ValueError(f"Argument `{name}` must be a square matrix, but has shape {array.shape}.")
     if array.shape[0] < 2:
@@ -42,9 +43,11 @@ def check_matrix(name: str, matrix, *, definite: bool) -> None:
             f"{lowest:.3g}. Every coordinate needs a positive mass{_without(diagonal)}."
         )
     if lowest < -1e-9:
+        rounded = given.dtype == np.float32 and lowest > -1e-6 * len(array)
+        remedy = "Its entries are in single precision, whose rounding this is: give them in double precision"
         raise ValueError(
             f"Argument `{name}` must be positive semi-definite, but its smallest eigenvalue (diagonal scaled to one) "
-            f"is {lowest:.3g}. Negative springs or dampers are not modelled."
+            f"is {lowest:.3g}. {remedy if rounded else 'Negative springs or dampers are not modelled'}."
         )
 
 

@@ -304,6 +304,22 @@ def test_a_branch_with_ever_shorter_impacts_ends():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("belt_speed", [0.3, 0.7])
+def test_a_closed_curve_is_passed_once_wherever_it_begins(belt_speed):
+    branch = fj.continue_cycle(paper(belt_speed, 0.2), "belt_speed", (0.2, 1.8))
+    assert branch.begins == branch.ends == f"At belt_speed = {belt_speed} the branch is back where it began."
+    places = {
+        "fold": [0.271047422, 0.836082526],
+        "stick": [0.552200998, 0.602311525],
+        "grazing of N": [0.271056748, 0.830712625],
+        "Neimark–Sacker": [0.835398975],
+    }
+    for kind, wanted in places.items():
+        found = [float(v) for v, name in zip(branch.parameter, branch.special.values, strict=True) if kind in name]
+        np.testing.assert_allclose(sorted(found), wanted, atol=2e-9)
+
+
+@pytest.mark.slow
 def test_a_grazing_has_a_state_on_the_section_whatever_rounding_makes_of_the_touch():
     branch = fj.continue_cycle(paper(2.0, 0.227), "theta", (0.0065, 0.0105))
     at = int(np.argmax(branch.special.values == "grazing of N: impact inserted"))

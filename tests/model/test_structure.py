@@ -254,6 +254,16 @@ WITH_NAN = np.array([[1.0, math.nan, 0.0], [math.nan, 1.0, 0.0], [0.0, 0.0, 1.0]
 MATRICES = ("mass", "damping", "stiffness")
 
 
+def test_rounding_to_single_precision_is_named_as_what_it_is():
+    """The paper's stiffness is singular; so rounded, a spring would be negative."""
+    matrices = [np.asarray(matrix, np.float32) for matrix in fj.belt_oscillator().matrices[:3]]
+    with pytest.raises(ValueError, match="single precision, whose rounding this is: give them in double precision"):
+        fj.Structure(*matrices, [0.0, -1.0, 0.0], contacts=[fj.ContactPoint(0, 2)])
+    doubled = [matrix.astype(float) for matrix in matrices]
+    with pytest.raises(ValueError, match="Negative springs"):
+        fj.Structure(*doubled, [0.0, -1.0, 0.0], contacts=[fj.ContactPoint(0, 2)])
+
+
 @pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize(
     ("value", "error", "fragments"),
