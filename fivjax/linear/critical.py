@@ -12,7 +12,7 @@ from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import sliding_coordinates, sliding_matrices
+from ..model.sliding import sliding_coordinates
 from ..model.structure import Structure
 from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
@@ -66,13 +66,11 @@ def _check_held(structure: Structure) -> None:
     if not all(map(is_known, structure.matrices)):
         return
     own = in_contact_coordinates(structure)
-    tangential, normal = (
-        np.array([getattr(contact, name) for contact in own.contacts]) for name in ("tangential", "normal")
-    )
-    still = np.zeros(()) if len(own.contacts) == 1 else np.zeros(len(own.contacts))
-    mass, _, stiffness = map(np.asarray, sliding_matrices(own, still))
-    squares, modes = linalg.eigh(stiffness, mass)
-    moved = np.abs(modes[np.isin(sliding_coordinates(own.size, normal), tangential)]).max(axis=0)
+    tangential, normal = np.array([(contact.tangential, contact.normal) for contact in own.contacts]).T
+    free = sliding_coordinates(own.size, normal)
+    # The motion without friction, and what a unit of it would move.
+    squares, modes = linalg.eigh(*(np.asarray(matrix)[np.ix_(free, free)] for matrix in (own.stiffness, own.mass)))
+    moved = np.abs(modes[np.isin(free, tangential)]).max(axis=0)
     if np.any((squares < 1e-12 * squares[-1]) & (moved > 1e-9 * np.abs(modes).max(axis=0))):
         raise ValueError(
             "There is no steady sliding: friction moves a part of the structure that no spring holds. "
