@@ -534,3 +534,26 @@ def test_the_order_in_which_contacts_are_listed_changes_nothing(seed):
     listed, turned = motions
     np.testing.assert_array_equal(turned.status, listed.status[:, ::-1])
     np.testing.assert_allclose(turned.displacement, listed.displacement, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("static", "belt"), [(0.55, 0.2), (0.7, 0.15), (0.8, 0.3)])
+def test_two_equal_contacts_break_away_at_the_same_instant(static, belt):
+    """Masses that inertia couples move as one of the whole mass: neither spares the other."""
+    coupled = np.array([[1.0, 0.0, 0.1, 0.0], [0.0, 1.0, 0.0, 0.0], [0.1, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    contacts = [fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)]
+    pair = fj.Structure(coupled, 0.02 * np.eye(4), np.eye(4), [0.0, -1.0, 0.0, -1.0], contacts=contacts)
+    one = fj.Structure(np.diag([1.1, 1.0]), 0.02 * np.eye(2), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
+    both, alone = (
+        fj.simulate(
+            fj.Scene(structure, fj.Coulomb(0.4, static), belt, fj.ConstantLoad(1.0)),
+            60.0,
+            0.01,
+            y0=([0.3, 0.0] * count, [belt, 0.0] * count),
+        )
+        for structure, count in ((pair, 2), (one, 1))
+    )
+    assert set(np.unique(alone.status)) == {fj.Status.STICK, fj.Status.SLIDE}
+    for contact in (0, 1):
+        np.testing.assert_array_equal(both.status[:, contact], np.ravel(alone.status))
+        np.testing.assert_allclose(both.velocity[:, 2 * contact], alone.velocity[:, 0], atol=1e-12)
