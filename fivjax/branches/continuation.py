@@ -26,7 +26,7 @@ from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..linear.linearisation import sliding_rates
 from ..model.contact_coordinates import to_contact_coordinates
-from ..model.scene import Scene, refuse_several_contacts, scene_in_contact_coordinates
+from ..model.scene import Scene, check_corners, refuse_several_contacts, scene_in_contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import Point as SectionPoint
 from ..section.return_maps import ReturnMaps
@@ -89,9 +89,10 @@ def continue_cycle(
       points, for the parameter itself, and where the change of modes is not a simple one.
 
     The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once.
+    One of cycles whose two halves become alike ends there, at the period doubling from which it comes.
 
-    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value, and for
-    anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
+    **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value or that it
+    cannot have, and for anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.
 
     **Example:**
 
@@ -108,6 +109,7 @@ def continue_cycle(
     known = [name for name, value in final.parameters.items() if np.ndim(value) == 0]
     arguments.one_of("parameter", parameter, tuple(known))
     low, high = _checked_bounds(bounds)
+    check_corners(final, {parameter: np.array([low, high])})
     value = float(final.parameters[parameter])
     if not low <= value <= high:
         own, lower, upper = apart(value, low, high)

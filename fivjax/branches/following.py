@@ -7,11 +7,12 @@ from jaxtyping import Float
 
 from ..foundation.progress import stage
 from ..linear.linearisation import sliding_rates
+from . import halves
 from .branch_points import BranchPoint, beyond, branch_point
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import ComputedCycle, Curve, Family
-from .special_points import MEETS_SLIDING, Special, between
+from .special_points import FOLD, MEETS_SLIDING, Special, between
 
 # Lengths of steps, in the units of the curve (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
@@ -68,7 +69,11 @@ def follow_branch(
                 # The parameter may turn back just there.
                 passed = _specials(family, curve, here.cycle, tangent, special.cycle)
                 points += [one for one in passed if np.linalg.norm(one.cycle.u - special.cycle.u) > 1e-6]
-            at_change = branch_point(family, special.curve, special.cycle, special)
+            # The rebounds of a landing that begins to have them are as short as those that are left out.
+            begins = (
+                family.name.startswith("restitution") and special.cycle.parameter < 1e-5 and "impact" in special.name
+            )
+            at_change = branch_point(family, special.curve, special.cycle, None if begins else special)
             if onward is not None or at_change.real is not None:
                 points.append(at_change)
             onward = onward or over_a_gap()
@@ -76,6 +81,18 @@ def follow_branch(
                 return HalfBranch(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
             continue
+        if halves.exchange_places(curve, here.cycle, following):
+            end = halves.where_they_meet(family, curve, following)
+            if end is not None and bounds[0] <= end.cycle.parameter <= bounds[1]:
+                # Next to it the equations of the whole cycle are nearly singular, and seem to turn back.
+                near = 1e-5 * family.scale
+                points = [
+                    point
+                    for point in points
+                    if point.name != FOLD or abs(point.cycle.parameter - end.cycle.parameter) > near
+                ]
+                why = "the two halves of the cycle become one, whose period doubles there"
+                return HalfBranch([*points, end], _at(family, end, why))
         passed = _specials(family, curve, here.cycle, tangent, following)
         points += [point for point in passed if bounds[0] <= point.cycle.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:
@@ -140,12 +157,13 @@ def _to_bound(
     with the cycle at the bound, if it is found.
     """
     bound = bounds[0] if beyond.parameter < bounds[0] else bounds[1]
+    reached = f"The bound {family.name} = {bound:.10g} is reached."
+    if not points and here.cycle.parameter == bound:
+        return HalfBranch([], reached)
     share = (bound - here.cycle.parameter) / (along[-1] * family.scale)
     at = here.curve.at_parameter(here.cycle.u + share * along, bound)
     last = [] if at is None else [branch_point(family, here.curve, at)]
-    return HalfBranch(
-        points + [point for point in last if point.is_real], f"The bound {family.name} = {bound:.10g} is reached."
-    )
+    return HalfBranch(points + [point for point in last if point.is_real], reached)
 
 
 def _at(family: Family, point: BranchPoint, why: str) -> str:

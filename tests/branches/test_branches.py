@@ -181,6 +181,9 @@ def test_what_is_no_parameter_or_no_bound_is_refused():
         fj.continue_cycle(scene, "mu", (0.3, 0.4))
     with pytest.raises(ValueError, match="pair of numbers"):
         fj.continue_cycle(scene, "mu", 0.3)
+    # What no scene has is no part of a branch.
+    with pytest.raises(ValueError, match=r"`restitution` must be non-negative, but is -0\.2"):
+        fj.continue_cycle(scene, "restitution", (-0.2, 0.3))
     with pytest.raises(TypeError, match="whole number"):
         fj.cycle_at(None, 1.5)
 
@@ -301,6 +304,36 @@ def test_a_branch_with_ever_shorter_impacts_ends():
     """Beyond a change of modes the motion had 16,384 phases, and their equations would have been a matrix of 98 GiB."""
     branch = fj.continue_cycle(with_static_friction(1.0), "mu_static", (0.21, 0.6))
     assert branch.ends == "At mu_static = 0.55396671036 stick removed: no cycle was found to go on beyond."
+
+
+def rebounding(restitution: float) -> fj.Scene:
+    """A random structure whose period doubles where it rebounds half as fast as it lands."""
+    stiffness = np.array([[2.097, 0.967, -0.367], [0.967, 2.436, -1.042], [-0.367, -1.042, 1.861]])
+    damping = np.array([[0.07, 0.016, -0.006], [0.016, 0.076, -0.017], [-0.006, -0.017, 0.066]])
+    structure = fj.Structure(np.eye(3), damping, stiffness, [0.37, -1.0, 0.019], tangential=0, normal=1)
+    return fj.Scene(structure, fj.Coulomb(0.6963), 1.2088, fj.ConstantLoad(1.0), restitution, impact_law="reset")
+
+
+@pytest.mark.slow
+def test_the_branch_of_a_doubled_period_ends_where_it_is_born():
+    """There both branches have the same point, with the same derivatives, by equations of their own."""
+    single = fj.continue_cycle(rebounding(0.5), "restitution", (0.45, 0.53), points=40, derivatives=True)
+    (flip,) = np.flatnonzero(single.special.values == "period doubling")
+    for begin, bounds in ((0.512, (0.49, 0.514)), (0.52, (0.49, 0.55)), (0.508, (0.4, 0.6))):
+        double = fj.continue_cycle(rebounding(begin), "restitution", bounds, points=130, derivatives=True)
+        assert double.begins.endswith("the two halves of the cycle become one, whose period doubles there.")
+        assert double.special.values[0] == "period doubling" and "fold" not in double.special.values
+        assert float(double.parameter[0]) == pytest.approx(float(single.parameter[flip]), abs=1e-8)
+        assert float(double.period[0]) == pytest.approx(2 * float(single.period[flip]), rel=1e-8)
+        np.testing.assert_allclose(double.d_special[0], single.d_special[flip], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_nothing_happens_where_rebounds_begin():
+    branch = fj.continue_cycle(rebounding(0.0), "restitution", (0.0, 0.1), points=40)
+    assert specials(branch) == []
+    # The scene's own value is a bound, and its cycle one point.
+    assert branch.parameter.values[0] == 0.0 < branch.parameter.values[1]
 
 
 @pytest.mark.slow
