@@ -12,7 +12,7 @@ from .branch_points import BranchPoint, beyond, branch_point
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import ComputedCycle, Curve, Family
-from .special_points import FOLD, MEETS_SLIDING, Special, between
+from .special_points import MEETS_SLIDING, Special, between
 
 # Lengths of steps, in the units of the curve (cycle size, period and parameter scale).
 FIRST, LONGEST, SHORTEST = 0.01, 0.04, 1e-7
@@ -81,18 +81,10 @@ def follow_branch(
                 return HalfBranch(points, _at(family, at_change, f"{special.name}: no cycle was found to go on beyond"))
             here, tangent, step = onward
             continue
-        if halves.exchange_places(curve, here.cycle, following):
-            end = halves.where_they_meet(family, curve, following)
-            if end is not None and bounds[0] <= end.cycle.parameter <= bounds[1]:
-                # Next to it the equations of the whole cycle are nearly singular, and seem to turn back.
-                near = 1e-5 * family.scale
-                points = [
-                    point
-                    for point in points
-                    if point.name != FOLD or abs(point.cycle.parameter - end.cycle.parameter) > near
-                ]
-                why = "the two halves of the cycle become one, whose period doubles there"
-                return HalfBranch([*points, end], _at(family, end, why))
+        born = halves.born_between(family, curve, here.cycle, following)
+        if born is not None and bounds[0] <= born.cycle.parameter <= bounds[1]:
+            why = "the two halves of the cycle become one, whose period doubles there"
+            return HalfBranch([*halves.without_seeming_folds(points, born), born], _at(family, born, why))
         passed = _specials(family, curve, here.cycle, tangent, following)
         points += [point for point in passed if bounds[0] <= point.cycle.parameter <= bounds[1]]
         if not bounds[0] <= following.parameter <= bounds[1]:

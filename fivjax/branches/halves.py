@@ -10,24 +10,31 @@ from jaxtyping import Float
 from .branch_points import BranchPoint, branch_point
 from .multiple_shooting import Phases
 from .pseudo_arclength import ComputedCycle, Curve, Family, multipliers_of
-from .special_points import DOUBLING, Special, critical_multiplier, doubling, root
+from .special_points import DOUBLING, FOLD, Special, critical_multiplier, doubling, root
 
 
-def exchange_places(curve: Curve, a: ComputedCycle, b: ComputedCycle) -> bool:
-    """Whether the halves of a cycle are exchanged between two neighbours on a curve."""
+def born_between(family: Family, curve: Curve, a: ComputedCycle, b: ComputedCycle) -> BranchPoint | None:
+    """The point at which the halves of a cycle are one, between two neighbours on a curve; None if there is none."""
     half, odd = divmod(len(curve.modes), 2)
     if odd or curve.modes[:half] != curve.modes[half:]:
-        return False
+        return None
 
     def apart(cycle: ComputedCycle) -> Float[np.ndarray, " m"]:
         y = curve.weights * cycle.phases.y
         return (y[:half] - y[half:]).ravel()
 
-    return bool(apart(a) @ apart(b) < 0)
+    # Beyond it the halves are exchanged.
+    return _where_halves_meet(family, curve, b) if apart(a) @ apart(b) < 0 else None
 
 
-def where_they_meet(family: Family, curve: Curve, near: ComputedCycle) -> BranchPoint | None:
-    """The point at which the halves of a cycle are one, next to a cycle whose halves are nearly so; None if none is found."""
+def without_seeming_folds(points: list[BranchPoint], born: BranchPoint) -> list[BranchPoint]:
+    """The points of a branch up to there, less folds next to it: where the equations are nearly singular, they seem to turn."""
+    near = 1e-5 * born.curve.family.scale
+    return [one for one in points if one.name != FOLD or abs(one.cycle.parameter - born.cycle.parameter) > near]
+
+
+def _where_halves_meet(family: Family, curve: Curve, near: ComputedCycle) -> BranchPoint | None:
+    """That point, from a cycle whose halves are nearly one."""
     half, phases = len(curve.modes) // 2, near.phases
     mean = Phases(
         curve.modes[:half], 0.5 * (phases.y[:half] + phases.y[half:]), 0.5 * (phases.h[:half] + phases.h[half:])
