@@ -189,7 +189,7 @@ def test_restitution_at_zero_by_impact_law(law, lost, mode):
     np.testing.assert_allclose(found["restitution"], [change * (t1 - fall), 0.0, change, 0.0], rtol=1e-9, atol=1e-12)
 
 
-def lands_without_slip(seed: int, coupled: float):
+def lands_without_slip(seed: int, coupled: float, *mu: float):
     """A random structure whose first landing ends the slip, and its start."""
     rng = np.random.default_rng(seed)
     mass, stiffness = (rng.normal(size=(3, 3)) for _ in range(2))
@@ -197,14 +197,23 @@ def lands_without_slip(seed: int, coupled: float):
     structure = fj.Structure(mass, 0.05 * stiffness, stiffness, [0.0, 0.0, -1.0], tangential=0, normal=2)
     y0 = np.array([0.3, 0.2, 0.4]) * rng.uniform(0.2, 1.5, 3), rng.normal(size=3) * 0.3
     load = fj.Pulse(2.0, 1.0, start=100.0)
-    return lambda e: fj.Scene(structure, fj.Coulomb(0.5, 0.6), 0.3, load, restitution=e), y0
+    return lambda e: fj.Scene(structure, fj.Coulomb(*mu), 0.3, load, restitution=e), y0
 
 
-@pytest.mark.parametrize(("seed", "coupled", "least"), [(5, 0.125, 0.1), (13, 0.2, 0.05), (53, 0.2, 0.005)])
-def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it(seed, coupled, least):
+@pytest.mark.parametrize(
+    ("seed", "coupled", "mu", "least"),
+    [
+        (5, 0.125, (0.5, 0.6), 0.1),
+        (13, 0.2, (0.5, 0.6), 0.05),
+        (53, 0.2, (0.5, 0.6), 0.005),
+        (71, 0.45, (0.2,), 0.02),
+        (153, 0.45, (0.2,), 0.1),
+    ],
+)
+def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it(seed, coupled, mu, least):
     """The impulses of the two impacts lie inside the cone, the forces on its edge: they do not make up for each other. The second
-    impact ends the slip that the flight leaves without any contact force."""
-    scene, y0 = lands_without_slip(seed, coupled)
+    impact slides, or (the last two) ends the slip that the flight leaves without any contact force."""
+    scene, y0 = lands_without_slip(seed, coupled, *mu)
 
     def end(e):
         run = fj.simulate(scene(e), 4.0, 4.0, FEW, y0=y0)
@@ -217,7 +226,7 @@ def test_restitution_at_zero_where_an_impact_ends_the_slip_and_forces_begin_it(s
 
 def test_where_static_friction_alone_holds_what_has_landed_the_least_restitution_makes_it_slide():
     """However small the rebounds are, each leaves some slip, which the friction of sliding does not end: the motion jumps."""
-    scene, y0 = lands_without_slip(38, 0.2)
+    scene, y0 = lands_without_slip(38, 0.2, 0.5, 0.6)
     found = by_kernel(scene(0.0), "restitution", y0, 4.0)
     assert not found.exist and "static friction alone" in found.reason
     by_tiny = [fj.simulate(scene(e), 4.0, 4.0, FEW, y0=y0).displacement[-1, 0] for e in (0.0, 1e-7, 1e-5)]
