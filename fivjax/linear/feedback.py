@@ -59,11 +59,11 @@ class Loop(eqx.Module):
     @property
     def held(self) -> Float[Array, "m m"]:
         """The stiffness, with a spring for each rigid-body mode that the loop does not move: L(0) is the same with it."""
-        values, left, right = eigenvectors(self.stiffness)
+        stiffness, column = jax.lax.stop_gradient((self.stiffness, self.column))
+        values, left, right = eigenvectors(stiffness)
         sizes = jnp.abs(values)
-        free = (sizes < 1e-12 * jnp.max(sizes)) & (jnp.abs(left.conj().T @ self.column) < 1e-9)
-        springs = jnp.max(sizes) * (jnp.where(free, left, 0.0) @ right.conj().T).real
-        return self.stiffness + jax.lax.stop_gradient(springs)
+        free = (sizes < 1e-12 * jnp.max(sizes)) & (jnp.abs(left.conj().T @ column) < 1e-9)
+        return self.stiffness + jnp.max(sizes) * (jnp.where(free, left, 0.0) @ right.conj().T).real
 
     @property
     def limits(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
