@@ -88,8 +88,8 @@ def continue_cycle(
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
-    The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once.
-    One of cycles whose two halves become alike ends there, at the period doubling from which it comes.
+    The attributes `begins` and `ends` say in a sentence where each end is, and why. A closed curve is passed once. A branch of
+    cycles whose two halves become alike ends there, at the period doubling from which it comes.
 
     **Raises:** `ValueError` for a name that is no scalar parameter, bounds that do not contain the scene's value or that it
     cannot have, and for anything that `limit_cycle` refuses; `NoLimitCycle` if there is no periodic cycle to start from.

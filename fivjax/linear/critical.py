@@ -12,7 +12,7 @@ from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
-from ..model.sliding import sliding_coordinates
+from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
 from .feedback import friction_loop, slope_loop
@@ -59,28 +59,32 @@ def matrices_only(structure: Structure) -> Structure:
     return Structure(*structure.matrices, contacts=structure.contacts)
 
 
-def _check_held(structure: Structure) -> None:
-    """Refuse a structure that friction moves ever further: it has no steady sliding whose stability could be lost."""
+def _checked(structure: Structure, direction) -> Structure:
+    """The structure in contact coordinates, if its steady sliding may have a limit of stability.
+
+    **Raises:** `ValueError` if friction moves a part of it ever further.
+    """
     from scipy import linalg
 
-    if not all(map(is_known, structure.matrices)):
-        return
+    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    check_direction(direction)
     own = in_contact_coordinates(structure)
-    tangential, normal = np.array([(contact.tangential, contact.normal) for contact in own.contacts]).T
-    free = sliding_coordinates(own.size, normal)
-    # The motion without friction, and what a unit of it would move.
-    squares, modes = linalg.eigh(*(np.asarray(matrix)[np.ix_(free, free)] for matrix in (own.stiffness, own.mass)))
-    moved = np.abs(modes[np.isin(free, tangential)]).max(axis=0)
-    if np.any((squares < 1e-12 * squares[-1]) & (moved > 1e-9 * np.abs(modes).max(axis=0))):
-        raise ValueError(
-            "There is no steady sliding: friction moves a part of the structure that no spring holds. "
-            "Hold it by a spring along the belt."
-        )
+    if all(map(is_known, own.matrices)):
+        free, (tangential, _) = free_in_sliding(own), contact_coordinates(own)
+        # The motion without friction, and what a unit of it would move.
+        squares, modes = linalg.eigh(*(np.asarray(matrix)[np.ix_(free, free)] for matrix in (own.stiffness, own.mass)))
+        moved = np.abs(modes[np.isin(free, tangential)]).max(axis=0)
+        if np.any((squares < 1e-12 * squares[-1]) & (moved > 1e-9 * np.abs(modes).max(axis=0))):
+            raise ValueError(
+                "There is no steady sliding: friction moves a part of the structure that no spring holds. "
+                "Hold it by a spring along the belt."
+            )
+    return own
 
 
 def _several(structure: Structure, direction) -> tuple[Structure, Float[Array, " c"]]:
-    # In contact coordinates, so that one compiled program serves contacts of any directions.
-    return matrices_only(in_contact_coordinates(structure)), jnp.full(len(structure.contacts), float(direction))
+    # One compiled program serves contacts of any directions.
+    return matrices_only(structure), jnp.full(len(structure.contacts), float(direction))
 
 
 def _is_a_limit(value):
@@ -122,11 +126,9 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
         >>> round(float(fj.cea.critical_friction(structure)), 10)
         0.2282253477
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
-    check_direction(direction)
-    _check_held(structure)
+    own = _checked(structure, direction)
     if not one_contact(structure):
-        return _critical_friction_of_several(*_several(structure, direction))
+        return _critical_friction_of_several(*_several(own, direction))
     return _critical_friction(matrices_only(structure), jnp.asarray(float(direction)))
 
 
@@ -158,11 +160,9 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         >>> round(float(limit.frequency), 2), limit.mechanism.value  # Hz
         (67.92, 'flutter')
     """
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
-    check_direction(direction)
-    _check_held(structure)
+    own = _checked(structure, direction)
     if not one_contact(structure):
-        return _stability_limit_of_several(*_several(structure, direction))
+        return _stability_limit_of_several(*_several(own, direction))
     return _stability_limit(matrices_only(structure), jnp.asarray(float(direction)))
 
 

@@ -18,7 +18,7 @@ def paper(belt_speed: float, mu: float) -> fj.Scene:
 
 
 def benchmark_a(belt_speed: float) -> fj.Scene:
-    """A unit mass under falling friction. Its contact is at the last coordinate first, unlike that of the belt oscillator."""
+    """A unit mass under falling friction. Unlike the belt oscillator's, its normal coordinate comes before the tangential one."""
     structure = fj.Structure(np.eye(2), np.diag([0.0, 0.1]), np.eye(2), np.array([-1.0, 0.0]), tangential=1, normal=0)
     return fj.Scene(structure, fj.ExponentialDecay(1.0, 0.5, 2.0), belt_speed, fj.ConstantLoad(1.0))
 
