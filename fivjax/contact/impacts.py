@@ -1,6 +1,5 @@
 """Velocities after the gap has closed."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -89,31 +88,33 @@ def _ending_slip(mechanics: Mechanics, slip, jump):
     return (-g_nn * slip - g_tn * jump) / determinant, (g_tn * slip + g_tt * jump) / determinant
 
 
-def after_brief_flight(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
-    """How velocities differ, per m/s of a rebound that ends at once, from those of one contact that stays on the belt.
+def after_brief_flights(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
+    """How velocities differ, per m/s of a rebound that counts as rest, from those of one contact that stays on the belt.
 
-    That is the derivative of what follows a landing by the restitution, where that is zero: a rebound of speed v flies for
-    2 v / a under the acceleration a towards the belt. Meanwhile the forces of the mode `contact` are missing; then a second
-    impact ends it. Where the impulses of both impacts lie on the same edge of the friction cone as these forces do, or both
-    end the slip, they make up for exactly what is missing.
+    That is the derivative of what follows a landing by the speed of its rebound. A rebound of speed v flies for 2 v / a under
+    the acceleration a towards the belt, and with restitution e again with e v, e² v, ... Meanwhile the forces of the mode
+    `contact` are missing, and impacts end the flights. Where the impulses of all impacts lie on the same edge of the friction
+    cone as these forces do, or all end the slip, they make up for exactly what is missing, with that of the landing.
     """
     g_tt, g_tn, g_nn = mechanics.compliance
     tangential_force, normal_force = contact_forces(mechanics, contact, load, y)
     pressing = g_tn * tangential_force + g_nn * normal_force
-    flight = 2.0 / jnp.where(pressing > 0, pressing, 1.0)  # s, per m/s
+    e = jnp.where(mechanics.restitution < 1, mechanics.restitution, 0.0)
+    # In all, per m/s: the time of the flights, in s, and the changes of the gap's rate by the impacts that end them.
+    flight, jump = 2.0 / (1 - e) / jnp.where(pressing > 0, pressing, 1.0), (1 + e) / (1 - e)
     if mechanics.impact_law == "reset":
         tangential = normal = jnp.zeros_like(flight)
     elif mechanics.impact_law == "frictionless":
-        tangential, normal = jnp.zeros_like(flight), 1.0 / g_nn
+        tangential, normal = jnp.zeros_like(flight), jump / g_nn
     else:
         slip = relative_velocity(mechanics, y)
         mu = mechanics.friction(jnp.abs(slip))
         # After an impact that ended the slip, it is what the flight leaves: without contact forces.
         along = acceleration(mechanics, contact, load, y)[mechanics.tangential]
         left = (along - g_tt * tangential_force - g_tn * normal_force) * flight
-        ending, ending_normal = _ending_slip(mechanics, left, jnp.ones_like(left))
+        ending, ending_normal = _ending_slip(mechanics, left, jump)
         ends_slip = (slip == 0) & (jnp.abs(ending) <= mu * ending_normal)
-        dragging = 1.0 / mechanics.normal_compliance(contact.direction, mu)
+        dragging = jump / mechanics.normal_compliance(contact.direction, mu)
         tangential = jnp.where(ends_slip, ending, contact.direction * mu * dragging)
         normal = jnp.where(ends_slip, ending_normal, dragging)
     tangential, normal = tangential - tangential_force * flight, normal - normal_force * flight
@@ -122,17 +123,3 @@ def after_brief_flight(mechanics: Mechanics, contact: Contact, load: Float[Array
     sticks = contact.status == Status.STICK
     tangential, normal = jnp.where(sticks, held, tangential), jnp.where(sticks, held_normal, normal)
     return spread(mechanics.from_tangential, tangential) + spread(mechanics.from_normal, normal)
-
-
-@jax.custom_jvp
-def also_moved(y: State, by: Float[Array, " n"], amount: Float[Array, ""]) -> State:
-    """The state, whose velocities' derivatives are those of `y` and, `by` so much, that of `amount`."""
-    del by, amount
-    return y
-
-
-@also_moved.defjvp
-def _(primals, tangents):
-    y, by, amount = primals
-    n = degrees_of_freedom(y)
-    return also_moved(y, by, amount), tangents[0].at[n:].add(by * tangents[2])

@@ -124,7 +124,10 @@ def clearness_of_impact(mechanics: Mechanics, y: State, reached: Bool[Array, " c
     """The same for the impulses where gaps have closed."""
     problem = _impact_problem(mechanics, y, reached)
     found = settled_states(problem, jnp.where(problem.away, OPEN, STICK).astype(jnp.int32))
-    return jnp.abs(jnp.minimum(*margins(problem, found)))
+    # Slip that goes on, and what is off the belt, are no part of the impulses: an impact may be a trifle beside them.
+    along = jnp.where(found == STICK, jnp.abs(problem.tangential), 0.0)
+    force_size, change_size = _sizes(mechanics, along, jnp.where(problem.away, 0.0, jnp.abs(problem.normal)))
+    return jnp.abs(jnp.minimum(*margins(problem._replace(force_size=force_size, change_size=change_size), found)))
 
 
 def state_of(contact: Contact) -> Int[Array, " c"]:
@@ -157,7 +160,6 @@ def _allowed(away: Bool[Array, " c"], slips: Bool[Array, " c"], forward: Bool[Ar
 def _problem(
     mechanics: Mechanics, tangential, normal, sizes, *, sliding, static, allowed, slips, away, ended, with_rest: bool
 ) -> ContactProblem:
-    g_tt, g_tn, g_nn = mechanics.compliance
     none = jnp.zeros_like(normal)
     rest = mechanics.rest if with_rest else None
     edges, pressing, otherwise, open_normal = jnp.stack([none] * 2, -1), none, jnp.stack([none] * 4, -1), none
@@ -168,15 +170,7 @@ def _problem(
             [none, (sliding - rest.friction) * n_0, -(sliding + rest.friction) * n_0, -rest.tangential_force], axis=-1
         )
         pressing, open_normal = n_0, -n_0
-    own_t, own_n = jnp.diagonal(g_tt), jnp.diagonal(g_nn)
-    # The size of a contact's forces: by its own free acceleration, and by the forces that other contacts pass on to it.
-    alone = sizes[0] / own_t + sizes[1] / own_n
-    if rest is not None:
-        alone = alone + jnp.abs(rest.normal_force) + jnp.abs(rest.tangential_force)
-    handed_on = (jnp.abs(g_tt) + jnp.abs(g_tn) + jnp.abs(g_tn.T) + jnp.abs(g_nn)) @ alone
-    force_size = alone + handed_on / jnp.minimum(own_t, own_n)
-    change_size = sizes[0] + sizes[1] + handed_on
-    tiny = jnp.finfo(normal.dtype).tiny
+    force_size, change_size = _sizes(mechanics, *sizes, rest)
     return ContactProblem(
         mechanics=mechanics,
         tangential=tangential,
@@ -191,8 +185,26 @@ def _problem(
         slips=slips,
         away=away,
         ended=ended.astype(jnp.int32),
-        force_size=jnp.maximum(force_size, tiny),
-        change_size=jnp.maximum(change_size, tiny),
+        force_size=force_size,
+        change_size=change_size,
+    )
+
+
+def _sizes(
+    mechanics: Mechanics, along: Float[Array, " c"], apart: Float[Array, " c"], rest=None
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Sizes of the terms in forces and in accelerations, from those of free accelerations along the belt and away from it."""
+    g_tt, g_tn, g_nn = mechanics.compliance
+    own_t, own_n = jnp.diagonal(g_tt), jnp.diagonal(g_nn)
+    # A contact's forces: by its own free acceleration, and by the forces that other contacts pass on to it.
+    alone = along / own_t + apart / own_n
+    if rest is not None:
+        alone = alone + jnp.abs(rest.normal_force) + jnp.abs(rest.tangential_force)
+    handed_on = (jnp.abs(g_tt) + jnp.abs(g_tn) + jnp.abs(g_tn.T) + jnp.abs(g_nn)) @ alone
+    tiny = jnp.finfo(apart.dtype).tiny
+    return (
+        jnp.maximum(alone + handed_on / jnp.minimum(own_t, own_n), tiny),
+        jnp.maximum(along + apart + handed_on, tiny),
     )
 
 

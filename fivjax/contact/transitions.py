@@ -19,7 +19,7 @@ from .forces import (
     with_contact_coordinates,
 )
 from .guard import cone_margins
-from .impacts import after_brief_flight, also_moved, impact
+from .impacts import after_brief_flights, impact
 from .mechanics import Mechanics
 from .mode import Contact, Status
 from .mode_forces import ModeForces, sticking_forces
@@ -101,19 +101,31 @@ def _following(
     y_stopped = stopped(mechanics, contact, y, ended)
 
     def struck():
-        reached = affected_by(mechanics, touched) if mechanics.several else True
+        fall, rate = _fall(mechanics, contact, load, y_stopped), gap_rate(mechanics, y_stopped)
         # One that rises has landed by rounding, right after a rebound: in one that several impacts have made small nothing else
         # would end it.
-        rising = touched & (gap_rate(mechanics, y_stopped) >= 0)
-        return _resting(mechanics, contact, load, impact(impacting, y_stopped, reached), touched, rising, resolution)
+        rising = touched & (rate >= 0)
+        if mechanics.several:
+            reached = affected_by(mechanics, touched)
+            # What a rebound changes that counts as rest is made up for by its end (`after_brief_flights`).
+            inelastic = _ends_within(resolution, -mechanics.restitution * rate, fall)
+            restitution = jnp.where(inelastic, 0.0, mechanics.restitution)
+            y_struck = impact(eqx.tree_at(lambda m: m.restitution, mechanics, restitution), y_stopped, reached)
+        else:
+            y_struck = jnp.where(rising, y_stopped, impact(mechanics, y_stopped))
+        own = gap_rate(mechanics, y_struck)
+        rests = rising | (touched & _ends_within(resolution, own, fall))
+        return with_contact_coordinates(
+            mechanics,
+            y_struck,
+            gap=gap(mechanics, y_struck),
+            gap_rate=jnp.where(rests, 0.0, own),
+            tangential_velocity=y_struck[degrees_of_freedom(y) + mechanics.tangential],
+        )
 
-    impacting, inelastic = mechanics, mechanics.restitution == 0
     # At the edge of the friction cone, or where N has just reached zero, rounding would decide whether the status that has
     # ended goes on. So it is excluded.
     if mechanics.several:
-        # Without restitution, what a small rebound changes is made up for by its end (`after_brief_flight`).
-        fixed = jnp.where(inelastic, jax.lax.stop_gradient(mechanics.restitution), mechanics.restitution)
-        impacting = eqx.tree_at(lambda m: m.restitution, mechanics, fixed)
         y_next = jax.lax.cond(jnp.any(touched), struck, lambda: y_stopped)
         own = ended[..., 0] | ended[..., 1]
         over = (own & (contact.status == Status.STICK)) | lifted
@@ -130,10 +142,17 @@ def _following(
         y_next = jnp.where(touched, struck(), y_stopped)
         following = status_from_forces(mechanics, load, y_next, may_stick=contact.status != Status.STICK)
         status = jnp.where(lifted, Status.DETACH, following.status)
-        rebounds = touched & inelastic & (status != Status.DETACH)
+        rests = touched & (status != Status.DETACH)
         landed = Contact(status.astype(contact.status.dtype), following.direction)
-        by = jnp.where(rebounds, after_brief_flight(mechanics, landed, load, y_next), 0.0)
-        y_next = also_moved(y_next, by, -mechanics.restitution * gap_rate(mechanics, y_stopped))
+        rate = gap_rate(mechanics, y_stopped)
+        # A rebound that counts as a landing as soon as it begins has its speed already.
+        rebound = jnp.where(rate < 0, -mechanics.restitution, 1.0) * rate
+
+        def rested():
+            by = after_brief_flights(mechanics, landed, load, y_next)
+            return y_next.at[degrees_of_freedom(y) :].add(by * rebound)
+
+        y_next = jax.lax.cond(rests, rested, lambda: y_next)
     following = Contact(status.astype(contact.status.dtype), following.direction)
     return following, on_constraint(mechanics, following, y_next)
 
@@ -169,32 +188,23 @@ def status_from_forces(
     return Contact(status=status.astype(jnp.int32), direction=direction)
 
 
-def _resting(
-    mechanics: Mechanics,
-    contact: Contact,
-    load: Float[Array, ""],
-    y: State,
-    touched: Bool[Array, "*contacts"],
-    rising: Bool[Array, "*contacts"],
-    resolution: Float[Array, ""],
-) -> State:
-    """The state without rebounds that would end within `resolution` (s), and without those of `rising` contacts."""
-    rate = gap_rate(mechanics, y)
+def _fall(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, "*contacts"]:
+    """The acceleration of a gap that opens."""
     if mechanics.several:
-        # The acceleration before the impact, while the contact was free.
-        fall = acceleration(mechanics, contact, load, y)[mechanics.normal]
-    else:
-        fall = free_acceleration(mechanics, load, y)[mechanics.normal]
-        if mechanics.rest is not None:
-            _, g_tn, g_nn = mechanics.compliance
-            fall = fall - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
-    # One that is about to lift off anyway has no rebound, even if its rate is zero: with restitution it would lift off sooner.
-    at_end = rate + 0.5 * fall * resolution
-    rests = rising | (touched & ((at_end < 0) | ((at_end == 0) & (fall <= 0))))
-    return with_contact_coordinates(
-        mechanics,
-        y,
-        gap=gap(mechanics, y),
-        gap_rate=jnp.where(rests, 0.0, rate),
-        tangential_velocity=y[degrees_of_freedom(y) + mechanics.tangential],
-    )
+        # That before the impact, while the contact was free.
+        return acceleration(mechanics, contact, load, y)[mechanics.normal]
+    fall = free_acceleration(mechanics, load, y)[mechanics.normal]
+    if mechanics.rest is None:
+        return fall
+    _, g_tn, g_nn = mechanics.compliance
+    return fall - g_tn * mechanics.rest.tangential_force - g_nn * mechanics.rest.normal_force
+
+
+def _ends_within(
+    time: Float[Array, ""], rate: Float[Array, "*contacts"], fall: Float[Array, "*contacts"]
+) -> Bool[Array, "*contacts"]:
+    """Whether flights that begin at these rates end within a time. One that is about to lift off anyway has no rebound, even if
+    its rate is zero: with restitution it would lift off sooner.
+    """
+    at_end = rate + 0.5 * fall * time
+    return (at_end < 0) | ((at_end == 0) & (fall <= 0))

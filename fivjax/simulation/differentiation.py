@@ -28,10 +28,14 @@ from .trajectory import Trajectory, simulate
 
 # What has a derivative that is not worked out.
 JUMPS_AT_ONCE = "two jumps of the load, which a parameter moves apart,"
-LANDINGS_OF_SEVERAL = "a landing without restitution, of several contacts under this impact law,"
+LANDINGS_OF_SEVERAL = "a landing with hardly any restitution, of several contacts under this impact law,"
 HELD_BY_STATIC_FRICTION = (
     "a landing after which static friction alone holds the contact, which the least rebound makes slide,"
 )
+# By the restitution, how far rebounds are from vanishing.
+NO_REBOUND = "a landing without a rebound, at restitution 0,"
+# With less restitution, rebounds end in no time. What follows is worked out for one contact, and for impacts with friction.
+LITTLE = 1e-3
 
 
 class Derivatives(eqx.Module):
@@ -181,18 +185,24 @@ def _differentiated(functional, scene, names, t1, dt_save, y0, mode, method):
 
 
 def _missing(scene: Scene, t1: float, moved: dict[str, np.ndarray], calls: ClosestCall) -> ClosestCall | None:
-    """Something whose derivative is not worked out; `moved`: the derivatives of parts of the scene, a row each."""
+    """Something whose derivative is not worked out, or rebounds that nearly vanish; `moved`: the derivatives of parts of the
+    scene, a row each.
+    """
     jumps, apart = np.asarray(scene.load.jumps), np.any(np.diff(moved["jumps"], axis=-1) != 0, axis=0)
     # The load between two jumps at one instant is not known.
     at_once = jumps[1:][(np.diff(jumps) == 0) & apart & (jumps[1:] >= 0) & (jumps[1:] < t1)]
     if len(at_once):
         return dataclasses.replace(calls, closest=0.0, at=float(at_once[0]), event=JUMPS_AT_ONCE)
-    inelastic = np.any(moved["restitution"] != 0, axis=0) & (np.atleast_1d(scene.restitution) == 0)
+    restitution, landed = np.atleast_1d(scene.restitution), np.isfinite(calls.landed_at)
+    moves = np.any(moved["restitution"] != 0, axis=0)
     several = len(scene.structure.places) > 1 and scene.impact_law != "coulomb"
-    if several and calls.landed and np.any(inelastic):
-        return dataclasses.replace(calls, closest=0.0, event=LANDINGS_OF_SEVERAL)
-    if calls.held < 0 and np.any(inelastic):
+    if several and landed and np.any(moves & (restitution < LITTLE)):
+        return dataclasses.replace(calls, closest=0.0, at=calls.landed_at, event=LANDINGS_OF_SEVERAL)
+    if calls.held < 0 and np.any(moves & (restitution == 0)):
         return dataclasses.replace(calls, closest=0.0, event=HELD_BY_STATIC_FRICTION)
+    least = float(np.min(restitution, where=moves & (restitution > 0), initial=np.inf))
+    if landed and least < calls.closest:
+        return dataclasses.replace(calls, closest=least, at=calls.landed_at, event=NO_REBOUND)
     return None
 
 

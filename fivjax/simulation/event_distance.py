@@ -11,9 +11,15 @@ With several contacts, an event of one acts at once on those that the mass matri
 event of one may leave another's guard close to zero. Events of contacts that only springs and dampers couple may coincide: in
 either order the motion after them is the same to first order.
 
+Flights that impacts begin follow on one another, ever shorter: the rebounds of one contact, or of two that the mass matrix
+couples and that kick each other up. What changes one changes those after it in proportion, so each is measured by its own
+largest gap.
+
 At the start a force may be close to where another mode begins. A slip that is zero there stays zero, unless a parameter changes
 it: then a contact that slides has a derivative on one side only, and one that sticks must be held by the friction of sliding.
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -60,7 +66,7 @@ class ClosestCall(eqx.Module):
     closest: float  # relative; infinite without any
     at: float  # s
     event: str
-    landed: bool = False  # whether a contact has come back to the belt
+    landed_at: float = np.nan  # when a contact first came back to the belt, s
     held: float = np.inf  # smallest relative margin by which the friction of sliding holds one that then sticks
 
 
@@ -149,18 +155,29 @@ class _Start(eqx.Module):
     coupled: Bool[Array, "c c"]
 
 
+class _Guard(NamedTuple):
+    """A guard of a contact."""
+
+    contact: int
+    status: int
+    which: int
+    flight: int = 0  # its number, of those that an impact has begun
+
+
 class _Seen:
     """The distances found on a trajectory so far."""
 
     def __init__(self, mechanics: Mechanics, start: _Start, slips_move: Bool[np.ndarray, " c"]):
         self.mechanics, self.several, self.slips_move = mechanics, mechanics.several, slips_move
         count, self.coupled = len(mechanics.places), start.coupled
-        # The largest size of each guard, by contact, status and number.
-        self.largest: dict[tuple[int, int, int], float] = {}
+        # The largest size of each guard: on the whole trajectory where there is no flight.
+        self.largest: dict[_Guard, float] = {}
         # Distances by guard, in its own unit, and decisions, which are relative already.
-        self.calls: list[tuple[tuple[int, int, int], float, float]] = []
+        self.calls: list[tuple[_Guard, float, float]] = []
         self.decisions: list[tuple[float, float, str]] = []
-        self.events, self.landed, self.held = 0, False, np.inf
+        self.events, self.landed_at, self.held = 0, np.nan, np.inf
+        # The numbers of flights that impacts have begun, zero for contacts that are in none; and how many there have been.
+        self.flight, self.flights = np.zeros(count, int), 0
         # Contacts on which another's event has just acted while their own status lasted, and their guards before it.
         self.struck = np.zeros(count, bool)
         self.before = np.zeros((count, 2))
@@ -178,54 +195,69 @@ class _Seen:
         """Add an advance, which `begins` at the start or at a jump of the load. Returns whether it ended in an event."""
         after = np.atleast_1d(look.contact.status)
         at = t + float(look.h)
-        relevant = [self._of_contact(i, int(s), look, t, begins) for i, s in enumerate(status)]
+        relevant = [self._of_contact(i, status, look, t, begins) for i in range(len(status))]
         fired = [i for i in range(len(status)) if relevant[i] and self._fires(i, int(status[i]), int(after[i]), look)]
         for i in fired:
-            key = (i, int(status[i]))
             # The guard that ran out is the one nearest to zero at the end, in units of its size.
-            which = min(
-                relevant[i], key=lambda k, i=i, key=key: abs(look.guards[-1, i, k]) / max(self.largest[*key, k], 1e-300)
+            ran_out = min(
+                (self._guard(i, status, k) for k in relevant[i]),
+                key=lambda guard: abs(look.guards[-1, guard.contact, guard.which]) / max(self.largest[guard], 1e-300),
             )
+            which = ran_out.which
             # After a jump of the load a guard may be far below zero.
             passed = abs(float(look.guards[0, i, which])) if look.h == 0 else 0.0
             slope, bend = float(look.slope[i, which]), abs(float(look.bend[i, which]))
             depth = slope**2 / (2 * bend) if bend > 0 else float("inf")
-            self.calls.append(((*key, which), max(depth, passed), at))
+            self.calls.append((ran_out, max(depth, passed), at))
             # The other guards at that instant: if one of them is zero as well, either may be the first. A guard of another
             # contact that rises was zero when its status began, an event that has been counted already.
-            for j in np.flatnonzero(self.coupled[i]):
+            for j in np.flatnonzero(self.coupled[i]).tolist():
                 others = [k for k in relevant[j] if (j, k) != (i, which) and (j == i or look.slope[j, k] < 0)]
-                self.calls += [((int(j), int(status[j]), k), abs(float(look.guards[-1, j, k])), at) for k in others]
+                self.calls += [(self._guard(j, status, k), abs(float(look.guards[-1, j, k])), at) for k in others]
         if fired:
             names = DECISIONS_OF_SEVERAL if self.several else DECISIONS
             self.decisions += [(float(m), at, name) for m, name in zip(look.decisions, names, strict=True)]
             self.events += 1
-            self.landed |= bool(np.any((status == Status.DETACH) & (after != Status.DETACH)))
             self.held = min(self.held, float(look.held))
         elif arrives:
-            # An event at a jump of the load, or at the end, may come before or after it.
+            # An event at a jump of the load, or at the end, may come before or after it: of a whole chain of impacts.
             for i, own in enumerate(relevant):
-                self.calls += [((i, int(status[i]), k), abs(float(look.guards[-1, i, k])), at) for k in own]
+                self.calls += [(_Guard(i, int(status[i]), k), abs(float(look.guards[-1, i, k])), at) for k in own]
+        impact = any(status[i] == Status.DETACH for i in fired)
+        if impact:
+            self.landed_at = np.fmin(self.landed_at, at)
+        self._number_flights(status, after, fired, impact)
         felt = np.any(self.coupled[fired], axis=0)
         felt[fired] = False
         self.struck, self.before = felt & (after == status), look.guards[-1]
         return bool(fired)
 
-    def _of_contact(self, i: int, status: int, look: AdvanceMargins, t: float, begins: bool) -> list[int]:
+    def _number_flights(self, status: np.ndarray, after: np.ndarray, fired: list[int], impact: bool) -> None:
+        """Give a number to each flight that an impact begins: a rebound, or that of a contact which another's impact lifts."""
+        for i in np.flatnonzero((status != Status.DETACH) | np.isin(np.arange(len(status)), fired)).tolist():
+            begun = impact and after[i] == Status.DETACH and (status[i] == Status.DETACH or i not in fired)
+            self.flights += begun
+            self.flight[i] = self.flights if begun else 0
+
+    def _guard(self, i: int, status: np.ndarray, which: int) -> "_Guard":
+        return _Guard(i, int(status[i]), which, int(self.flight[i]) if status[i] == Status.DETACH else 0)
+
+    def _of_contact(self, i: int, status: np.ndarray, look: AdvanceMargins, t: float, begins: bool) -> list[int]:
         """Add the distances of the guards of one contact inside an advance. Returns the guards that count."""
         # A guard that is a rounding error all the time does not count: with zero friction the friction cone has no width.
         relevant = [k for k in range(2) if np.abs(look.guards[:, i, k]).max() > 1e-12 * look.size[i, k]]
-        relevant = relevant[:1] if status == Status.DETACH else relevant
+        relevant = relevant[:1] if status[i] == Status.DETACH else relevant
         for which in relevant:
-            guard, key = look.guards[:, i, which], (i, status, which)
-            self.largest[key] = max(self.largest.get(key, 0.0), float(np.abs(guard).max()))
+            guard, key = look.guards[:, i, which], self._guard(i, status, which)
+            for one in {key, key._replace(flight=0)}:
+                self.largest[one] = max(self.largest.get(one, 0.0), float(np.abs(guard).max()))
             turns = np.flatnonzero(look.turns[:, i, which])
             self.calls += [(key, float(look.lowest[at, i, which]), t + float(look.h) * at / LOOKS) for at in turns]
             # The start, a jump of the load or another contact's event may leave a guard close to zero, on either side. At the
             # start, what is given stays as it is: the gap, and the slip unless it moves.
             jumped = abs(float(guard[0]) - self.before[i, which]) > 1e-6 * self.largest[key]
-            is_force = status == Status.STICK or (status == Status.SLIDE and which == 0)
-            moves = t > 0 or is_force or (status == Status.SLIDE and self.slips_move[i] and guard[0] != 0)
+            is_force = status[i] == Status.STICK or (status[i] == Status.SLIDE and which == 0)
+            moves = t > 0 or is_force or (status[i] == Status.SLIDE and self.slips_move[i] and guard[0] != 0)
             if (begins and moves) or (self.struck[i] and jumped):
                 self.calls.append((key, abs(float(guard[0])), t))
         return relevant
@@ -241,13 +273,13 @@ class _Seen:
     def closest(self) -> ClosestCall:
         """The smallest of all distances."""
 
-        def name(contact: int, status: int, which: int) -> str:
-            event = GUARDS[Status(status), which]
-            return f"{event} (contact {contact})" if self.several else event
+        def name(guard: _Guard) -> str:
+            event = GUARDS[Status(guard.status), guard.which]
+            return f"{event} (contact {guard.contact})" if self.several else event
 
-        closest = [(value / max(self.largest[key], 1e-300), at, name(*key)) for key, value, at in self.calls]
+        closest = [(value / max(self.largest[guard], 1e-300), at, name(guard)) for guard, value, at in self.calls]
         nearest = min(closest + self.decisions, default=(float("inf"), float("nan"), "none"))
-        return ClosestCall(self.events, *nearest, self.landed, self.held)
+        return ClosestCall(self.events, *nearest, self.landed_at, self.held)
 
 
 @by_numpy

@@ -893,7 +893,7 @@ def test_how_clear_an_impact_is_falls_to_zero_at_the_edge_of_the_cone_whichever_
         mechanics = Mechanics(scene)
         of_all = jax.jit(jax.vmap(lambda y: physics.clearness_of_impact(mechanics, y)))
         found = np.asarray(of_all(jnp.asarray(states)))
-    # Relative to the terms in it: the slip and the approach.
-    own = found[:, 0] * (np.abs(slips) + 1.0)
+    # Relative to the terms in it: the approach, and the slip that is ended.
+    own = found[:, 0] * (np.where(np.abs(slips) <= 0.4, np.abs(slips), 0.0) + 1.0)
     np.testing.assert_allclose(own / own[0], np.abs(np.abs(slips) - 0.4) / 0.4, rtol=0, atol=1e-12)
     assert np.all(np.isinf(found[:, 1]))
