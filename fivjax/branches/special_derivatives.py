@@ -15,7 +15,7 @@ from ..linear.linearisation import sliding_rates
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of
 from .multiple_shooting import images, moved_along, parameter_direction
-from .pseudo_arclength import ComputedCycle, Curve, Family, assembled, multipliers_of
+from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
 # Relative change of a parameter for differences of multipliers.
@@ -105,24 +105,23 @@ def _of_stability_limit(family: Family, limit: float, name: str) -> float:
 
 
 def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray, slope: np.ndarray) -> float:
-    """By differences of the multiplier's size along the families over both parameters."""
+    """By differences of the multiplier's size along the curve, and across it with the other parameter: next to a fold, where it
+    has no derivative by the curve's own parameter.
+    """
     curve, cycle = special.curve, special.cycle
-    scene = family.at(cycle.parameter)
-    value = float(np.asarray(scene.parameters[name]))
+    value = float(np.asarray(family.at(cycle.parameter).parameters[name]))
     by = APART * (abs(value) if value else 1.0)
-    through_other = np.linalg.solve(own[:, :-1], -slope)
-    through_own = np.linalg.solve(own[:, :-1], -own[:, -1])
-    step = APART * max(abs(cycle.parameter), 0.1 * family.scale) / family.scale
+    tangent = curve.tangent(cycle, None)
+    sizes = np.max(np.abs(own), axis=1)
+    across = np.linalg.lstsq(own / sizes[:, None], -slope / sizes, rcond=None)[0]
 
-    def size(own_step: float, other_step: float) -> float:
-        u = cycle.u.copy()
-        u[:-1] += own_step * through_own + other_step * through_other
-        u[-1] += own_step
-        moved = family._replace(scene=moved_along(family.scene, parameter_direction(family.scene, name), other_step))
-        at = _solved(Curve(moved, cycle.phases), u, curve)
-        if at is None:
-            return np.nan
-        which = critical_multiplier(multipliers_of(at.images), special.name)
+    def size(along: float, other: float) -> float:
+        moved = family._replace(scene=moved_along(family.scene, parameter_direction(family.scene, name), other))
+        there = Curve(moved, cycle.phases)
+        # Converted to the units of its own curve.
+        guess = (cycle.u + along * tangent + other * across) * curve.scales / there.scales
+        at = there.corrected(guess, tangent)
+        which = None if at is None else critical_multiplier(multipliers_of(at.images), special.name)
         return np.nan if which is None else abs(which)
 
     if name == "restitution" and value < by:
@@ -130,11 +129,6 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
         with_other = (4 * size(0.0, by) - 3 * size(0.0, 0.0) - size(0.0, 2 * by)) / (2 * by)
     else:
         with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)
-    with_own = (size(step, 0.0) - size(-step, 0.0)) / (2 * step)
-    return float(-with_other / with_own * curve.scales[-1])
-
-
-def _solved(curve: Curve, u: np.ndarray, like: Curve) -> ComputedCycle | None:
-    # Converted from the units of the curve in which the guess was made.
-    values = u * like.scales
-    return curve.at_parameter(values / curve.scales, values[-1])
+    with_own = (size(APART, 0.0) - size(-APART, 0.0)) / (2 * APART)
+    change = across - with_other / with_own * tangent
+    return float(change[-1] * curve.scales[-1])

@@ -179,10 +179,10 @@ class ReturnMaps:
 
     def _free(self, status: Int[np.ndarray, " m"], y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, "m 2n"]:
         """With one contact: which coordinates are free at states of the section. An impact leaves the gap at zero, and its rate
-        where it does not rebound, but any velocity.
+        where it does not rebound, but any velocity, unless the contact sticks.
         """
         free, jumped, n = self.free[status], self.jumped(y), self.structure.size
-        free[jumped, n + self.tangential] = True
+        free[jumped & (status != Status.STICK), n + self.tangential] = True
         for place in (self.normal, n + self.normal):
             free[:, place] &= ~jumped | (y[:, place] != 0)
         return free

@@ -575,6 +575,20 @@ def test_a_cycle_meets_the_section_by_an_impact(paper_scene):
     assert run.fate == ["sustained"] and run.amplitude[0] == pytest.approx(cycle.amplitude, rel=1e-5)
 
 
+@pytest.mark.parametrize("along", [1.0, -1.0])
+def test_a_cycle_meets_the_section_by_an_impact_after_which_it_sticks(along):
+    """There the velocity is the belt's, and not free; a map's lanes were undecided. With x reversed it is met smoothly."""
+    stiffness = np.array([[1.65, 0.23, -0.23], [0.23, 2.47, -0.43], [-0.23, -0.43, 1.28]])
+    signs = np.diag([along, 1.0, 1.0])
+    stiffness = signs @ stiffness @ signs
+    structure = fj.Structure(np.eye(3), 0.005 * stiffness, stiffness, signs @ [0.2, -1.0, 0.19], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.68), along * 0.38, fj.Pulse(1.0, 3.0, duration=2.0))
+    found = fj.bistability_map(scene, p=[2.0, 3.0], progress=False)
+    assert found.verdict.values.tolist() == [fj.Verdict.LIMIT_CYCLE] * 2
+    # By an independent integrator, after 1000 cycles.
+    np.testing.assert_allclose(found.amplitude, 0.4727571, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_cycle_that_meets_the_section_by_an_impact_is_followed_to_neighbours(paper_scene):
     """Its period's derivative, against differences of cycles that are searched for."""

@@ -401,3 +401,28 @@ def test_two_special_points_at_once_have_no_derivatives():
     both = np.flatnonzero(np.abs(branch.parameter.values - 1.16454938) < 1e-7)
     assert len(both) and np.all(np.isnan(branch.d_special.values[both]))
     assert np.nanmax(np.abs(branch.d_special.values)) < 1e4
+
+
+@pytest.mark.slow
+def test_the_derivatives_of_a_neimark_sacker_point_beside_a_fold_are_differences_of_where_it_is():
+    """A thousandth of a per cent from the fold the multiplier's size has hardly a derivative by the branch's own parameter."""
+    scene = fj.Scene(
+        fj.belt_oscillator(), fj.ExponentialDecay(0.26, 0.2, 1.0), belt_speed=1.0, load=fj.ConstantLoad(100.0)
+    )
+    branch = fj.continue_cycle(scene, "m2", (0.027, 0.072), derivatives=True)
+    (at,) = np.flatnonzero(
+        (branch.special.values == "Neimark–Sacker") & (np.abs(branch.parameter.values / 0.0406147 - 1) < 1e-5)
+    )
+    assert branch.special.values[at - 1] == "fold"
+    start = fj.cycle_at(branch, at + 2)
+
+    def where(**changes):
+        near = scene.replace(m2=float(branch.parameter[at + 2]), **changes)
+        found = fj.continue_cycle(near, "m2", (0.0404, 0.0415), start=start)
+        return float(found.parameter[found.special.values == "Neimark–Sacker"][0])
+
+    for name in ("k1", "mu_static"):
+        value = float(scene.parameters[name])
+        ahead, behind = (where(**{name: value * (1 + by)}) for by in (1e-5, -1e-5))
+        slope = (ahead - behind) / (2e-5 * value)
+        assert float(branch.d_special.sel(of=name)[at]) == pytest.approx(slope, rel=1e-7)
