@@ -19,7 +19,7 @@ from .contact_problem import (
 )
 from .coordinates import spread
 from .forces import State, degrees_of_freedom, free_acceleration, gap, gap_rate, relative_velocity
-from .mechanics import Mechanics
+from .mechanics import Mechanics, Rest
 from .mode import Contact, Status
 
 
@@ -73,19 +73,22 @@ def _mode_problem(
     free = free_acceleration(mechanics, load, y)
     away = (gap(mechanics, y) > 0) | (gap_rate(mechanics, y) > 0)
     slips = slip != 0
-    sizes = _sizes_of_free(mechanics, load, y)
-    return _problem(
-        mechanics,
-        free[mechanics.tangential],
-        free[mechanics.normal],
-        sizes,
-        sliding=mechanics.friction(jnp.abs(slip)),
-        static=mechanics.friction.static,
+    sliding, static = mechanics.friction(jnp.abs(slip)), mechanics.friction.static
+    along, apart = _sizes_of_free(mechanics, load, y)
+    force_size, change_size = _sizes(mechanics, along, apart, mechanics.rest)
+    return ContactProblem(
+        mechanics=mechanics,
+        tangential=free[mechanics.tangential],
+        normal=free[mechanics.normal],
+        sliding=sliding,
+        static=static,
+        **_of_rest(mechanics.rest, sliding, static),
         allowed=_allowed(away, slips, slip < 0),
         slips=slips,
         away=away,
-        ended=jnp.full_like(away, NONE, jnp.int32) if ended is None else ended,
-        with_rest=True,
+        ended=jnp.full_like(away, NONE, jnp.int32) if ended is None else ended.astype(jnp.int32),
+        force_size=force_size,
+        change_size=change_size,
     )
 
 
@@ -99,19 +102,21 @@ def _impact_problem(mechanics: Mechanics, y: State, reached: Bool[Array, " c"] |
     if frictionless:
         mu = jnp.zeros_like(mu)
     nobody = jnp.zeros_like(away)
-    return _problem(
-        mechanics,
-        slip,
-        demanded,
-        (jnp.abs(slip), jnp.abs(demanded)),
+    force_size, change_size = _sizes(mechanics, jnp.abs(slip), jnp.abs(demanded))
+    return ContactProblem(
+        mechanics=mechanics,
+        tangential=slip,
+        normal=demanded,
         sliding=mu,
         static=mu,
+        **_of_rest(None, mu, mu),
         # Without friction the only choice is whether there is an impulse.
         allowed=_allowed(away, jnp.full_like(away, frictionless), ~nobody),
         slips=jnp.full_like(away, frictionless),
         away=away,
         ended=jnp.full_like(away, NONE, jnp.int32),
-        with_rest=False,
+        force_size=force_size,
+        change_size=change_size,
     )
 
 
@@ -157,41 +162,20 @@ def _allowed(away: Bool[Array, " c"], slips: Bool[Array, " c"], forward: Bool[Ar
     )
 
 
-def _problem(
-    mechanics: Mechanics, tangential, normal, sizes, *, sliding, static, allowed, slips, away, ended, with_rest: bool
-) -> ContactProblem:
-    none = jnp.zeros_like(normal)
-    rest = mechanics.rest if with_rest else None
-    edges, pressing, otherwise, open_normal = jnp.stack([none] * 2, -1), none, jnp.stack([none] * 4, -1), none
-    if rest is not None:
-        n_0 = rest.normal_force
-        edges = jnp.stack([static - rest.friction, static + rest.friction], axis=-1) * n_0[:, None]
-        otherwise = jnp.stack(
-            [none, (sliding - rest.friction) * n_0, -(sliding + rest.friction) * n_0, -rest.tangential_force], axis=-1
-        )
-        pressing, open_normal = n_0, -n_0
-    force_size, change_size = _sizes(mechanics, *sizes, rest)
-    return ContactProblem(
-        mechanics=mechanics,
-        tangential=tangential,
-        normal=normal,
-        sliding=sliding,
-        cone_edges=edges,
-        static=static,
-        pressing=pressing,
-        otherwise=otherwise,
-        open_normal=open_normal,
-        allowed=allowed,
-        slips=slips,
-        away=away,
-        ended=ended.astype(jnp.int32),
-        force_size=force_size,
-        change_size=change_size,
-    )
+def _of_rest(rest: Rest | None, sliding: Float[Array, " c"], static: Float[Array, " c"]) -> dict[str, Array]:
+    """What the forces at rest, to which those sought are added, change in a problem, by field; zero where these are total."""
+    none = jnp.zeros_like(sliding)
+    if rest is None:
+        edges, otherwise = jnp.stack([none] * 2, axis=-1), jnp.stack([none] * 4, axis=-1)
+        return {"cone_edges": edges, "pressing": none, "otherwise": otherwise, "open_normal": none}
+    n_0 = rest.normal_force
+    edges = jnp.stack([static - rest.friction, static + rest.friction], axis=-1) * n_0[:, None]
+    otherwise = [none, (sliding - rest.friction) * n_0, -(sliding + rest.friction) * n_0, -rest.tangential_force]
+    return {"cone_edges": edges, "pressing": n_0, "otherwise": jnp.stack(otherwise, axis=-1), "open_normal": -n_0}
 
 
 def _sizes(
-    mechanics: Mechanics, along: Float[Array, " c"], apart: Float[Array, " c"], rest=None
+    mechanics: Mechanics, along: Float[Array, " c"], apart: Float[Array, " c"], rest: Rest | None = None
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """Sizes of the terms in forces and in accelerations, from those of free accelerations along the belt and away from it."""
     g_tt, g_tn, g_nn = mechanics.compliance

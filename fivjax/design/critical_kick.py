@@ -179,7 +179,13 @@ def raise_critical_perturbation(
         if following is None:
             break
         here, why = following, ""
-    return _concluded(scene, first, here, target, names, start, taken, why, p_range, p_step)
+    anew = critical_perturbation(here.scene, p_range=p_range, p_step=p_step, progress=False).isel(belt_speed=0)
+    ended = np.array([float(np.asarray(here.scene.parameters[name])) for name in names])
+    changes = dict(zip(names, zip(start.tolist(), ended.tolist(), strict=True), strict=True))
+    outcome, why = _outcome(here.p, target, _bracket(anew), why)
+    return RaisedCriticalKick(
+        here.scene, first.p, here.p, target, first.bracket, _bracket(anew), changes, outcome, why, taken
+    )
 
 
 class _Iterate(NamedTuple):
@@ -207,27 +213,18 @@ def _bracket(found) -> tuple[float, float]:
     return float(found["p_crit_low"]), float(found["p_crit_high"])
 
 
-def _concluded(scene, first, last, target, names, start, taken, why, p_range, p_step) -> RaisedCriticalKick:
-    anew = critical_perturbation(last.scene, p_range=p_range, p_step=p_step, progress=False).isel(belt_speed=0)
-    low, high = _bracket(anew)
-    changes = {
-        name: (float(old), float(np.asarray(last.scene.parameters[name])))
-        for name, old in zip(names, start, strict=True)
-    }
-    if not low <= last.p <= high:
-        outcome, why = DesignOutcome.TARGET_NOT_REACHED, "Bracketing anew contradicts the p_crit that was found."
-    elif last.p >= target:
-        outcome, why = DesignOutcome.TARGET_REACHED, ""
-    else:
-        outcome = DesignOutcome.TARGET_NOT_REACHED
-        beyond = (
-            f"beyond, {why}"
-            if why
-            else "p_crit rises less there than its derivatives promise, or more steps are needed"
-        )
-        why = f"The search ended before the target: {beyond}. Widen `bounds`, or free other parameters."
-    return RaisedCriticalKick(
-        last.scene, first.p, last.p, target, first.bracket, (low, high), changes, outcome, why, taken
+def _outcome(p: float, target: float, bracket: tuple[float, float], why: str) -> tuple[DesignOutcome, str]:
+    """How a search has ended at a critical p for which a bracket was sought anew, and why; `why` it went no further."""
+    low, high = bracket
+    if not low <= p <= high:
+        return DesignOutcome.TARGET_NOT_REACHED, "Bracketing anew contradicts the p_crit that was found."
+    if p >= target:
+        return DesignOutcome.TARGET_REACHED, ""
+    beyond = (
+        f"beyond, {why}" if why else "p_crit rises less there than its derivatives promise, or more steps are needed"
+    )
+    return DesignOutcome.TARGET_NOT_REACHED, (
+        f"The search ended before the target: {beyond}. Widen `bounds`, or free other parameters."
     )
 
 
