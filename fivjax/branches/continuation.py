@@ -83,8 +83,8 @@ def continue_cycle(
     - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
     - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
     - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
-      end the slip there, say), "period doubling", "Neimark–Sacker", or how the contact modes change there ("grazing of slip:
-      stick inserted"). Special points are computed to rounding;
+      end the slip there, say), "period doubling", "Neimark–Sacker", or how the contact modes change there, as seen from the
+      start outwards ("grazing of slip: stick inserted"). Special points are computed to rounding;
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
