@@ -1,7 +1,7 @@
 """The approach to a stable cycle: a tube about paths that lead into it, which captures from further away than its ellipsoid.
 
 The ellipsoid in which a cycle's return map contracts (`neighbourhood`) ends where motions begin to pass through other events.
-Next to a grazing that is near, though motions come in from far away; and on a locked torus they creep along the torus first. So
+Near a grazing that is close by, though motions come in from far away; on a locked torus they creep along the torus first. So
 motions are started about the cycle. Some of them, pilots, are followed until its ellipsoid has them, the others until they have
 come to where the pilots were. The states through which they come make a set. What starts on the edge of a tube about that set
 is followed, too: if all of it comes back to well within the tube, and stays there, the tube is drawn in as one about a torus
@@ -35,7 +35,7 @@ ABOUT_CYCLES = PathSettings(0.1, 0, 32)
 ABOUT_LOCKED_TORI = PathSettings(tube.RADIUS, 48, 128)
 # Motions that are followed until they lead into a cycle, the most returns in which they do, and how many of their states are
 # kept at least, where there are more.
-PILOTS, LONGEST, ONWARD = 4, 16384, 1024
+PILOTS, LONGEST, LEAST_KEPT = 4, 16384, 1024
 
 
 class Approach(NamedTuple):
@@ -93,7 +93,7 @@ def _paths_into(
     onward = _followed_into(maps, Motions(own, at), each[:, :PILOTS], cycles, how)
     # On long ways states lie close together.
     whose = {
-        k: thin(np.concatenate([np.zeros((0, size)), *states]), ONWARD)
+        k: thin(np.concatenate([np.zeros((0, size)), *states]), LEAST_KEPT)
         for k, states in onward.items()
         if np.all(np.isfinite(paths[k]))
     }
@@ -142,7 +142,8 @@ def _followed_into(
 
 
 def _attracting(maps: ReturnMaps, group: Int[np.ndarray, " a"], tried: list[Approach], report) -> Int[np.ndarray, " d"]:
-    """Which of these tubes are drawn in: what starts on their edges comes back, above all where ways begin and further out."""
+    """Which of these tubes are drawn in: all that starts on their edges comes back. Starts where
+    paths begin, further out, are asked first."""
     left = np.arange(len(tried))
     for beyond in (True, False):
         if not len(left):

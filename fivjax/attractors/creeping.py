@@ -132,7 +132,7 @@ def creep(
 
 
 def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
-    """How motions drift in the latter half of `2 * OVER` returns."""
+    """How motions drift in the latter half of `2 * DRIFT_RETURNS` returns."""
     group, at = motions
     middle = maps.returns(group, at, DRIFT_RETURNS)
     end = maps.returns(group, middle.at, DRIFT_RETURNS)

@@ -19,7 +19,7 @@ from .neighbourhood import LARGEST, CycleTrial, Neighbourhood, ReturnImages, cyc
 # those on which neighbours close in.
 CROSSINGS, MORE_CROSSINGS, MOST_CROSSINGS = 8, 40, 512
 # A multiplier of the section's return map this close to 1 counts as 1.
-FAMILY = 1e-7
+FAMILY_TOLERANCE = 1e-7
 
 
 class Recurrence(NamedTuple):
@@ -154,7 +154,7 @@ def in_families(maps: ReturnMaps, motions: Motions) -> Bool[np.ndarray, " m"]:
         return found
     near, closed = close_recurring(maps, motions)
     multipliers = np.linalg.eigvals(closed.jacobian)
-    found[near] = np.any(np.abs(multipliers - 1.0) < FAMILY, axis=1)
+    found[near] = np.any(np.abs(multipliers - 1.0) < FAMILY_TOLERANCE, axis=1)
     return found
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from ..section.return_maps import ReturnMaps, Section, section_at
 from .motions import Motions
 
-# Over so many returns growth is measured, again and again, and so often at most: the first returns turn directions to where
-# they grow. On a torus neighbours part no faster than linearly; in chaos exponentially.
+# Growth is measured over so many returns, at most so often: the first returns turn deviations to where they grow. On a torus
+# neighbours part no faster than linearly; in chaos exponentially.
 WINDOW_RETURNS, MOST_WINDOWS = 48, 128
 # How far neighbours are apart at first, relative to their size.
 APART = 1e-7
@@ -100,7 +100,7 @@ def diverges_along(
     # many.
     suspicious, parted_on_torus = 4.0, 12.0
     states = paths / maps.weights
-    beside, since = states[:, 0] * (1 + APART), np.zeros(len(group))
+    beside, parted = states[:, 0] * (1 + APART), np.zeros(len(group))
     furthest = np.zeros(len(group))
     for start in range(0, states.shape[1] - RETURNS_ALONG, RETURNS_ALONG):
         here, there = states[:, start], states[:, start + RETURNS_ALONG]
@@ -110,8 +110,8 @@ def diverges_along(
         size = np.linalg.norm(maps.weights * there, axis=1, keepdims=True)
         beside, distance = _brought_near(maps, there, away, size)
         with np.errstate(divide="ignore", invalid="ignore"):
-            since = np.fmax(since + np.log(distance / apart), 0.0)
-        furthest = np.fmax(furthest, since)
+            parted = np.fmax(parted + np.log(distance / apart), 0.0)
+        furthest = np.fmax(furthest, parted)
     chaotic, rows = np.zeros(len(group), bool), np.flatnonzero(~(furthest < suspicious))
     if len(rows):
         at = section_at(states[rows, -1], maps.normal, maps.sliding[group[rows]])

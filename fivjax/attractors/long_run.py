@@ -46,7 +46,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
     maps, group = catalogue.maps, motions.group
     at, events, time, *_ = maps.returns(*motions, 1)
     attractor: dict[int, CapturingSet] = {}
-    chaotic, quiet = np.zeros((2, len(group)), bool)
+    chaotic, without_events = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
     # A few of each group first: mostly the others are by now where these come to.
     for rows in (far_apart(maps.weights * at.y, group, left), np.arange(len(group))):
@@ -57,7 +57,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
         rows = np.delete(rows, list(captured))
         if len(rows):
             found = _slow_fates(catalogue, Motions(group, at).rows(rows), onward[rows], slides)
-            chaotic[rows], quiet[rows] = found.chaotic, found.without_events
+            chaotic[rows], without_events[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
             time[rows] += found.time
             events[rows] += found.events
@@ -66,7 +66,7 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
             ended = found.chaotic | found.without_events
             ended[list(found.attractor)] = True
             onward &= np.isin(group, group[rows[ended]])
-    return Fates(chaotic, attractor, quiet, at, time, events)
+    return Fates(chaotic, attractor, without_events, at, time, events)
 
 
 class _Underway(NamedTuple):
@@ -90,18 +90,18 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     count = len(motions.group)
     attractor: dict[int, CapturingSet] = {}
     run = _Underway(motions, np.zeros(count), np.zeros(count, int))
-    chaotic, quiet = np.zeros((2, count), bool)
+    chaotic, without_events = np.zeros((2, count), bool)
     if slides is not None:
-        quiet = _slide_on(catalogue, run, attractor, slides)
-    left = ~quiet
+        without_events = _slide_on(catalogue, run, attractor, slides)
+    left = ~without_events
     left[list(attractor)] = False
     rows = np.flatnonzero(left)
     if len(rows):
         found = _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides)
-        chaotic[rows], quiet[rows] = found.chaotic, found.without_events
+        chaotic[rows], without_events[rows] = found.chaotic, found.without_events
         run.move(rows, found.at, found.time, found.events)
         attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
-    return Fates(chaotic, attractor, quiet, run.motions.at, run.time, run.events)
+    return Fates(chaotic, attractor, without_events, run.motions.at, run.time, run.events)
 
 
 def _slide_on(
@@ -146,7 +146,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     run = _Underway(Motions(group, now), time, events)
     attractor: dict[int, CapturingSet] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
-    asks, further, quiet = left.copy(), *np.zeros((2, len(group)), bool)
+    asks, further, without_events = left.copy(), *np.zeros((2, len(group)), bool)
     for turn in range(TIMES + 1):
         new = catalogue.captures(run.motions, left)
         attractor |= new
@@ -163,12 +163,12 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
         left &= np.all(np.isfinite(now.y), axis=1)
         asks, further = asks | drifting, further | drifting
     rows = np.flatnonzero(left)
-    quiet[rows] = maps.returns(*run.motions.rows(rows), RETURNS_INSIDE).events == 0
+    without_events[rows] = maps.returns(*run.motions.rows(rows), RETURNS_INSIDE).events == 0
     # Where neighbours closed in and yet there is no cycle, the motion was only regular for a time.
-    rows = np.flatnonzero(left & (further | followed.closing_in) & ~quiet)
+    rows = np.flatnonzero(left & (further | followed.closing_in) & ~without_events)
     if len(rows):
         chaotic[rows] = long_divergence(maps, run.motions.rows(rows)).chaotic
-    return Fates(chaotic, attractor, quiet, now, time, events)
+    return Fates(chaotic, attractor, without_events, now, time, events)
 
 
 def _creep(

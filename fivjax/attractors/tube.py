@@ -88,7 +88,7 @@ class Tube:
 
 
 def thin(states: Float[np.ndarray, "k 2n"], count: int) -> Float[np.ndarray, "_ 2n"]:
-    """Each so-many-th of the states: `count` of them, or some more."""
+    """Every k-th state, so that `count` of them are left, or some more."""
     return states[:: max(len(states) // count, 1)]
 
 

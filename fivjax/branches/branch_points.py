@@ -62,7 +62,7 @@ def point_through(family: Family, parameter: float, start: SectionPoint, period:
     return None if cycle is None else branch_point(family, curve, cycle)
 
 
-def beyond(family: Family, last: BranchPoint, sense: float) -> BranchPoint | None:
+def cycle_beyond(family: Family, last: BranchPoint, sense: float) -> BranchPoint | None:
     """A cycle much like a point's for somewhat larger (`sense` 1) or smaller (-1) values of the parameter, closed on the
     section: there may be many changes of modes in between, as where a chain of rebounds ends no longer.
     """
@@ -87,7 +87,7 @@ def _are_alike(one: BranchPoint, other: BranchPoint, share: float) -> bool:
 
 
 def is_real_motion(family: Family, cycle: ComputedCycle) -> bool:
-    """The same of a computed cycle."""
+    """Whether the real motion has the modes and events of a computed cycle."""
     return _moves_as_computed(real_motion(family.at(cycle.parameter), family.stepper, cycle.phases), cycle)
 
 

@@ -26,6 +26,7 @@ from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..linear.linearisation import sliding_rates
 from ..model.contact_coordinates import to_contact_coordinates
+from ..model.directions import direction_of
 from ..model.scene import Scene, check_corners, refuse_several_contacts, scene_in_contact_coordinates
 from ..section.about_sliding import sliding_state
 from ..section.crossings import Point as SectionPoint
@@ -34,7 +35,7 @@ from ..simulation.start import snapped_to_belt
 from ..steppers.event_exact import EventExact
 from .branch_points import BranchPoint, point_through
 from .following import HalfBranch, follow_branch
-from .multiple_shooting import Mode, Phases, parameter_direction
+from .multiple_shooting import Mode, Phases
 from .pseudo_arclength import Family
 from .special_derivatives import derivatives_of_special_points
 from .special_points import MEETS_SLIDING, SMOOTH
@@ -83,8 +84,9 @@ def continue_cycle(
     - `multipliers` over `multiplier`, largest first, without the one for a deviation along the cycle;
     - `word`, the contact modes in order; `state`, on the section, in m and m/s, and the contact mode there;
     - `special`: the kind of a special point, else empty: "fold", "non-smooth fold" (no multiplier is one: an impact begins to
-      end the slip there, say), "period doubling", "Neimark–Sacker", or how the contact modes change there, as seen from the
-      start outwards ("grazing of slip: stick inserted"). Special points are computed to rounding;
+      end the slip there, say), "period doubling", "Neimark–Sacker", "amplitude meets the sliding equilibrium", or how the
+      contact modes change there, as seen from the start outwards ("grazing of slip: stick inserted"). Special points are
+      computed to rounding;
     - with `derivatives`, `d_special` over `of`: derivatives of the parameter's value at a special point. NaN at all other
       points, for the parameter itself, and where the change of modes is not a simple one.
 
@@ -100,8 +102,6 @@ def continue_cycle(
         >>> bool(branch["stable"].any())
         True
     """
-    import xarray as xr
-
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     refuse_several_contacts(scene.structure, "`continue_cycle`")
@@ -130,7 +130,7 @@ def continue_cycle(
             f"The motion to start from, at {parameter} = {value:g}, is a torus, which is not continued. Start where the limit "
             f"cycle is periodic, or give a `LimitCycle` as `start`."
         )
-    family = Family(final, parameter_direction(final, parameter), parameter, value, high - low, EventExact())
+    family = Family(final, direction_of(final, parameter), parameter, value, high - low, EventExact())
     first = point_through(family, value, point_of(cycle), cycle.period)
     if first is None:
         raise NoLimitCycle(
@@ -143,7 +143,7 @@ def continue_cycle(
     if derivatives:
         stage("differentiating special points")
     slopes = derivatives_of_special_points(family, along) if derivatives else None
-    return labelled(_dataset(xr, family, along, slopes), final, parameter=parameter).assign_attrs(
+    return labelled(_dataset(family, along, slopes), final, parameter=parameter).assign_attrs(
         parameter=parameter, begins=down.ending, ends=up.ending
     )
 
@@ -208,7 +208,9 @@ def _checked_bounds(bounds) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _dataset(xr, family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
+def _dataset(family: Family, points: list[BranchPoint], slopes) -> "xr.Dataset":
+    import xarray as xr
+
     size = 2 * family.scene.structure.size
     states, status, direction, amplitude, slides = [], [], [], [], []
     for point in points:

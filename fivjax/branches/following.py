@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..foundation.progress import stage
 from ..linear.linearisation import sliding_rates
 from . import halves
-from .branch_points import BranchPoint, beyond, branch_point
+from .branch_points import BranchPoint, branch_point, cycle_beyond
 from .mode_changes import change_of_modes, with_own_rebounds
 from .multiple_shooting import AT_SECTION
 from .pseudo_arclength import ComputedCycle, Curve, Family
@@ -35,7 +35,7 @@ def follow_branch(
     soon, later = 3.0, 1.5
     # Gaps that a branch goes over: beyond one it may come back on itself, again and again.
     most_gaps = 16
-    # A cycle of pure sliding that has shrunk to this share of its size ends at the equilibrium.
+    # A branch of pure sliding ends at the equilibrium once its cycle has shrunk to this share of its first size.
     small = 0.02
     here, tangent = start, start.curve.tangent(start.cycle, None)
     tangent = tangent * (sense if tangent[-1] >= 0 else -sense)
@@ -175,7 +175,7 @@ def _over_a_gap(
     before, last = [start, start, *points][-2:]
     onwards = np.sign(last.cycle.parameter - before.cycle.parameter) or sense
     for way in (onwards, -onwards) if points else (sense,):
-        found = beyond(family, last, way)
+        found = cycle_beyond(family, last, way)
         if found is None or not bounds[0] <= found.cycle.parameter <= bounds[1]:
             continue
         if _met_before([start, *points, found], found) is None:

@@ -16,14 +16,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Status
 from ..cycles.one_period import PeriodSegments
 from ..foundation.carried import depending_on
 from ..foundation.compiling import power_of_4
-from ..foundation.numpy_evaluation import by_numpy
 from ..kernels.functions import KernelFunction
 from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
@@ -232,18 +231,3 @@ def _inside_of_phase(args, shares):
 
 # Of (how, scene, y, h, ends), and of (how, scene, y, h, status, direction).
 _image, _looks = KernelFunction(_image_of_phase), KernelFunction(_inside_of_phase)
-
-
-def parameter_direction(scene: Scene, name: str) -> Scene:
-    """The scene's derivative by one of its parameters: one for that parameter, zero for all others."""
-    return _parameter_direction(scene, name, np.asarray(scene.parameters[name], float))
-
-
-@by_numpy
-def _parameter_direction(scene: Scene, name: str, value: Float[Array, ""]) -> Scene:
-    return jax.jvp(lambda value: scene.replace(**{name: value}), (value,), (jnp.ones_like(value),))[1]
-
-
-def moved_along(scene: Scene, direction: Scene, by: Float[Array, ""] | float) -> Scene:
-    """The scene with a parameter changed, without the checks of `replace`, which take longer than a return of the section."""
-    return jax.tree.map(lambda leaf, slope: np.asarray(leaf) + by * np.asarray(slope), scene, direction)

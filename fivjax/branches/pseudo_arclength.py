@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..contact import Status
+from ..model.directions import moved_along
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
-from .multiple_shooting import Mode, PhaseImages, Phases, images, moved_along
+from .multiple_shooting import Mode, PhaseImages, Phases, images
 
 
 class Family(NamedTuple):

@@ -12,9 +12,10 @@ from jaxtyping import Float
 
 from ..contact import Status
 from ..linear.linearisation import sliding_rates
+from ..model.directions import direction_of, moved_along
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of
-from .multiple_shooting import images, moved_along, parameter_direction
+from .multiple_shooting import images
 from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
@@ -42,7 +43,7 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         return _of_stability_limit(family, cycle.parameter, name)
     if name == "restitution" and _is_inelastic(family) and _rebounds_change(special):
         return np.nan
-    direction = parameter_direction(family.scene, name)
+    direction = direction_of(family.scene, name)
     found = images(family.at(cycle.parameter), direction, family.stepper, cycle.phases)
     _, rows = assembled(found, cycle.phases)
     _, own = assembled(cycle.images, cycle.phases)
@@ -95,7 +96,7 @@ def _rebounds_change(special: Special) -> bool:
 
 def _of_stability_limit(family: Family, limit: float, name: str) -> float:
     def slope(other: str) -> float:
-        scene, direction = family.at(limit), parameter_direction(family.scene, other)
+        scene, direction = family.at(limit), direction_of(family.scene, other)
         value = abs(float(np.asarray(scene.parameters[other])))
         by = APART * (value if value else 1.0)
         low, high = (sliding_rates(moved_along(scene, direction, side * by))[0].real for side in (-1.0, 1.0))
@@ -116,7 +117,7 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
     across = np.linalg.lstsq(own / sizes[:, None], -slope / sizes, rcond=None)[0]
 
     def size(along: float, other: float) -> float:
-        moved = family._replace(scene=moved_along(family.scene, parameter_direction(family.scene, name), other))
+        moved = family._replace(scene=moved_along(family.scene, direction_of(family.scene, name), other))
         there = Curve(moved, cycle.phases)
         # Converted to the units of its own curve.
         guess = (cycle.u + along * tangent + other * across) * curve.scales / there.scales

@@ -24,7 +24,8 @@ class FitOutcome(enum.StrEnum):
     )
     DOES_NOT_FIT = (
         "the model does not fit: much of what was recorded is left, and it is not noise; check regime, channels and units, "
-        "and correct or free what differs from the scene, or start closer: below two samples a vibration many fits seem near"
+        "and correct or free what differs from the scene, or start closer: "
+        "with fewer than two samples a vibration, many fits seem close"
     )
     NOT_CONVERGED = "not converged: the last fit ran out of steps; start closer, free fewer parameters or set bounds"
     NO_CYCLE = (

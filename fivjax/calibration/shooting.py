@@ -37,7 +37,7 @@ from ..steppers.event_exact import for_derivatives
 from ..steppers.kernel_scope import has_kernel
 from .inside import advance_with_channels, jumps, terms_of
 
-# Then its state is sampled so often per expected period, to see where it returns to itself.
+# A settled motion's state is sampled so often per expected period, to see where it returns to itself.
 LOOKS = 48
 # The shortest and the longest period tried, relative to the expected one.
 SHORTEST, LONGEST = 0.6, 1.7

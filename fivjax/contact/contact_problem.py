@@ -5,7 +5,7 @@ impulses. Each contact is in one of four states; every state demands something, 
 
 | state | demands | admissible where |
 |---|---|---|
-| STICK | $a_t = a_n = 0$ | $|T| ≤ μ_s N$, and it does not slip yet |
+| STICK | $a_t = a_n = 0$ | $\lvert T\rvert ≤ μ_s N$, and it does not slip yet |
 | FORWARD | $T = +μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≤ 0$ |
 | BACKWARD | $T = -μ N$, $a_n = 0$ | $N ≥ 0$; if it does not slip yet, $a_t ≥ 0$ |
 | OPEN | $T = N = 0$ | $a_n ≥ 0$ |

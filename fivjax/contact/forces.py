@@ -7,11 +7,9 @@ from ..foundation.linear_solve import product
 from .coordinates import at_places, spread, with_values
 from .mechanics import Mechanics
 from .mode import Contact, Status
-from .mode_forces import ModeForces
+from .mode_forces import Each, ModeForces
 
 State = Float[Array, " state"]  # displacements, then velocities
-# One value, or with several contacts one for each.
-Each = Float[Array, "*contacts"]
 
 
 def relative_velocity(mechanics: Mechanics, y: State) -> Each:

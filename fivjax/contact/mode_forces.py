@@ -14,6 +14,7 @@ from ..foundation.linear_solve import inverse
 from .mechanics import Mechanics
 from .mode import Contact, Status
 
+# One value, or with several contacts one for each.
 Each = Float[Array, "*contacts"]
 
 

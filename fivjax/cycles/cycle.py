@@ -1,11 +1,13 @@
 """A limit cycle, its properties, and the quantities computed from it."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
 from ..attractors.closing import FixedPoint
-from ..attractors.cycles import FAMILY
+from ..attractors.cycles import FAMILY_TOLERANCE
 from ..contact import Contact, Status
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
@@ -94,7 +96,7 @@ class LimitCycle(eqx.Module):
         """
         if self.kind != "periodic" or np.ndim(self.contact.status) == 0:
             return False
-        return bool(np.any(np.abs(section_multipliers(self.return_jacobian) - 1.0) < FAMILY))
+        return bool(np.any(np.abs(section_multipliers(self.return_jacobian) - 1.0) < FAMILY_TOLERANCE))
 
     def trajectory(self, points: int = 1000, *, periods: int = 1, energy: bool = False) -> Trajectory:
         """One period, or several, as a trajectory of `points` + 1 rows, the first and the last on the section.
@@ -210,11 +212,11 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
         contact=Contact(np.asarray(point.contact.status), np.asarray(point.contact.direction)),
         word=word(seen.segments),
         multipliers=floquet_multipliers(scene, stepper, seen.segments, closed.period),
-        stable=bool(largest < 1 - (MARGIN if np.ndim(point.contact.status) == 0 else FAMILY)),
+        stable=bool(largest < 1 - (MARGIN if np.ndim(point.contact.status) == 0 else FAMILY_TOLERANCE)),
         amplitude=float(seen.amplitude),
         residual=closed.residual,
         crossings=closed.crossings,
-        harmonics=seen.lines,
+        harmonics=seen.harmonics,
         points=points,
         return_jacobian=closed.jacobian,
     )
@@ -223,14 +225,7 @@ def limit_cycle_of(maps: ReturnMaps, scene: Scene, closed: FixedPoint) -> LimitC
 @in_double_precision
 def under_final_load(scene: Scene) -> Scene:
     """The scene with its load after the last jump."""
-    return Scene(
-        scene.structure,
-        scene.friction,
-        scene.belt_speed,
-        ConstantLoad(scene.load.final),
-        scene.restitution,
-        scene.impact_law,
-    )
+    return dataclasses.replace(scene, load=ConstantLoad(scene.load.final))
 
 
 def point_of(cycle: LimitCycle) -> Point:

@@ -53,7 +53,7 @@ class PeriodSummary(NamedTuple):
 
     segments: PeriodSegments
     amplitude: float  # m/s
-    lines: Complex[np.ndarray, "count n"]  # m/s
+    harmonics: Complex[np.ndarray, "count n"]  # m/s
 
 
 class _Carry(NamedTuple):

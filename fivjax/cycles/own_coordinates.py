@@ -15,8 +15,8 @@ import equinox as eqx
 import numpy as np
 
 from ..foundation.precision import in_double_precision
-from ..io.datasets import describe
 from ..model.contact_coordinates import from_contact_coordinates, to_contact_coordinates, transformation
+from ..model.description import describe
 from ..model.scene import Scene, scene_in_contact_coordinates
 from ..simulation.start import start_in_contact_coordinates
 from ..simulation.trajectory import Trajectory

@@ -13,11 +13,11 @@ from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..linear.linearisation import sliding_rates
-from ..model.scene import Scene, refuse_painleve, sliding_equilibrium
+from ..model.scene import Scene
 from ..section.return_maps import ReturnMaps, Section
 from .cycle import LimitCycle, limit_cycle_of, section_multipliers, under_final_load
 from .own_coordinates import in_own_coordinates
-from .search import MOST_CROSSINGS, NoLimitCycle, limit_cycle
+from .search import MOST_CROSSINGS, NoLimitCycle, check_scene, limit_cycle
 
 # Points of the section that are looked at together.
 POINTS = 96
@@ -30,7 +30,8 @@ APART = 1e-4
 ROUNDS = 24
 # A trajectory has reached the cycle when it is this close to it, relative to the cycle's size.
 CAPTURED = 1e-2
-FADED = 1e-2
+# And it slides below this size, relative to the cycle's.
+SLID_BELOW = 1e-2
 # Sliding counts as unstable above this growth rate, relative to the largest eigenvalue; below, the sign may be one of rounding.
 UNSTABLE = 1e-6
 
@@ -59,22 +60,19 @@ def saddle_cycle(scene: Scene, cycle: LimitCycle | None = None, *, progress: boo
     # the path of both must repeat for Newton's method to begin there. Closer ones take longer to find, and follow the boundary
     # longer.
     narrow = ((1e-8, 1e-2), (1e-14, 1e-1))
-    arguments.instance("scene", scene, Scene, "a Scene")
-    arguments.known("scene", scene)
+    check_scene(scene)
     arguments.instance("cycle", cycle, LimitCycle | None, "a limit cycle, such as `fivjax.limit_cycle(scene)`, or None")
-    refuse_painleve(scene)
-    sliding_equilibrium(under_final_load(scene))
     _refuse_unstable_sliding(under_final_load(scene))
     cycle = limit_cycle(scene) if cycle is None else cycle
-    fates = _Fates(scene, cycle)
+    edge = _Edge(scene, cycle)
     low, high = np.zeros_like(cycle.deviation), cycle.deviation
     for number in range(ROUNDS):
         stage(f"tracking the edge, round {number + 1}")
         paths = None
         for share, repeated in narrow:
-            low, high = fates.narrowed(low, high, share)
-            paths = fates.together(low, high)
-            found = fates.saddle_near(paths, repeated)
+            low, high = edge.narrowed(low, high, share)
+            paths = edge.together(low, high)
+            found = edge.saddle_near(paths, repeated)
             if found is not None:
                 return found
         assert paths is not None
@@ -95,7 +93,7 @@ def _refuse_unstable_sliding(scene: Scene) -> None:
         )
 
 
-class _Fates:
+class _Edge:
     """Which side of the boundary states lie on."""
 
     def __init__(self, scene: Scene, cycle: LimitCycle):
@@ -127,7 +125,7 @@ class _Fates:
         ends = self.weights * last.path[:, -4:]
         apart = np.min(np.linalg.norm(ends[:, :, None] - self.target, axis=-1), axis=(1, 2))
         with np.errstate(invalid="ignore"):
-            slid = ((last.events == 0) & (now < 0.7 * before)) | (now < FADED * self.size)
+            slid = ((last.events == 0) & (now < 0.7 * before)) | (now < SLID_BELOW * self.size)
             fate = np.where(slid, 0, np.where(apart < CAPTURED * self.size, 1, -1))
         # The section is no longer crossed: the contact sticks for good, or a failure. Neither is sliding.
         return np.where((fate < 0) & ~np.isfinite(now), 1, fate), last.at

@@ -81,7 +81,7 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
         >>> round(float(cycle.frequency), 4), round(float(cycle.amplitude), 5)  # Hz, m/s
         (67.5928, 1.11209)
     """
-    _check(scene)
+    check_scene(scene)
     if start is None:
         met = _met(scene)
         if not met.cycles:
@@ -124,7 +124,7 @@ def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None =
         >>> cycles[0].kind
         'periodic'
     """
-    _check(scene)
+    check_scene(scene)
     if isinstance(starts, str | Mapping) or not isinstance(starts, Iterable):
         raise TypeError(
             f"Argument `starts` must be a list of states `(2n,)` or trajectories, but is {arguments.describe(starts)}."
@@ -216,7 +216,8 @@ def _described(maps: ReturnMaps, scene: Scene, cycle: StableCycle) -> LimitCycle
     return dataclasses.replace(found, reach=cycle.reach, contraction=cycle.contraction)
 
 
-def _check(scene: Scene) -> None:
+def check_scene(scene: Scene) -> None:
+    """Refuse what is no scene, or one without a sliding equilibrium under its final load."""
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     refuse_painleve(scene)

@@ -51,7 +51,7 @@ def limit_cycle_of_torus(maps: ReturnMaps, scene: Scene, torus: Torus) -> LimitC
         amplitude=torus.amplitude,
         residual=residual,
         crossings=1,
-        harmonics=seen.lines,
+        harmonics=seen.harmonics,
         points=points,
         return_jacobian=np.diag(np.pad(largest.real, (0, len(weights) - len(largest)))),
         rotation_number=rotation,

@@ -30,8 +30,8 @@ class _Equation(NamedTuple):
     types: list[np.dtype]  # of results
 
     @classmethod
-    def of(cls, equation, params: dict, reads: list[int], writes: list[int], types: list[str]) -> "_Step":
-        """The step of an equation, or of the name of its primitive and its parameters."""
+    def of(cls, equation, params: dict, reads: list[int], writes: list[int], types: list[str]) -> "_Equation":
+        """An equation, ready, from itself or from the name of its primitive and its parameters."""
         return cls(_function(equation, params), reads, writes, [np.dtype(kind) for kind in types])
 
     def taken(self, values: list) -> None:

@@ -1,6 +1,5 @@
 """Names and units of the parameters and results that fivjax itself names, for labels, tables and pictures."""
 
-# Long name and unit of each parameter and result that fivjax itself names.
 QUANTITIES = {
     "mu": ("friction coefficient", "1"),
     "mu_static": ("static friction coefficient", "1"),

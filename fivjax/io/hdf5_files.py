@@ -1,4 +1,4 @@
-"""HDF5 files, which NetCDF and MATLAB 7.3 files are: read in a process of its own, which damage may crash."""
+"""HDF5 files, which NetCDF and MATLAB 7.3 files are: read in a process of its own, which a damaged one may crash."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What runs in a process of its own to read a file with a library that damage may crash: it imports nothing of fivjax.
+"""What runs in a process of its own to read a file with a library that a damaged one may crash: it imports nothing of fivjax.
 
 On some damaged files the HDF5 library crashes or never returns, and pyyeti, which reads OUTPUT4, makes room for whatever a
 header declares. Here that cannot harm the caller. By itself the HDF5 library also reads whatever other files a file names;

@@ -17,13 +17,14 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
 from ..io.datasets import labelled
 from ..maps.basin_map import verdicts_from
+from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import sliding_state
 from ..steppers.event_exact import EventExact
 from ..verdicts.verdict import Verdict
 from .critical import critical_perturbation
-from .response import MOST_CROSSINGS, Crossings, directions_of, kicked
+from .response import MOST_CROSSINGS, Crossings, kicked
 from .stable_manifold import Saddle, critical_kick, saddle_of
 
 if TYPE_CHECKING:

@@ -89,7 +89,7 @@ def critical_perturbation(
     - `d_p_crit` over `parameter`, per unit of each; NaN if there is no derivative, and `why_none` says why in a sentence;
     - `newton_trajectories`: the number of trajectories that Newton's method took.
 
-    **Raises:** `ValueError` as `bistability_map`, and for a load without a pulse or an axis named p.
+    **Raises:** `ValueError` as `bistability_map`, and for an axis named p; `TypeError` for a load without a pulse.
 
     **Example:**
 
@@ -136,8 +136,8 @@ def critical_perturbation(
 
     def run(values, method, label: str, limits: Limits | None = None):
         limits = Limits(t_max) if limits is None else limits
-        means = RunOptions(label, memory, progress, executor)
-        return run_to_verdict(scene, TrajectoryList(values), method, limits, means, attractors=known)
+        options = RunOptions(label, memory, progress, executor)
+        return run_to_verdict(scene, TrajectoryList(values), method, limits, options, attractors=known)
 
     scan = np.linspace(low, high, scanned)
     verdicts = _verdicts(run, method, columns, np.tile(scan, (math.prod(shape), 1)), "scan")

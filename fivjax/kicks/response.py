@@ -6,11 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .. import contact as physics
 from ..contact import Contact, Status
-from ..foundation.numpy_evaluation import by_numpy
 from ..foundation.precision import known_to_numpy
 from ..kernels.functions import KernelFunction
 from ..model.load import Pulse
@@ -33,20 +32,6 @@ class Crossings(NamedTuple):
     direction: Float[np.ndarray, " k"]
     events: Int[np.ndarray, " k"]  # contact events up to the crossing
     count: int
-
-
-def directions_of(scene: Scene, names: tuple[str, ...]) -> Scene:
-    """The scene's derivatives by several of its parameters, stacked along a first axis."""
-    return _directions_of(scene, names, np.array([float(scene.parameters[name]) for name in names]))
-
-
-@by_numpy
-def _directions_of(scene: Scene, names: tuple[str, ...], values: Float[Array, " k"]) -> Scene:
-    def moved(values) -> Scene:
-        return scene.replace(**dict(zip(names, values, strict=True)))
-
-    # All in one, because each is traced.
-    return jax.vmap(lambda along: jax.jvp(moved, (values,), (along,))[1])(jnp.eye(len(names)))
 
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:

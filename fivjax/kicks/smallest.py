@@ -34,7 +34,8 @@ from .stable_manifold import Saddle, critical_kick, saddle_of
 GRID, STARTS = 4096, 24
 # Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
-OVER = ("p", "duration", "start", "state", "history")
+# What of a kick may be free.
+OF_KICK = ("p", "duration", "start")
 
 
 class SmallestKick(NamedTuple):
@@ -126,8 +127,8 @@ def smallest_kick(
 
     **Returns:** a `SmallestKick`, or a `SmallestPerturbation` for a state or a history; printing it shows the gap.
 
-    **Raises:** `ValueError` for a load without a pulse, friction that varies with slip speed, sliding that is not stable, and
-    invalid names or bounds; `NoSquealingKick` if nothing that was tried leads to a limit cycle.
+    **Raises:** `TypeError` for a load without a pulse; `ValueError` for friction that varies with slip speed, sliding that is
+    not stable, and invalid names or bounds; `NoSquealingKick` if nothing that was tried leads to a limit cycle.
 
     **Example:**
 
@@ -148,15 +149,15 @@ def smallest_kick(
         return _other(scene, str(over), bounds, pieces)
     free = arguments.listed_names("over", over, "p")
     for name in free:
-        arguments.one_of("over", name, OVER)
+        arguments.one_of("over", name, OF_KICK)
     if "p" not in free:
         raise ValueError(f'Argument `over` must hold "p", whose smallest value is sought, but is {free!r}.')
     own = float(scene.load.duration)
     given = {"p": (1.0, 5.0), "duration": (0.0, 2 * own), **bounds}
-    unknown = sorted(set(given) - set(OVER))
+    unknown = sorted(set(given) - set(OF_KICK))
     if unknown:
         raise ValueError(
-            f"Argument `bounds` must name what of a kick is free ({', '.join(OVER)}), but has {unknown[0]!r}."
+            f"Argument `bounds` must name what of a kick is free ({', '.join(OF_KICK)}), but has {unknown[0]!r}."
         )
     for name, pair in given.items():
         if arguments.numeric_array(f"bounds[{name!r}]", pair).shape != (2,):

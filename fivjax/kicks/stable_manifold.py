@@ -20,11 +20,12 @@ from jaxtyping import Float
 from ..attractors.closing import FixedPoint, close_near
 from ..contact import Contact
 from ..foundation.precision import in_double_precision
+from ..model.directions import directions_of
 from ..model.scene import Scene
 from ..section.crossings import Point
 from ..section.return_maps import ReturnMaps
 from ..steppers.event_exact import EventExact
-from .response import MOST_CROSSINGS, Crossings, directions_of, kicked, returned, started
+from .response import MOST_CROSSINGS, Crossings, kicked, returned, started
 
 # The most trajectories of Newton's method, and the relative change of p at which it has converged.
 MOST_TRAJECTORIES = 12

@@ -22,6 +22,7 @@ from .. import contact as physics
 from ..contact import Contact, Mechanics
 from ..foundation.precision import in_double_precision
 from ..kernels.functions import KernelFunction
+from ..model.directions import directions_of
 from ..model.load import Pulse
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding, slowest_period
@@ -29,7 +30,6 @@ from ..section.crossings import MOST_SEGMENTS, ByMethod
 from ..steppers.core import Segment, follow
 from ..steppers.event_exact import EventExact, for_derivatives
 from ..steppers.kernel_scope import has_kernel
-from .response import directions_of
 
 # The most events that are compared; and the longest time in which two motions separate, in slowest periods.
 MOST_EVENTS, MOST_TIME = 1024, 20.0

@@ -1,5 +1,6 @@
 """The cost of accuracy: methods, steps and precisions measured on the user's scene."""
 
+import dataclasses
 import itertools
 import json
 import time
@@ -99,7 +100,7 @@ def tradeoff(
     frequency = _frequency(scene)
     rows = {(name, kind): method for (name, method), kind in itertools.product(methods.items(), precisions)}
     measures = ("cost", "state_error", "p_crit_error", "wrong_verdicts", "undecided")
-    table = {name: np.full((len(methods), len(precisions)), np.nan) for name in measures}
+    measured = {name: np.full((len(methods), len(precisions)), np.nan) for name in measures}
 
     with following("tradeoff", shown=progress, total=len(rows), unit=" methods"):
         exact = EventExact(order=20, tolerance=1e-16)
@@ -110,11 +111,11 @@ def tradeoff(
             stage(f"{name}, {kind}")
             place = list(methods).index(name), precisions.index(kind)
             own = scene if kind == "float64" else _single(scene)
-            table["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
-            table["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
+            measured["state_error"][place] = _state_error(_end_state(own, method, t1), reference, scene.structure.size)
+            measured["cost"][place] = _cost(own, method, t1, trajectories) / (trajectories * t1 * frequency)
             if edge is not None and kind == "float64":
                 for measure, value in edge(method).items():
-                    table[measure][place] = value
+                    measured[measure][place] = value
             tick()
         stage("parts")
         parts = _parts(scene, t1)
@@ -122,7 +123,7 @@ def tradeoff(
     halvings = {"halvings": np.arange(refine + 1)} if refine else {}
     dataset = xr.Dataset(
         {
-            **{name: (("stepper", "precision"), values) for name, values in table.items()},
+            **{name: (("stepper", "precision"), values) for name, values in measured.items()},
             "part_cost": ("part", np.array(list(parts.values()))),
             **{name: ("halvings", values) for name, values in refined.items()},
         },
@@ -302,14 +303,7 @@ def _parts(scene: Scene, t1: float) -> dict[str, float]:
     if isinstance(scene.friction, Coulomb):
         # Practically constant, so that the motion is the same but is computed as with friction that varies.
         mu = scene.friction.mu
-        falling = Scene(
-            scene.structure,
-            ExponentialDecay(mu, mu, 1.0),
-            scene.belt_speed,
-            scene.load,
-            scene.restitution,
-            scene.impact_law,
-        )
+        falling = dataclasses.replace(scene, friction=ExponentialDecay(mu, mu, 1.0))
         found["friction that may depend on speed"] = cost(falling) / plain
     if isinstance(scene.load, Pulse):
         found["no contact events (no kick)"] = cost(scene.replace(p=1.0)) / plain

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..model.contact_coordinates import in_contact_coordinates
+from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
 from ..model.structure import Structure
@@ -44,11 +45,7 @@ def sliding_motion(scene: Scene) -> tuple[Float[Array, "m m"], Float[Array, " c"
     speed = jnp.broadcast_to(jnp.abs(scene.belt_speed), (count,))
     friction = jnp.broadcast_to(jnp.sign(scene.belt_speed) * scene.friction(speed), (count,))
     forces = sliding_forces(scene.structure, friction, scene.load.final)
-    if scene.friction.constant:
-        slopes = jnp.zeros_like(friction)
-    else:
-        _, slopes = jax.jvp(lambda v: scene.friction(v), (speed,), (jnp.ones_like(speed),))
-        slopes = forces * slopes
+    slopes = jnp.zeros_like(friction) if scene.friction.constant else forces * slope_of(scene.friction, speed)
     return sliding_state_matrix(scene.structure, friction, slopes), forces
 
 

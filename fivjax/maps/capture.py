@@ -40,25 +40,25 @@ class Late(NamedTuple):
 class Capture:
     """The attractors of the groups of a batch, and which trajectories have entered where they capture.
 
-    `of_groups` has the groups' parameters, `group` the group of each trajectory, `seeds` the group whose attractors seed the
+    `parameters` has those of the groups, `group` the group of each trajectory, `seeds` the group whose attractors seed the
     search in each; `report(0)` says that a search goes on.
     """
 
     def __init__(
         self,
         batch: Batch,
-        of_groups: Float[np.ndarray, "g k"],
+        parameters: Float[np.ndarray, "g k"],
         group: Int[np.ndarray, " m"],
         seeds: Int[np.ndarray, " g"],
         report: Callable[[int], None],
     ):
-        self.batch, self.of_groups, self.group, self.seeds, self.report = batch, of_groups, group, seeds, report
+        self.batch, self.parameters, self.group, self.seeds, self.report = batch, parameters, group, seeds, report
         self.maps: ReturnMaps | None = None
         self.known: dict[int, Attractors] = {}
         # Those of each group when the time of its trajectories is over.
         self.known_at_last: dict[int, Attractors] = {}
         # Time that the known cycles of each group take to attract, and the most that is waited for them, s.
-        self.settled_by = np.zeros(len(of_groups))
+        self.settled_by = np.zeros(len(parameters))
         self.most_time = 20000.0 * np.asarray(batch.shared.tree.modes.slowest_period)
 
     def _catalogue(self, maps: ReturnMaps, known: dict[int, Attractors]) -> Catalogue:
@@ -79,7 +79,7 @@ class Capture:
 
     def go_on(self, earlier: JobState) -> None:
         """Go on from that state."""
-        self.known, self.known_at_last = dict(earlier.of_groups), dict(earlier.at_last)
+        self.known, self.known_at_last = dict(earlier.parameters), dict(earlier.at_last)
         self.settled_by = earlier.settled_by
         if self.known:
             self.maps = self._return_maps()
@@ -87,7 +87,7 @@ class Capture:
     def search(self, groups: np.ndarray, known: dict[bytes, Attractors], keep: Callable[[], None]) -> None:
         """Finds the attractors of these groups, where they are not `known`; `keep` is called when some are found."""
         self.maps = self._return_maps()
-        keys = [row.tobytes() for row in self.of_groups]
+        keys = [row.tobytes() for row in self.parameters]
         seeds = {int(g): int(self.seeds[g]) for g in groups if keys[g] not in known}
         found = {g: known[keys[g]] for g in {*seeds, *seeds.values()} if keys[g] in known}
 

@@ -23,7 +23,7 @@ from ..attractors.catalogue import Attractors
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
-from .job_files import file_of, from_bytes, to_bytes
+from .job_files import attractors_from_bytes, attractors_to_bytes, file_of
 from .plan import Indices
 from .results import Verdicts, by_name, not_run
 
@@ -51,19 +51,19 @@ class Checkpoint:
 
     `run` describes the run of `total` trajectories in plain Python values (that `json` can hold).
 
-    **Raises:** as `recall`.
+    **Raises:** as `read_checkpoint`.
     """
 
     def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
         self.path, self.run = Path(path), run
         self.verdicts, self.found = not_run(total, energy), {}
         self._new, self._done = False, []
-        kept = recall(path, run)
+        kept = read_checkpoint(path, run)
         if kept is not None:
             for name, values in by_name(self.verdicts).items():
                 values[:] = kept.results[name]
             self._new = self._leave_out_damage(kept)
-            self.found = {place: from_bytes(content) for place, content in kept.found.items()}
+            self.found = {place: attractors_from_bytes(content) for place, content in kept.found.items()}
         self._written = time.monotonic()
 
     def _leave_out_damage(self, kept: Contents) -> bool:
@@ -109,9 +109,9 @@ class Checkpoint:
         """Write results that are not written yet."""
         if not self._new:
             return
-        found = {place: to_bytes(part) for place, part in self.found.items()}
+        found = {place: attractors_to_bytes(part) for place, part in self.found.items()}
         self._written = time.monotonic()
-        if keep(self.path, self.run, by_name(self.verdicts), found):
+        if write_checkpoint(self.path, self.run, by_name(self.verdicts), found):
             self._new = False
             for places in self._done:
                 Path(self.job_file(places)[0]).unlink(missing_ok=True)
@@ -127,7 +127,7 @@ def jobs_beside(path: Path) -> Path:
     return path.with_name(f"{path.name}.jobs")
 
 
-def recall(path: str | Path, run: dict) -> Contents | None:
+def read_checkpoint(path: str | Path, run: dict) -> Contents | None:
     """What is kept in a checkpoint; None if there is no such file yet.
 
     `run` describes the run in plain Python values (that `json` can hold).
@@ -170,7 +170,7 @@ def refuse_other_run(what: str, theirs: dict, run: dict) -> None:
             )
 
 
-def keep(path: Path, run: dict, results: dict[str, np.ndarray], found: dict[int, bytes]) -> bool:
+def write_checkpoint(path: Path, run: dict, results: dict[str, np.ndarray], found: dict[int, bytes]) -> bool:
     """Write the checkpoint; if the disk does not take it, warn and leave the earlier one. Whether it was written."""
     try:
         replace_whole(check_writable(path), contents_to_bytes(run, results, found))

@@ -178,7 +178,7 @@ def is_broken(error: BaseException) -> bool:
     return "BrokenExecutor" in _kinds(error)
 
 
-def is_proof(error: BaseException) -> bool:
+def was_tried_on_several(error: BaseException) -> bool:
     """Whether the error means that the executor has tried the job on several workers, all of which died (Dask)."""
     return "KilledWorker" in _kinds(error)
 
@@ -261,7 +261,7 @@ def hand_out(
                 workers.renew()
             for one, number in gone:
                 # Jobs begin in order, so only the first ones were running.
-                blamed = most_losses if is_proof(error) else int(one in running)
+                blamed = most_losses if was_tried_on_several(error) else int(one in running)
                 if number == alone:
                     lost_alone[number] += blamed
                 else:

@@ -67,7 +67,7 @@ def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndar
 
     def function(*block):
         return _begin_block(
-            task.scene, task.names, task.history, tuple(task.states.values()), task.limits.energy, *block
+            task.scene, task.names, task.of_kick, tuple(task.states.values()), task.limits.energy, *block
         )
 
     return in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
@@ -82,7 +82,7 @@ def advance_all(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flatte
     follow_block = _follow_block_of_many if task.many else _follow_block
 
     def function(*block):
-        return follow_block(task.scene, task.method, task.names, task.history, np.int32(steps), *block)
+        return follow_block(task.scene, task.method, task.names, task.of_kick, np.int32(steps), *block)
 
     in_blocks(function, batch.shared, group, trajectories, task.width, batch.pool, in_place=True, size=batch.block)
 
@@ -134,12 +134,12 @@ def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
 
 
 @kept
-def _begin_block(scene, names, history, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _begin_block(scene, names, of_kick, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
     def group(shared, columns):
         own = with_values(scene, names, shared.values)
 
         def one(row):
-            return begin_one(with_values(own, history, row), shared, states, row[len(history) :], energy=energy)
+            return begin_one(with_values(own, of_kick, row), shared, states, row[len(of_kick) :], energy=energy)
 
         return jax.vmap(one)(columns)
 
@@ -147,9 +147,9 @@ def _begin_block(scene, names, history, states, energy: bool, shared: Flattened,
     return flatten((columns, jax.vmap(group)(shared.tree, columns)), row_axes=2)
 
 
-def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _follow_rows(scene, method, names, of_kick, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
-    of_all = functools.partial(_of_all, scene, method, names, history, shared.tree, columns)
+    of_all = functools.partial(_of_all, scene, method, names, of_kick, shared.tree, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
     a_step, concluded = map(of_all, (with_step, conclude))
@@ -160,14 +160,14 @@ def _follow_rows(scene, method, names, history, steps, shared: Flattened, trajec
 _follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
-def _of_all(scene, method, names, history, everything: GroupConstants, columns, function):
+def _of_all(scene, method, names, of_kick, everything: GroupConstants, columns, function):
     """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
 
     def of_group(shared, columns, *own):
         scene_of_group = with_values(scene, names, shared.values)
 
         def of_one(row, *own):
-            setting = Setting(with_values(scene_of_group, history, row), method, shared)
+            setting = Setting(with_values(scene_of_group, of_kick, row), method, shared)
             return function(setting, *own)
 
         return jax.vmap(of_one)(columns, *own)

@@ -31,7 +31,7 @@ from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 
 # Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
-HISTORY = ("p", "duration", "start")
+OF_KICK = ("p", "duration", "start")
 
 
 class GroupConstants(eqx.Module):
@@ -60,7 +60,7 @@ class Task(NamedTuple):
     scene: Scene  # on the way to a worker with NumPy arrays, because JAX arrays lose double precision when they are unpickled
     method: AbstractStepper | Propagation
     names: tuple[str, ...]  # parameters that differ between groups
-    history: tuple[str, ...]  # parameters of the kick
+    of_kick: tuple[str, ...]  # parameters of the kick
     states: dict[str, int]  # initial displacements and velocities, with their indices in the state
     limits: Limits = Limits()
     width: int = 1  # trajectories of a group in a row of a block
@@ -110,7 +110,7 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
 
 def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
     """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
-    own = [column for name, column in values.items() if name not in HISTORY and name not in states]
+    own = [column for name, column in values.items() if name not in OF_KICK and name not in states]
     if not own:
         count = len(next(iter(values.values())))
         return np.zeros((1, 0)), np.zeros(count, int)

@@ -27,7 +27,7 @@ from .plan import Indices
 from .results import Verdicts, by_name
 
 
-def to_bytes(found: dict[bytes, Attractors]) -> bytes:
+def attractors_to_bytes(found: dict[bytes, Attractors]) -> bytes:
     """The attractors of groups, by the groups' parameters, as bytes."""
     arrays, index = {}, []
     for number, (key, one) in enumerate(found.items()):
@@ -49,8 +49,8 @@ def to_bytes(found: dict[bytes, Attractors]) -> bytes:
     return content.getvalue()
 
 
-def from_bytes(content: bytes) -> dict[bytes, Attractors]:
-    """The attractors that `to_bytes` has written."""
+def attractors_from_bytes(content: bytes) -> dict[bytes, Attractors]:
+    """The attractors that `attractors_to_bytes` has written."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     found = {}
@@ -114,7 +114,7 @@ class JobFile:
         if self.path is None or not self.path.is_file():
             return None
         try:
-            return from_content(unsealed(self.path.read_bytes()), self.key)
+            return state_from_bytes(unsealed(self.path.read_bytes()), self.key)
         except (OSError, Damaged):
             warnings.warn(f"File `{self.path}` of an unfinished job is damaged; the job begins anew.", stacklevel=2)
         return None
@@ -138,17 +138,17 @@ class JobFile:
             return
         with contextlib.suppress(OSError):
             self.path.parent.mkdir(exist_ok=True)
-            replace_whole(self.path, sealed(to_content(noted, self.key)))
+            replace_whole(self.path, sealed(state_to_bytes(noted, self.key)))
         self._written = time.monotonic()
 
 
-def to_content(now: JobState, key: str) -> bytes:
+def state_to_bytes(now: JobState, key: str) -> bytes:
     """The state as bytes (NumPy's npz, without pickles)."""
     head = {"key": key, "done": now.done, "own_from": now.own_from}
     attractors = {
-        "known": to_bytes(now.known),
-        "of_groups": to_bytes({str(g).encode(): one for g, one in now.of_groups.items()}),
-        "at_last": to_bytes({str(g).encode(): one for g, one in now.at_last.items()}),
+        "known": attractors_to_bytes(now.known),
+        "of_groups": attractors_to_bytes({str(g).encode(): one for g, one in now.of_groups.items()}),
+        "at_last": attractors_to_bytes({str(g).encode(): one for g, one in now.at_last.items()}),
     }
     arrays = {f"result.{name}": values for name, values in by_name(now.verdicts).items()}
     arrays |= {name: np.frombuffer(content, np.uint8) for name, content in attractors.items()}
@@ -158,7 +158,7 @@ def to_content(now: JobState, key: str) -> bytes:
     return content.getvalue()
 
 
-def from_content(content: bytes, key: str) -> JobState | None:
+def state_from_bytes(content: bytes, key: str) -> JobState | None:
     """The state again; none where it is not of this run and job."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         head = json.loads(file["head"].tobytes())
@@ -167,7 +167,9 @@ def from_content(content: bytes, key: str) -> JobState | None:
         arrays = {name: file[name] for name in file.files}
     results = {name.removeprefix("result."): arrays[name] for name in arrays if name.startswith("result.")}
     parts = {name: results.pop(name) for name in Verdicts._fields if name != "energy"}
-    known, of_groups, at_last = (from_bytes(arrays[name].tobytes()) for name in ("known", "of_groups", "at_last"))
+    known, of_groups, at_last = (
+        attractors_from_bytes(arrays[name].tobytes()) for name in ("known", "of_groups", "at_last")
+    )
     return JobState(
         done=head["done"],
         own_from=head["own_from"],

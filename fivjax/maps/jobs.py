@@ -91,7 +91,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     of_groups, group = groups_of(job.values, tuple(task.states))
     of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(group, return_index=True)[1]])
     batch = Batch(task, of_groups, pool)
-    own = [job.values[name] for name in (*task.history, *task.states)]
+    own = [job.values[name] for name in (*task.of_kick, *task.states)]
     columns = np.stack([np.zeros(len(group)), *own], axis=-1)[:, 1:]
     pending = np.arange(len(group))
     trajectories = begin_all(batch, group, columns)

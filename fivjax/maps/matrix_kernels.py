@@ -82,9 +82,7 @@ class MatrixKernels:
         self.on_device: dict[tuple, list] = {}  # the same on a device, and columns
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
-        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
-        """
+        """As `return_maps.Kernels.returns`."""
         (count, size), of = y.shape, ReturnColumn
         rows = np.empty((count, of.STATE + size))
         rows[:, of.CROSSINGS], rows[:, of.STATE :] = crossings, y

@@ -18,7 +18,7 @@ from ..simulation.ending import UNBOUNDED_FROM
 from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, open_ledger
 from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
-from ..steppers.core import Segment
+from ..steppers.core import Segment, end_after
 from ..steppers.propagation import Propagation
 from ..verdicts.sliding_proof import margin_share_bound
 from ..verdicts.slow_growth import slide_while_certain
@@ -157,8 +157,8 @@ def with_step(setting: Setting, now: Progress) -> Progress:
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
     assert not isinstance(method, Propagation)
     after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section=True)
-    y, contact, h, rise = after.y, after.contact, after.h, after.rise
-    t = jnp.where(h >= t - now.t, t, now.t + h)
+    y, contact, rise = after.y, after.contact, after.rise
+    t = end_after(after, now.t, t, jnp.asarray(True))
     changed = contact.status != now.contact.status
     changed = jnp.any(changed) if setting.shared.mechanics.several else changed
     # Crossings during the kick do not count for the motion after it.

@@ -17,7 +17,7 @@ from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import HISTORY, Limits, Task, batch_stepper, bytes_per_trajectory, groups_of
+from .groups import OF_KICK, Limits, Task, batch_stepper, bytes_per_trajectory, groups_of
 
 # Indices of trajectories in a run; those of one job, for instance.
 Indices = Int[np.ndarray, " r"]
@@ -38,7 +38,7 @@ class Grid:
         self.shape = tuple(len(values) for values in axes.values())
         self.total = math.prod(self.shape)
         # Axes along which groups change.
-        self.across = [k for k, name in enumerate(axes) if name not in HISTORY and name not in self.states]
+        self.across = [k for k, name in enumerate(axes) if name not in OF_KICK and name not in self.states]
         self.group_count = math.prod(self.shape[k] for k in self.across)
 
     def columns(self, places: Indices | None = None) -> dict[str, np.ndarray]:
@@ -216,10 +216,10 @@ def plan_of(
     """The plan of a run of these trajectories, or of those at `places`; see `engine.run_to_verdict`."""
     states = trajectories.states
     followed = method if limits.energy else batch_stepper(method, scene)
-    of_group = trajectories.total / trajectories.group_count
-    each = bytes_per_trajectory(scene, of_group)
+    per_group = trajectories.total / trajectories.group_count
+    each = bytes_per_trajectory(scene, per_group)
     count = trajectories.total if places is None else len(places)
-    jobs = trajectories.jobs(places, largest_job_size(followed, each, of_group, count))
+    jobs = trajectories.jobs(places, largest_job_size(followed, each, per_group, count))
     counts, later = np.zeros(trajectories.group_count, np.int64), []
     for number, own in enumerate(jobs):
         groups, here = np.unique(trajectories.groups(own), return_counts=True)
@@ -233,8 +233,8 @@ def plan_of(
     task = Task(
         scene=jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, scene),
         method=followed,
-        names=tuple(name for name in trajectories.names if name not in HISTORY and name not in states),
-        history=tuple(name for name in trajectories.names if name in HISTORY),
+        names=tuple(name for name in trajectories.names if name not in OF_KICK and name not in states),
+        of_kick=tuple(name for name in trajectories.names if name in OF_KICK),
         states=states,
         limits=limits,
         # The same in all jobs, because matrix products of other shapes round differently. A trajectory in a row of its own
@@ -242,18 +242,18 @@ def plan_of(
         width=side_by_side if in_rows <= 4 * total else 1,
         many=total >= MANY,
         # To find an approach takes about as long as to follow so many trajectories to a cycle's neighbourhood.
-        from_afar=of_group >= 32,
+        from_afar=per_group >= 32,
     )
     waiting = set(later)
     first = [number for number in range(len(jobs)) if number not in waiting]
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def largest_job_size(method: AbstractStepper | Propagation, each: float, of_group: float, count: int) -> int:
+def largest_job_size(method: AbstractStepper | Propagation, each: float, per_group: float, count: int) -> int:
     """The most trajectories of a job, of so many in the run, if each takes `each` bytes and so many, on average, are of one
     group.
     """
     by_time = IN_A_JOB if isinstance(method, Propagation) else IN_A_LONG_JOB
     times = min(max(count // (JOBS * by_time), 1), TIMES_AS_LARGE)
     memory = 2.5e8  # of a job, bytes: trajectories in small groups take much
-    return max(1, min(by_time * times, int(memory // each), int(GROUPS_IN_A_JOB * of_group)))
+    return max(1, min(by_time * times, int(memory // each), int(GROUPS_IN_A_JOB * per_group)))

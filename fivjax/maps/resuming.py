@@ -46,10 +46,10 @@ def keeper_at(
     }
     if not is_store(path):
         return Checkpoint(path, run, grid.total, energy)
-    of_group = grid.total / grid.group_count
-    each = bytes_per_trajectory(scene, of_group)
+    per_group = grid.total / grid.group_count
+    each = bytes_per_trajectory(scene, per_group)
     # The chunks are those of a short run: a store that is resumed with more points, or fewer, finds the same ones.
-    tile = grid.tile(largest_job_size(method if energy else batch_stepper(method, scene), each, of_group, 1))
+    tile = grid.tile(largest_job_size(method if energy else batch_stepper(method, scene), each, per_group, 1))
     return Store(path, run, grid, tile, energy)
 
 

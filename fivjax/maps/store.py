@@ -30,7 +30,7 @@ from ..foundation.seals import Damaged, sealed, unsealed
 from ..foundation.whole_files import own_folder
 from ..io.files import check_writable, replace_whole
 from .checkpoint import refuse_other_run
-from .job_files import file_of, from_bytes, to_bytes
+from .job_files import attractors_from_bytes, attractors_to_bytes, file_of
 from .plan import Grid, Indices, Tiles
 from .results import Verdicts, by_name, not_run
 
@@ -75,7 +75,7 @@ class Store:
             for file in sorted((self.path / FOUND).glob("*.npz")):
                 # Without it, the job that found it is run again.
                 with contextlib.suppress(OSError, Damaged, ValueError):
-                    self.found[int(file.stem)] = from_bytes(unsealed(file.read_bytes()))
+                    self.found[int(file.stem)] = attractors_from_bytes(unsealed(file.read_bytes()))
         except BaseException:
             self._lock.close()
             raise
@@ -126,7 +126,7 @@ class Store:
         if found is not None:
             folder = self.path / FOUND
             folder.mkdir(exist_ok=True)
-            replace_whole(folder / f"{int(places[0])}.npz", sealed(to_bytes(found)))
+            replace_whole(folder / f"{int(places[0])}.npz", sealed(attractors_to_bytes(found)))
         fields = by_name(verdicts)
         parts = []
         for number, inside, rows in self.tiles.among(places):

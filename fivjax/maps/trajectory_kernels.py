@@ -26,20 +26,20 @@ class TaskConstants(eqx.Module):
 
     scene: Scene
     names: tuple[str, ...] = eqx.field(static=True)
-    history: tuple[str, ...] = eqx.field(static=True)
+    of_kick: tuple[str, ...] = eqx.field(static=True)
     states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
     method: AbstractStepper | Propagation = eqx.field(static=True)
     energy: bool = eqx.field(static=True)
 
     def setting(self, shared: GroupConstants, row) -> Setting:
         """That of a trajectory with these values of the parameters of the kick."""
-        scene = with_values(with_values(self.scene, self.names, shared.values), self.history, row)
+        scene = with_values(with_values(self.scene, self.names, shared.values), self.of_kick, row)
         return Setting(scene, self.method, shared)
 
 
 def _begin_one(args, instants):
     of_task, shared, row = args
-    scene, own = of_task.setting(shared, row).scene, row[len(of_task.history) :]
+    scene, own = of_task.setting(shared, row).scene, row[len(of_task.of_kick) :]
     for_kernel = isinstance(of_task.method, Propagation)
     return begin(scene, shared, of_task.states, own, energy=of_task.energy, for_kernel=for_kernel), ()
 
@@ -67,7 +67,7 @@ class TrajectoryKernels:
 
     def __init__(self, task: Task, shared: Flattened, pool: Executor):
         self.of_task = TaskConstants(
-            task.scene, task.names, task.history, tuple(task.states.values()), task.method, task.limits.energy
+            task.scene, task.names, task.of_kick, tuple(task.states.values()), task.method, task.limits.energy
         )
         # Without the matrices of `Propagation`, which have a kernel of their own.
         without = eqx.tree_at(lambda own: own.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)

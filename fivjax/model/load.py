@@ -124,7 +124,7 @@ class Pulse(AbstractLoad):
 
     The paper waits 40 s before the kick. Sliding equilibrium is an exact fixed point, so the wait changes nothing and
     the default `start` is 0. With `p` = 1, or `duration` = 0, there is no kick: see `ConstantLoad`. A derivative by `start` = 0
-    is that towards later kicks; by `duration` = 0 there is none.
+    is that towards later kicks; by `duration` = 0 none is worked out.
 
     **Arguments:** `force` in N, the factor `p` without unit, `duration` and `start` in s.
 

@@ -182,8 +182,7 @@ def scene_in_contact_coordinates(scene: Scene) -> Scene:
     structure = scene.structure
     if structure.contacts_at_coordinates:
         return scene
-    parts = (scene.friction, scene.belt_speed, scene.load, scene.restitution, scene.impact_law)
-    return Scene(in_contact_coordinates(structure), *parts)
+    return dataclasses.replace(scene, structure=in_contact_coordinates(structure))
 
 
 def _each_number(name: str, value, count: int, **bounds) -> None:

@@ -44,8 +44,9 @@ def slowest_period(structure: Structure) -> Float[Array, ""]:
 def longest_return(scene: Scene) -> Float[Array, ""]:
     r"""A time (s) within which any sustained motion crosses the section.
 
-    A hundred of the slowest natural periods, and twice the time for which a contact sticks on a slow belt, from one edge of the
-    friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness $k$ along the belt.
+    A hundred periods of the slowest coordinate, all others held, and twice the time for which a contact sticks on a slow belt,
+    from one edge of the friction cone to the other: $2 μ N / (k |v|)$ with the normal force of steady sliding and the stiffness
+    $k$ along the belt.
     """
     structure = scene.structure
     tangential, _ = contact_coordinates(structure)

@@ -28,9 +28,7 @@ class SectionKernels:
         self.form: Form | None = None
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
-        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
-        """
+        """As `return_maps.Kernels.returns`."""
         form, given = self._rows(group, y, status, direction, crossings, peaks)
         numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
         parts = [

@@ -15,7 +15,7 @@ def zero_on_section(
     size: int, tangential: int | Int[np.ndarray, " c"], normal: int | Int[np.ndarray, " c"], status
 ) -> Bool[np.ndarray, "... state"]:
     """Which entries of a state on the section are zero, in a structure of `size` coordinates, by the `status` `(..., *c)`: the
-    gaps of closed contacts and their rates; with one also its tangential velocity (with several, a sum of them is).
+    gaps of closed contacts and their rates; with one contact also its tangential velocity (with several, a weighted sum).
 
     They are to be exactly zero where a state is computed. A velocity just below zero, by rounding, would cross the section at
     once, as if a period had passed; a gap just above it would be open.
@@ -34,8 +34,8 @@ def section_row(size: int, tangential: int | Int[np.ndarray, " c"]) -> Float[np.
 
 
 def jumped_to(y, weights: Float[np.ndarray, " state"], section: Float[np.ndarray, " n"], tangential):
-    """Which states of the section (`(..., 2n)`) are those just after an impact that made the velocity jump over zero: there the
-    section does not hold it. Elsewhere it is zero, but for rounding.
+    """Which states of the section (`(..., 2n)`) are those just after an impact that made the velocity jump over zero: there it
+    need not be zero. Elsewhere it is, but for rounding.
     """
     n, rounding = len(section), 1e-9
     speed = weights[n + np.atleast_1d(tangential)].max() * abs(y[..., n:] @ section)

@@ -98,14 +98,18 @@ class Images(NamedTuple):
 class Kernels(Protocol):
     """Kernels that compute return maps, as `by_kernel.SectionKernels` does, perhaps without derivatives."""
 
-    def returns(self, group, y, status, direction, crossings, peaks: bool, kept: int): ...
+    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
+        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
+        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
+        """
+        ...
 
 
 class ReturnMaps:
     """The return maps of all groups.
 
-    `mechanics` (about sliding) and `longest_return` (s) have a leading axis over groups. `known_to` says how well latest
-    crossings of trajectories are known, relative to their size: they tell which to ask for attractors.
+    `mechanics` (about sliding) and `longest_return` (s) have a leading axis over groups. `known_to` is the relative
+    error of trajectories' latest crossings, by which those to ask for attractors are chosen.
     """
 
     def __init__(
@@ -119,7 +123,7 @@ class ReturnMaps:
     ):
         longest = np.asarray(longest_return)
         self.kernels, self.pool, self.known_to = kernels, pool, known_to
-        self.of_groups = mechanics, longest
+        self.shared = mechanics, longest
         self.structure = structure
         weights = np.asarray(structure.weights)
         # A coordinate that no spring holds has no weight of its own.
@@ -145,12 +149,12 @@ class ReturnMaps:
         return cls(scene.structure, mechanics, longest, section_kernels(scene, mechanics, longest, pool), pool)
 
     @cached_property
-    def mechanics(self) -> Flattened:
-        return flatten(self.of_groups)
+    def flattened(self) -> Flattened:
+        return flatten(self.shared)
 
     def in_contact(self, group, y: Float[np.ndarray, "m 2n"]) -> Section:
         """These deviations from sliding with the contact modes that their forces demand."""
-        own = jax.tree.map(lambda leaf: np.asarray(leaf)[group], self.of_groups[0])
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[group], self.shared[0])
         contact = _contacts_demanded(own, np.asarray(y, float))
         return Section(np.array(y, float), np.asarray(contact.status), np.asarray(contact.direction))
 
@@ -315,7 +319,7 @@ class ReturnMaps:
         return np.repeat(np.arange(len(each)), list(map(len, each))), np.concatenate(each)
 
     def _exactly(self, program, size: int, group, at: Section, crossings):
-        return in_blocks(program, self.mechanics, group, _rows(at, crossings), 1, self.pool, size=size).tree
+        return in_blocks(program, self.flattened, group, _rows(at, crossings), 1, self.pool, size=size).tree
 
 
 def _rows(at: Section, crossings) -> Flattened:

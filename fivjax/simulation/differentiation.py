@@ -101,10 +101,10 @@ def derivatives(
 
     - `functional`: a smooth function of a `Trajectory`, written with `jax.numpy`: a peak, an energy, a line of the spectrum.
       Sums of *accelerations* over saved instants have no derivative where these jump; use differences of velocities.
-      By the instant of a load's jump, velocities at a saved instant on which it falls have a derivative on either side only;
-      that towards later instants is given.
+      By the instant of a load's jump, a velocity saved at that very instant has one-sided derivatives only: the one towards
+      later jumps is given.
     - `wrt`: names of parameters, any of `scene.parameters`. For `start` = 0 the derivative is that towards later times, for
-      `restitution` = 0 that towards larger values. By `duration` = 0 there is none: give a short one, such as 1e-9 s.
+      `restitution` = 0 that towards larger values. By `duration` = 0 none is worked out: give a short one, such as 1e-9 s.
     - `t1`, `dt_save`, `y0`, `method`: as in `simulate`. With `WhereSwitched` the derivatives are those of its steps, which
       are wrong after contact events.
     - `mode`: "forward" (faster up to some ten parameters) or "reverse" (keeps only the saved states in memory).

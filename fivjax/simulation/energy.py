@@ -268,6 +268,19 @@ def enter(
     return eqx.tree_at(lambda ledger: ledger.worst, entered, jnp.maximum(ledger.worst, open_))
 
 
+def entered(
+    energy_data: EnergyData | None,
+    method: AbstractStepper,
+    mechanics: Mechanics,
+    ledger: Ledger | None,
+    segment: Segment,
+) -> Ledger | None:
+    """The same where there is a ledger."""
+    if energy_data is None or ledger is None:
+        return None
+    return enter(energy_data, method, mechanics, ledger, segment)
+
+
 def _all(mechanics: Mechanics, each: Bool[Array, "*contacts"]) -> Bool[Array, ""]:
     return jnp.all(each) if mechanics.several else each
 

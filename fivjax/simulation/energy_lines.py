@@ -125,7 +125,7 @@ class Energy(eqx.Module):
             "energy_residual": self.residual,
             "stick_time": self.ledger.stick_time,
             "detach_time": self.ledger.detach_time,
-            **_by_contact("{}", {name: self.ledger.by_contact[name] for name in self.ledger.by_contact}),
+            **_by_contact("{}", self.ledger.by_contact),
         }
 
 

@@ -88,12 +88,12 @@ def _followed(args, instants, method: EventExact):
         q, _ = steady_sliding(scene, scene.load.force)
         y0 = jnp.concatenate([q, jnp.zeros_like(q)])
     mechanics = Mechanics(scene)
-    accounts_of = EnergyData(scene) if how.energy else None
-    begin = _first_step(scene, mechanics, y0, method, accounts_of)
+    energy_data = EnergyData(scene) if how.energy else None
+    begin = _first_step(scene, mechanics, y0, method, energy_data)
     none = jnp.zeros((), bool)
 
     def step(now: Step) -> Step:
-        return _next_step(scene, mechanics, method, accounts_of, now)
+        return _next_step(scene, mechanics, method, energy_data, now)
 
     def to_row(carry, instant):
         now, lost, ending = carry
@@ -102,7 +102,7 @@ def _followed(args, instants, method: EventExact):
             return (now.end < instant) & (now.count < most)
 
         now = jax.lax.while_loop(going, step, now)
-        y, ledger = _at(mechanics, method, accounts_of, now, instant)
+        y, ledger = _at(mechanics, method, energy_data, now, instant)
         finite = jnp.all(jnp.isfinite(y))
         # Too few steps, or a step of no length: the series does not reach the row.
         short = now.end < instant
@@ -127,7 +127,7 @@ def _followed(args, instants, method: EventExact):
         # A row at a jump of the load shows the load and the contact just after it.
         on_jump = jnp.any(instant == scene.load.jumps) & (instant > instants_begin)
         contact = contact_after_jump(mechanics, now.contact, load, y, on_jump)
-        row = row_of(mechanics, accounts_of, contact, load, y, ledger, lost)
+        row = row_of(mechanics, energy_data, contact, load, y, ledger, lost)
         now = now._replace(highest=highest, count=jnp.zeros_like(now.count), events=jnp.zeros_like(now.events))
         return (now, lost, ending), row
 
@@ -138,17 +138,17 @@ def _followed(args, instants, method: EventExact):
 
 
 def _first_step(
-    scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, accounts_of: EnergyData | None
+    scene: Scene, mechanics: Mechanics, y0: State, method: EventExact, energy_data: EnergyData | None
 ) -> Step:
     """A step of no length at the start."""
     none, no = jnp.zeros((), y0.dtype), jnp.zeros((), jnp.int32)
     load = load_from(scene.load, none)
     contact = physics.status_from_forces(mechanics, load, y0)
-    ledger = None if accounts_of is None else accounts.open_ledger(accounts_of, y0)
+    ledger = None if energy_data is None else accounts.open_ledger(energy_data, y0)
     series = jnp.zeros((method.order_ + 1, y0.shape[0]), y0.dtype).at[0].set(y0)
 
     def enter(ledger, segment: Segment):
-        return None if accounts_of is None else accounts.enter(accounts_of, method, mechanics, ledger, segment)
+        return accounts.entered(energy_data, method, mechanics, ledger, segment)
 
     start = StartOfRun(none, physics.stuck(mechanics, contact, y0), ledger)
     if method.for_deviations:
@@ -172,16 +172,14 @@ def _first_step(
     return depending_on((scene, method), begin)
 
 
-def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_of, now: Step) -> Step:
+def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, energy_data, now: Step) -> Step:
     t, y, contact = now.end, now.y_end, now.contact_end
     until = next_jump(scene.load, t)
     load = load_from(scene.load, t)
     part, is_last = next_part(until - t, method.dt)
     # The ledger counts crossings of the section.
-    after, states, unit = method.with_series(mechanics, contact, load, y, part, accounts_of is not None)
-    ledger = None
-    if accounts_of is not None:
-        ledger = accounts.enter(accounts_of, method, mechanics, now.ledger_end, Segment(t, load, contact, y, after))
+    after, states, unit = method.with_series(mechanics, contact, load, y, part, energy_data is not None)
+    ledger = accounts.entered(energy_data, method, mechanics, now.ledger_end, Segment(t, load, contact, y, after))
     return Step(
         t=t,
         y=y,
@@ -200,13 +198,13 @@ def _next_step(scene: Scene, mechanics: Mechanics, method: EventExact, accounts_
     )
 
 
-def _at(mechanics: Mechanics, method: EventExact, accounts_of, now: Step, instant) -> tuple[State, Ledger | None]:
+def _at(mechanics: Mechanics, method: EventExact, energy_data, now: Step, instant) -> tuple[State, Ledger | None]:
     """The state and the ledger within a step."""
     y, _ = value_and_rate(now.series, now.unit, instant - now.t)
     y = physics.on_constraint(mechanics, now.contact, y)
-    if accounts_of is None:
+    if energy_data is None:
         return y, None
     none = jnp.zeros((*now.contact.status.shape, 2), bool)
     after = advance_between(now.y, y, none, y, now.contact, instant - now.t, mechanics)
     segment = Segment(now.t, now.load, now.contact, now.y, after)
-    return y, accounts.enter(accounts_of, method, mechanics, now.ledger, segment)
+    return y, accounts.enter(energy_data, method, mechanics, now.ledger, segment)

@@ -204,7 +204,7 @@ def states_at(
     ends = _ends(scene, instants)
 
     def enter(ledger, segment: Segment):
-        return ledger if energy_data is None else accounts.enter(energy_data, method, mechanics, ledger, segment)
+        return accounts.entered(energy_data, method, mechanics, ledger, segment)
 
     def to_next(carry, end):
         t, y, contact, ledger = carry

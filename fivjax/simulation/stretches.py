@@ -55,7 +55,7 @@ def _advances(begin: Begin, method: AbstractStepper, most: int | Array, derivati
         method = for_derivatives(method)
 
     def enter(ledger, segment: Segment):
-        return None if energy_data is None else accounts.enter(energy_data, method, mechanics, ledger, segment)
+        return accounts.entered(energy_data, method, mechanics, ledger, segment)
 
     after = follow(
         method,

@@ -47,15 +47,6 @@ def nothing(total: Total, segment: Segment) -> Total:
     return total
 
 
-def advanced(
-    stepper: AbstractStepper, mechanics: Mechanics, contact: Contact, load, y: State, left, at_section: bool = False
-) -> tuple[Advance, Float[Array, ""]]:
-    """The next advance of a motion for which so much time is `left` (s), and how much is left after it."""
-    part, is_last = next_part(left, stepper.dt)
-    after = stepper.advance(mechanics, contact, load, y, part, at_section)
-    return after, left_after(after, left, is_last)
-
-
 def next_part(left: Float[Array, ""], dt) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """The longest that the next advance may take of the time that is left: one of equal parts of at most `dt`; and whether that
     is all of it.
@@ -102,9 +93,10 @@ def follow(
 
     def body(carry):
         y, contact, left, total = carry
-        after, still = advanced(stepper, mechanics, contact, load, y, left, at_section)
+        part, is_last = next_part(left, stepper.dt)
+        after = stepper.advance(mechanics, contact, load, y, part, at_section)
         total = observe(total, Segment(h - left, load, contact, y, after))
-        return after.y, after.contact, still, total
+        return after.y, after.contact, left_after(after, left, is_last), total
 
     def going(carry):
         _, _, left, total = carry

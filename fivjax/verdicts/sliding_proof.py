@@ -39,9 +39,6 @@ class SlidingModes(eqx.Module):
     slip: Complex[Array | np.ndarray, "*groups_contacts k"]
     remainder: Complex[Array | np.ndarray, "*groups_contacts k"]
     envelope: "Envelope"
-    slowest_decay: Float[
-        Array | np.ndarray, "*groups"
-    ]  # of the structure on a belt without friction, 1/s; negative where it grows
     slowest_period: Float[Array | np.ndarray, "*groups"]  # of the sliding motion, s
     stable: Bool[Array | np.ndarray, "*groups"]
 
@@ -93,7 +90,6 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
         slip=_of_modes(linear.slip, from_modal),
         remainder=_in_modes(np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
-        slowest_decay=_slowest_decay(linear.frictionless),
         slowest_period=_slowest_period(eigenvalues),
         stable=regular & np.all(eigenvalues.real < 0, axis=-1),
     )
@@ -111,11 +107,6 @@ def _in_modes(
 ) -> Complex[np.ndarray, "groups *contacts k"]:
     """These directions of the state in modal coordinates."""
     return np.einsum("gkm,g...m->g...k", to_modal, columns)
-
-
-def _slowest_decay(matrix: np.ndarray) -> np.ndarray:
-    finite = np.all(np.isfinite(matrix), axis=(-2, -1))
-    return np.where(finite, -np.max(np.linalg.eigvals(np.where(finite[:, None, None], matrix, 0)).real, axis=-1), 0.0)
 
 
 def _slowest_period(eigenvalues: np.ndarray) -> np.ndarray:
@@ -191,7 +182,7 @@ def _where_known(known: Bool[Array, ""], used: Float[Array, ""]) -> Float[Array,
 
 
 def _parts(shares, modal: Pair, margin: Float[Array, "*contacts"]) -> list[tuple[Pair, Float[Array, ""]]]:
-    """Of each contact the parts of the modes in a quantity with these shares, and how far it may fall."""
+    """For each contact: the modes' parts in a quantity with these shares, and how far it may fall."""
     parts = complex_pairs.times(shares, modal)
     return [(parts, margin)] if margin.ndim == 0 else [(parts[i], margin[i]) for i in range(len(margin))]
 

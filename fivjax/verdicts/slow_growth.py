@@ -31,7 +31,7 @@ def slide_while_certain(
     parts = [complex_pairs.times(shares, modal) for shares in (modes.pressing, modes.slip)]
     sizes = jnp.stack([jnp.sum(complex_pairs.size(part)) for part in parts])
     margins = jnp.stack([linear.pressing_margin, linear.slip_margin])
-    # The share of the time for which sliding is certain that is used, because rounding must not lead past an event.
+    # Only this share of the time for which sliding is certain is used: rounding must not lead past an event.
     used = 0.999
     time = used * jnp.min(jnp.log(margins / sizes)) / growth
     frequency = jnp.max(jnp.where(modes.eigenvalues.real >= growth, modes.eigenvalues.imag, 0.0))

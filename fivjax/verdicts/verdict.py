@@ -1,4 +1,4 @@
-"""Verdicts on trajectories: proved, undecided, or failed and why (the proofs are in the other modules here)."""
+"""Verdicts on trajectories: proved, undecided, or failed and why. The proofs are beside this module, and in `attractors`."""
 
 import enum
 

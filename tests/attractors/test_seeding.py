@@ -38,7 +38,7 @@ def test_what_is_continued_is_what_releases_find(paper_scene, monkeypatch, speed
     by_releases = search._by_releases
 
     def counting(catalogue, equilibrium, groups):
-        searched.extend(MUS[np.searchsorted(MUS, catalogue.maps.of_groups[0].friction.mu[groups])])
+        searched.extend(MUS[np.searchsorted(MUS, catalogue.maps.shared[0].friction.mu[groups])])
         by_releases(catalogue, equilibrium, groups)
 
     monkeypatch.setattr(search, "_by_releases", counting)

@@ -14,7 +14,7 @@ from fivjax.attractors.neighbourhood import Neighbourhood
 from fivjax.attractors.tori import Torus
 from fivjax.attractors.tube import Tube
 from fivjax.maps import engine, plan
-from fivjax.maps.job_files import from_bytes, to_bytes
+from fivjax.maps.job_files import attractors_from_bytes, attractors_to_bytes
 from tests.helpers import stand_in_jobs
 
 AXES = {"mu": np.linspace(0.1, 0.2, 6), "p": np.linspace(1.0, 3.0, 7)}
@@ -147,7 +147,7 @@ def test_attractors_come_back_from_a_file_bit_for_bit():
         b"one": Attractors([cycle, other], [], [Approach(other, Tube(rng.normal(size=(5, 6)), 0.04))]),
         b"two": Attractors([], [Torus(Tube(rng.normal(size=(9, 6)), radius), 2.0, 0.3) for radius in (0.04, 0.01)], []),
     }
-    again = from_bytes(to_bytes(found))
+    again = attractors_from_bytes(attractors_to_bytes(found))
     assert list(again) == list(found)
     assert not again[b"one"].tori and not again[b"two"].cycles
     for mine, theirs in zip(again[b"two"].tori, found[b"two"].tori, strict=True):
