@@ -79,7 +79,7 @@ class Capture:
 
     def go_on(self, earlier: JobState) -> None:
         """Go on from that state."""
-        self.known, self.known_at_last = dict(earlier.parameters), dict(earlier.at_last)
+        self.known, self.known_at_last = dict(earlier.known), dict(earlier.at_last)
         self.settled_by = earlier.settled_by
         if self.known:
             self.maps = self._return_maps()

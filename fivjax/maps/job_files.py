@@ -88,10 +88,10 @@ class JobState(NamedTuple):
     verdicts: Verdicts  # of all trajectories of the job
     pending: np.ndarray  # trajectories without a verdict, as indices
     numbers: np.ndarray  # their states, see `Flattened`
-    known: dict[bytes, Attractors]  # what searches have found, by the group's parameters
+    searched: dict[bytes, Attractors]  # what searches have found, by the group's parameters
     settled_by: np.ndarray  # time that the known cycles of each group take to attract, s
     # The same with what trajectories have found on their way, by the group's number; and when their time was over.
-    of_groups: dict[int, Attractors]
+    known: dict[int, Attractors]
     at_last: dict[int, Attractors]
 
 
@@ -146,8 +146,8 @@ def state_to_bytes(now: JobState, key: str) -> bytes:
     """The state as bytes (NumPy's npz, without pickles)."""
     head = {"key": key, "done": now.done, "own_from": now.own_from}
     attractors = {
-        "known": attractors_to_bytes(now.known),
-        "of_groups": attractors_to_bytes({str(g).encode(): one for g, one in now.of_groups.items()}),
+        "known": attractors_to_bytes(now.searched),
+        "of_groups": attractors_to_bytes({str(g).encode(): one for g, one in now.known.items()}),
         "at_last": attractors_to_bytes({str(g).encode(): one for g, one in now.at_last.items()}),
     }
     arrays = {f"result.{name}": values for name, values in by_name(now.verdicts).items()}
@@ -167,7 +167,7 @@ def state_from_bytes(content: bytes, key: str) -> JobState | None:
         arrays = {name: file[name] for name in file.files}
     results = {name.removeprefix("result."): arrays[name] for name in arrays if name.startswith("result.")}
     parts = {name: results.pop(name) for name in Verdicts._fields if name != "energy"}
-    known, of_groups, at_last = (
+    searched, known, at_last = (
         attractors_from_bytes(arrays[name].tobytes()) for name in ("known", "of_groups", "at_last")
     )
     return JobState(
@@ -177,8 +177,8 @@ def state_from_bytes(content: bytes, key: str) -> JobState | None:
         pending=arrays["pending"],
         numbers=arrays["numbers"],
         settled_by=arrays["settled_by"],
-        known=known,
-        of_groups={int(g): one for g, one in of_groups.items()},
+        searched=searched,
+        known={int(g): one for g, one in known.items()},
         at_last={int(g): one for g, one in at_last.items()},
     )
 

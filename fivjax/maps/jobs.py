@@ -109,7 +109,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
         done, own_from, pending = earlier.done, earlier.own_from, earlier.pending
         trajectories = Flattened(earlier.numbers, trajectories.form)
         capture.go_on(earlier)
-        known.update(earlier.known)
+        known.update(earlier.searched)
         for whole, part in zip(jax.tree.leaves(verdicts), jax.tree.leaves(earlier.verdicts), strict=True):
             whole[:] = part
         report(len(group) - len(pending))

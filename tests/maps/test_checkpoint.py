@@ -113,8 +113,8 @@ def test_the_state_of_a_job_comes_back_from_its_file_bit_for_bit(tmp_path):
         pending=np.array([1, 4]),
         numbers=rng.normal(size=(2, 7)),
         settled_by=rng.random(3),
-        known={b"group": Attractors.none()},
-        of_groups={2: Attractors.none()},
+        searched={b"group": Attractors.none()},
+        known={2: Attractors.none()},
         at_last={},
     )
     file = job_files.JobFile(*job_files.file_of(folder, {"of": 1}, np.arange(5)))
