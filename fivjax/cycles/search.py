@@ -109,12 +109,13 @@ def limit_cycle(scene: Scene, start=None, *, progress: bool | None = None) -> Li
 @in_own_coordinates
 @in_double_precision
 def limit_cycles(scene: Scene, starts: Sequence = (), *, progress: bool | None = None) -> list[LimitCycle]:
-    """All stable limit cycles that a search finds, the one with the largest amplitude first.
+    """All stable limit cycles that a search finds.
 
     Motions are released as in `limit_cycle`, at the end of pulses like the scene's own of several strengths, and from each of
     `starts` (states `(2n,)` in m and m/s, or trajectories). Several cycles may coexist; there may be others that no motion
-    reached, and tori that could not be computed.
-    `progress` as in `limit_cycle`.
+    reached, and tori that could not be computed. `progress` as in `limit_cycle`.
+
+    **Returns:** a list of `LimitCycle`, the one with the largest amplitude first; empty where all motions fade.
 
     **Raises:** `ValueError` for a scene without sliding equilibrium, or beyond Painlevé's limit.
 

@@ -90,7 +90,10 @@ def raise_critical_friction(
     - `target`: the friction that μ_crit shall reach; the design is the first that does. Unless given, μ_crit is raised as far
       as the steps go.
     - `tied`: parameters that follow from the others, as functions of the dictionary of all parameters.
+    - `direction`: as in `cea.critical_friction`.
     - `steps`, `rate`: number of steps, and the size of the first ones as a share of the bounds.
+
+    **Returns:** a `Design`: the structure, what was changed, and whether the target is reached.
 
     **Raises:** `ValueError` for unknown names, bounds that do not contain the structure's own value, and a structure without
     critical friction.
@@ -126,7 +129,12 @@ def lower_growth_rate(
     """Lower the largest growth rate over friction coefficients `mu` (a number or an array), as `raise_critical_friction` raises
     μ_crit.
 
-    Growth rates are in 1/s. `target` is the growth rate to stay below; -1 demands a decay of at least 1/s.
+    Growth rates are in 1/s. `target` is the growth rate to stay below; -1 demands a decay of at least 1/s. All other arguments
+    are those of `raise_critical_friction`.
+
+    **Returns:** a `Design`.
+
+    **Raises:** `ValueError` for unknown names, and bounds that do not contain the structure's own value.
 
     **Example:**
 

@@ -114,8 +114,8 @@ def search_critical_friction(
     Both find a crossing from stable to unstable, which need not be the first if there are several. `cea.critical_friction`
     checks all of them, by a third method.
 
-    **Arguments:** `start`, above 0; `highest`, the friction at which the search gives up; `direction` as in
-    `cea.critical_friction`.
+    **Arguments:** `structure`; `start`, above 0; `highest`, the friction at which the search gives up; `direction` as in
+    `cea.critical_friction`; `max_steps`, the most evaluations.
 
     **Returns:** a `Search`; its outcome is "found", "never unstable" (nothing up to `highest`), "always unstable" or
     "undecided" (out of steps).

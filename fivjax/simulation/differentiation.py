@@ -105,8 +105,8 @@ def derivatives(
       later jumps is given.
     - `wrt`: names of parameters, any of `scene.parameters`. For `start` = 0 the derivative is that towards later times, for
       `restitution` = 0 that towards larger values. By `duration` = 0 none is worked out: give a short one, such as 1e-9 s.
-    - `t1`, `dt_save`, `y0`, `method`: as in `simulate`. With `WhereSwitched` the derivatives are those of its steps, which
-      are wrong after contact events.
+    - `scene`, `t1`, `dt_save`, `y0`, `method`, `progress`: as in `simulate`. With `WhereSwitched` the derivatives are those of
+      its steps, which are wrong after contact events.
     - `mode`: "forward" (faster up to some ten parameters) or "reverse" (keeps only the saved states in memory).
     - `margin`: the relative distance from another sequence of events below which derivatives are said not to exist.
 
