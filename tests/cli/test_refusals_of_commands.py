@@ -215,7 +215,7 @@ def test_resuming_what_is_another_map(folder, capsys):
     (folder / "text.unfinished").write_text("notes")
     message = refused_on_the_command_line(capsys, ["map", "--out", "text", "--resume"])
     assert "is not a checkpoint" in message
-    checkpoint.keep(folder / "other.unfinished", {"fivjax": "0.0"}, {"verdict": np.zeros(4, np.int8)}, {})
+    checkpoint.write_checkpoint(folder / "other.unfinished", {"fivjax": "0.0"}, {"verdict": np.zeros(4, np.int8)}, {})
     with untouched(folder):
         assert "of another run" in refused_on_the_command_line(capsys, ["map", "--out", "other", "--resume"])
         assert "--resume" in refused_on_the_command_line(capsys, ["map", "--out", "other"])

@@ -33,7 +33,7 @@ def main(folder: str, name: str, delay: str) -> int:
 
     checkpoint.KEEP_EVERY = 0.0  # as often as possible, so that many instants fall into a write
     plan.IN_A_JOB = 16
-    keep = checkpoint.keep
+    keep = checkpoint.write_checkpoint
     started = []
 
     def keep_and_arm(*args):
@@ -44,7 +44,7 @@ def main(folder: str, name: str, delay: str) -> int:
             started[0].start()
         return written
 
-    checkpoint.keep = keep_and_arm
+    checkpoint.write_checkpoint = keep_and_arm
     out = Path(folder) / "map"
     resume = ["--resume"] if out.with_suffix(".unfinished").exists() else []
     return cli.main(["map", *AXES, "--out", str(out), *resume])
