@@ -57,13 +57,11 @@ class SceneOptions:
         if self.belt_speed < 0:
             print(f"The belt moves against the tangential coordinate, at {-self.belt_speed:g} m/s.", file=sys.stderr)
         names = ("m1", "m2", "c1", "c2", "k1", "k2", "theta")
-        return fj.Scene(
-            fj.belt_oscillator(**{name: getattr(self, name) for name in names}),
-            self._friction(),
-            self.belt_speed,
-            fj.Pulse(self.force, self.p, self.duration, self.start),
-            restitution=self.restitution,
-        )
+        return self._around(fj.belt_oscillator(**{name: getattr(self, name) for name in names}))
+
+    def _around(self, structure: "fj.Structure") -> "Scene":
+        pulse = fj.Pulse(self.force, self.p, self.duration, self.start)
+        return fj.Scene(structure, self._friction(), self.belt_speed, pulse, restitution=self.restitution)
 
     def _friction(self):
         # The default friction coefficient, and the default decay factor of Eq. 1 (s/m).

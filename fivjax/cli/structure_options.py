@@ -63,13 +63,7 @@ class StructureOptions(SceneOptions):
                 "Option `--load` is missing: nothing presses the contacts together. Name where the load acts, such as "
                 "`--load 903:-z`."
             )
-        return fj.Scene(
-            self.reduced(),
-            self._friction(),
-            self.belt_speed,
-            fj.Pulse(self.force, self.p, self.duration, self.start),
-            restitution=self.restitution,
-        )
+        return self._around(self.reduced())
 
     def reduced(self) -> "Structure":
         """The structure of the files, reduced; what was found about it is printed.

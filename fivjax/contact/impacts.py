@@ -16,6 +16,7 @@ from .forces import (
 )
 from .mechanics import Mechanics
 from .mode import Contact, Status
+from .mode_forces import holding_forces
 from .several_contacts import impulses_of_impact
 
 
@@ -71,7 +72,7 @@ def _one(mechanics: Mechanics, y: State):
         tangential_impulse, normal_impulse = jnp.zeros_like(jump), jump / g_nn
     else:
         mu = mechanics.friction(jnp.abs(slip))
-        ending, ending_normal = _ending_slip(mechanics, slip, jump)
+        ending, ending_normal = holding_forces(mechanics, slip, -jump)
         direction = jnp.sign(ending)
         dragging_normal = jump / mechanics.normal_compliance(direction, mu)
         ends_slip = jnp.abs(ending) <= mu * ending_normal
@@ -79,13 +80,6 @@ def _one(mechanics: Mechanics, y: State):
         normal_impulse = jnp.where(ends_slip, ending_normal, dragging_normal)
     kick = mechanics.from_tangential * tangential_impulse + mechanics.from_normal * normal_impulse
     return y.at[n:].add(kick), ends_slip
-
-
-def _ending_slip(mechanics: Mechanics, slip, jump):
-    """The tangential and the normal impulse that end the slip (m/s) and change the gap's rate by `jump` (m/s)."""
-    g_tt, g_tn, g_nn = mechanics.compliance
-    determinant = g_tt * g_nn - g_tn**2
-    return (-g_nn * slip - g_tn * jump) / determinant, (g_tn * slip + g_tt * jump) / determinant
 
 
 def after_brief_flights(mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State) -> Float[Array, " n"]:
@@ -112,14 +106,14 @@ def after_brief_flights(mechanics: Mechanics, contact: Contact, load: Float[Arra
         # After an impact that ended the slip, it is what the flight leaves: without contact forces.
         along = acceleration(mechanics, contact, load, y)[mechanics.tangential]
         left = (along - g_tt * tangential_force - g_tn * normal_force) * flight
-        ending, ending_normal = _ending_slip(mechanics, left, jump)
+        ending, ending_normal = holding_forces(mechanics, left, -jump)
         ends_slip = (slip == 0) & (jnp.abs(ending) <= mu * ending_normal)
         dragging = jump / mechanics.normal_compliance(contact.direction, mu)
         tangential = jnp.where(ends_slip, ending, contact.direction * mu * dragging)
         normal = jnp.where(ends_slip, ending_normal, dragging)
     tangential, normal = tangential - tangential_force * flight, normal - normal_force * flight
     # A contact that sticks is held: whatever the impulses in between, they add up to none.
-    held, held_normal = _ending_slip(mechanics, jnp.zeros_like(flight), -jnp.ones_like(flight))
+    held, held_normal = holding_forces(mechanics, jnp.zeros_like(flight), jnp.ones_like(flight))
     sticks = contact.status == Status.STICK
     tangential, normal = jnp.where(sticks, held, tangential), jnp.where(sticks, held_normal, normal)
     return spread(mechanics.from_tangential, tangential) + spread(mechanics.from_normal, normal)

@@ -122,10 +122,14 @@ class _OneContact(eqx.Module):
 
 def sticking_forces(mechanics: Mechanics, free: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(T, N) in N, added to those at rest, that make a single contact stick."""
+    return holding_forces(mechanics, free[mechanics.tangential], free[mechanics.normal])
+
+
+def holding_forces(mechanics: Mechanics, along, apart) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(T, N) that make up for these accelerations of a single contact; or the impulses, for changes of its velocity."""
     g_tt, g_tn, g_nn = mechanics.compliance
-    free_t, free_n = free[mechanics.tangential], free[mechanics.normal]
     determinant = g_tt * g_nn - g_tn**2
-    return (g_tn * free_n - g_nn * free_t) / determinant, (g_tn * free_t - g_tt * free_n) / determinant
+    return (g_tn * apart - g_nn * along) / determinant, (g_tn * along - g_tt * apart) / determinant
 
 
 def by_status(contact: Contact, *, stick, slide, detach):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision, is_known, real
 from ..model.structure import Structure
-from .gradients import significant_growth
+from .gradients import in_natural_units, significant_growth
 from .linearisation import linear_sliding, time_scale
 from .outcomes import StabilityOutcome
 from .routh_hurwitz import margin
@@ -166,9 +166,4 @@ def _search(structure, start, route, highest, direction, max_steps):
 
 
 def _in_natural_units(structure, mu, direction):
-    """The state matrix for time in units of 1/ω₀ and displacements times ω₀."""
-    scale = time_scale(structure)
-    matrix = linear_sliding(as_scene(structure, mu, direction)).matrix
-    half = matrix.shape[0] // 2
-    units = jnp.concatenate([jnp.full(half, scale), jnp.ones(half)])
-    return matrix * (units[:, None] / units[None, :]) / scale
+    return in_natural_units(linear_sliding(as_scene(structure, mu, direction)).matrix, time_scale(structure))

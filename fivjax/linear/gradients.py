@@ -10,10 +10,17 @@ from ..foundation.matrix_routines import eigenvectors
 from ..foundation.precision import in_double_precision
 
 
+def in_natural_units(matrix: Float[Array, "n n"], scale) -> Float[Array, "n n"]:
+    """A state matrix for time in units of 1 / `scale` (s), and displacements times it."""
+    half = matrix.shape[0] // 2
+    units = jnp.concatenate([jnp.full(half, scale), jnp.ones(half)])
+    return matrix * (units[:, None] / units[None, :]) / scale
+
+
 def significant_growth(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """The largest real part of the eigenvalues, less its possible rounding error: an undamped mode must not seem to grow.
 
-    The matrix is in units where displacements, velocities and frequencies are of order one. Differentiable.
+    The matrix is `in_natural_units`, so that displacements, velocities and frequencies are of order one. Differentiable.
     """
     usable = jnp.all(jnp.isfinite(matrix))
     matrix = jnp.where(usable, matrix, 0.0)

@@ -21,7 +21,7 @@ from ..model.friction import slope_of
 from ..model.scene import Scene, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding, sliding_matrices, sliding_rows
 from ..model.structure import Structure
-from .gradients import significant_growth
+from .gradients import in_natural_units, significant_growth
 from .linearisation import linear_sliding, state_matrix, time_scale_of
 from .outcomes import ALWAYS, COALESCENCE, DIVERGENCE, FLUTTER, NEVER
 
@@ -74,12 +74,8 @@ def sliding_state_matrix(
 
 
 def _growth(structure: Structure, mu, direction) -> Float[Array, ""]:
-    # In units of the structure's own frequencies, as `significant_growth` needs it.
     matrix = sliding_state_matrix(structure, direction * mu, jnp.zeros_like(direction))
-    scale = time_scale_of(structure, slice(None))
-    half = matrix.shape[0] // 2
-    units = jnp.concatenate([jnp.ones(half), jnp.full(half, scale)])
-    return significant_growth(matrix * units / units[:, None] / scale)
+    return significant_growth(in_natural_units(matrix, time_scale_of(structure, slice(None))))
 
 
 def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
