@@ -22,11 +22,11 @@ from ..foundation.kept_programs import kept
 from ..section.return_maps import BLOCK, Section, of_block
 from ..simulation.ending import UNBOUNDED_FROM
 from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
-from .groups import GroupConstants, Task, constants_of, with_values
+from .groups import GroupConstants, Task, constants_of
 from .matrix_kernels import MatrixKernels, begin_building
 from .one_trajectory import (
     Progress,
-    Setting,
+    TaskConstants,
     conclude,
     with_step,
 )
@@ -66,9 +66,7 @@ def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndar
         return batch.kernels.begin(group, columns)
 
     def function(*block):
-        return _begin_block(
-            task.scene, task.names, task.of_kick, tuple(task.states.values()), task.limits.energy, *block
-        )
+        return _begin_block(TaskConstants.of(task), *block)
 
     return in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
 
@@ -82,7 +80,7 @@ def advance_all(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flatte
     follow_block = _follow_block_of_many if task.many else _follow_block
 
     def function(*block):
-        return follow_block(task.scene, task.method, task.names, task.of_kick, np.int32(steps), *block)
+        return follow_block(TaskConstants.of(task), np.int32(steps), *block)
 
     in_blocks(function, batch.shared, group, trajectories, task.width, batch.pool, in_place=True, size=batch.block)
 
@@ -134,12 +132,11 @@ def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
 
 
 @kept
-def _begin_block(scene, names, of_kick, states, energy: bool, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _begin_block(of_task: TaskConstants, shared: Flattened, trajectories: Flattened) -> Flattened:
     def group(shared, columns):
-        own = with_values(scene, names, shared.values)
-
         def one(row):
-            return begin_one(with_values(own, of_kick, row), shared, states, row[len(of_kick) :], energy=energy)
+            own = row[len(of_task.of_kick) :]
+            return begin_one(of_task.setting(shared, row).scene, shared, of_task.states, own, energy=of_task.energy)
 
         return jax.vmap(one)(columns)
 
@@ -147,9 +144,9 @@ def _begin_block(scene, names, of_kick, states, energy: bool, shared: Flattened,
     return flatten((columns, jax.vmap(group)(shared.tree, columns)), row_axes=2)
 
 
-def _follow_rows(scene, method, names, of_kick, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
+def _follow_rows(of_task: TaskConstants, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
     columns, begun = trajectories.tree
-    of_all = functools.partial(_of_all, scene, method, names, of_kick, shared.tree, columns)
+    of_all = functools.partial(_of_all, of_task, shared.tree, columns)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
     a_step, concluded = map(of_all, (with_step, conclude))
@@ -160,16 +157,10 @@ def _follow_rows(scene, method, names, of_kick, steps, shared: Flattened, trajec
 _follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
-def _of_all(scene, method, names, of_kick, everything: GroupConstants, columns, function):
+def _of_all(of_task: TaskConstants, everything: GroupConstants, columns, function):
     """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
 
     def of_group(shared, columns, *own):
-        scene_of_group = with_values(scene, names, shared.values)
-
-        def of_one(row, *own):
-            setting = Setting(with_values(scene_of_group, of_kick, row), method, shared)
-            return function(setting, *own)
-
-        return jax.vmap(of_one)(columns, *own)
+        return jax.vmap(lambda row, *own: function(of_task.setting(shared, row), *own))(columns, *own)
 
     return lambda *own: jax.vmap(of_group)(everything, columns, *own)

@@ -24,7 +24,7 @@ from ..verdicts.sliding_proof import margin_share_bound
 from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
-from .groups import GroupConstants
+from .groups import GroupConstants, Task, with_values
 
 
 class Progress(eqx.Module):
@@ -53,6 +53,27 @@ class Setting(eqx.Module):
     scene: Scene
     method: AbstractStepper | Propagation
     shared: GroupConstants
+
+
+class TaskConstants(eqx.Module):
+    """What is the same for all trajectories of a run."""
+
+    scene: Scene
+    names: tuple[str, ...] = eqx.field(static=True)
+    of_kick: tuple[str, ...] = eqx.field(static=True)
+    states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
+    method: AbstractStepper | Propagation = eqx.field(static=True)
+    energy: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, task: Task) -> "TaskConstants":
+        states = tuple(task.states.values())
+        return cls(task.scene, task.names, task.of_kick, states, task.method, task.limits.energy)
+
+    def setting(self, shared: GroupConstants, row) -> Setting:
+        """That of a trajectory with these values of the parameters of the kick."""
+        scene = with_values(with_values(self.scene, self.names, shared.values), self.of_kick, row)
+        return Setting(scene, self.method, shared)
 
 
 class EnergyRecord(eqx.Module):

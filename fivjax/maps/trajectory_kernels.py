@@ -13,28 +13,10 @@ from ..foundation.complex_pairs import in_pairs
 from ..foundation.flattened import Flattened, flatten
 from ..kernels.functions import KernelFunction
 from ..kernels.kernel import Groups, kernel_of
-from ..model.scene import Scene
 from ..section.by_kernel import in_parts, numbers_in_rows
-from ..steppers.base import AbstractStepper
 from ..steppers.propagation import Propagation
-from .groups import GroupConstants, Task, with_values
-from .one_trajectory import Progress, Setting, begin, conclude, with_step
-
-
-class TaskConstants(eqx.Module):
-    """What is the same for all trajectories of a run."""
-
-    scene: Scene
-    names: tuple[str, ...] = eqx.field(static=True)
-    of_kick: tuple[str, ...] = eqx.field(static=True)
-    states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
-    method: AbstractStepper | Propagation = eqx.field(static=True)
-    energy: bool = eqx.field(static=True)
-
-    def setting(self, shared: GroupConstants, row) -> Setting:
-        """That of a trajectory with these values of the parameters of the kick."""
-        scene = with_values(with_values(self.scene, self.names, shared.values), self.of_kick, row)
-        return Setting(scene, self.method, shared)
+from .groups import Task
+from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
 
 
 def _begin_one(args, instants):
@@ -66,9 +48,7 @@ class TrajectoryKernels:
     """The kernels for a batch, with the data of its groups."""
 
     def __init__(self, task: Task, shared: Flattened, pool: Executor):
-        self.of_task = TaskConstants(
-            task.scene, task.names, task.of_kick, tuple(task.states.values()), task.method, task.limits.energy
-        )
+        self.of_task = TaskConstants.of(task)
         # Without the matrices of `Propagation`, which have a kernel of their own.
         without = eqx.tree_at(lambda own: own.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
         of_groups = in_pairs(jax.tree.map(np.asarray, without))

@@ -17,6 +17,7 @@ from fivjax.contact import Contact, Status
 from fivjax.foundation import linear_solve, matrix_factors, matrix_routines
 from fivjax.foundation.flattened import Flattened, flatten
 from fivjax.maps import following, groups
+from fivjax.maps.one_trajectory import TaskConstants
 from fivjax.steppers.event_exact import EventExact
 from tests.helpers.chains import chain
 
@@ -79,11 +80,13 @@ def test_a_batch_of_trajectories_has_no_lapack():
     columns = flatten(np.zeros((2, 1)))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 
+    of_task = TaskConstants(scene, names, ("p",), (), method, False)
+
     def begin(shared, rows):
-        return following._begin_block.__wrapped__(scene, names, ("p",), (), False, shared, rows)
+        return following._begin_block.__wrapped__(of_task, shared, rows)
 
     def follow(shared, rows):
-        return following._follow_rows(scene, method, names, ("p",), np.int32(4), shared, rows)
+        return following._follow_rows(of_task, np.int32(4), shared, rows)
 
     of_beginning, begun = of_program(begin, shared, rows)
     of_following, _ = of_program(follow, shared, begun)
