@@ -88,9 +88,9 @@ def _part(
     energy: bool,
 ) -> tuple[dict, Reached]:
     energy_data, at_start = EnergyData(scene) if energy else None, (begin.contact, begin.ledger)
-    y, contacts, ledgers = states_at(scene, method, begin.y, saved, most, energy_data, at_start=at_start)
-    found = _rows(scene, start, saved, y, contacts, ledgers, energy_data, begin.highest, begin.ended)
-    y, contact, ledger = jax.tree.map(lambda leaf: leaf[-1], (y, contacts, ledgers))
+    states = states_at(scene, method, begin.y, saved, most, energy_data, at_start=at_start)
+    found = _rows(scene, start, saved, states, energy_data, begin.highest, begin.ended)
+    y, contact, ledger = jax.tree.map(lambda leaf: leaf[-1], states)
     highest = jnp.maximum(begin.highest, jnp.max(jnp.abs(found["load"])))
     return found, Reached(y, contact, ledger, highest, ~jnp.all(jnp.isfinite(found["velocity"][-1])))
 
@@ -107,13 +107,14 @@ def rows_at(
 ) -> dict:
     """What a `Trajectory` has at its saved instants, by name; and from where on it has `grown` without bound."""
     energy_data = EnergyData(scene) if energy else None
-    y, contacts, ledgers = states_at(scene, method, y0, saved, most, energy_data, derivatives)
-    return _rows(scene, y0, saved, y, contacts, ledgers, energy_data)
+    return _rows(scene, y0, saved, states_at(scene, method, y0, saved, most, energy_data, derivatives), energy_data)
 
 
-def _rows(scene: Scene, start: State, saved, y, contacts, ledgers, energy_data, highest=0.0, ended=False) -> dict:
-    """The rows of a run; `highest` is the largest load (N) before them, and it may have `ended` before."""
-    mechanics = Mechanics(scene)
+def _rows(scene: Scene, start: State, saved, states, energy_data, highest=0.0, ended=False) -> dict:
+    """The rows of a run from what `states_at` gives; `highest` is the largest load (N) before them, and it may have `ended`
+    before.
+    """
+    mechanics, (y, contacts, ledgers) = Mechanics(scene), states
     load = jax.vmap(scene.load)(saved)
     # Rows after one that is not finite are not finite either, even where contact would set a value to zero.
     finite = jnp.logical_not(ended) & (jnp.cumprod(jnp.all(jnp.isfinite(y), axis=-1)) > 0)
