@@ -19,6 +19,7 @@ from ..attractors.long_run import fates
 from ..attractors.motions import Motions, far_apart
 from ..attractors.search import TOGETHER, search_groups
 from ..attractors.tori import TUBES, Torus
+from ..contact import Status
 from ..section.by_kernel import section_kernels
 from ..section.return_maps import INTERPOLATED, ROUNDED, ReturnMaps, Section
 from ..steppers.event_exact import EventExact
@@ -165,12 +166,13 @@ class Capture:
 
     def _may_be_captured(self, now: Progress, growing: bool = False) -> Bool[np.ndarray, " m"]:
         """Which trajectories may be on an attractor: they have crossed the section under their final load, and under constant
-        friction they have had events, because sliding alone has no attractor but its equilibrium. Those of several contacts may
-        still be `growing` towards their first event.
+        friction they have had events, or rebound, because sliding alone has no attractor but its equilibrium. Those of several
+        contacts may still be `growing` towards their first event.
         """
         scene, crossed = self.batch.task.scene, np.all(np.isfinite(now.crossing), axis=1)
         without_events = not scene.friction.constant or (growing and len(scene.structure.contacts) > 1)
-        return crossed if without_events else crossed & (now.events > 0)
+        slides = (np.array(now.contact.status) == Status.SLIDE).reshape(len(crossed), -1).all(axis=1)
+        return crossed if without_events else crossed & ((now.events > 0) | ~slides)
 
 
 def section_of(now: Progress) -> Section:

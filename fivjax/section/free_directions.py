@@ -56,14 +56,17 @@ def directions_of_several(
     tangential: Int[np.ndarray, " c"],
     normal: Int[np.ndarray, " c"],
     status: Int[np.ndarray, " c"],
+    without_slip: Bool[np.ndarray, " c"] | None = None,
 ) -> Float[np.ndarray, "state f"]:
     """With several contacts: orthonormal weighted directions that are free.
 
-    `section` has the weights of the velocities whose sum is zero on the section (`steppers.section`).
+    `section` has the weights of the velocities whose sum is zero on the section (`steppers.section`). Contacts `without_slip`
+    are those that stick, unless given.
     """
     n = len(section)
-    closed, sticking = normal[status != Status.DETACH], tangential[status == Status.STICK]
-    held = np.eye(2 * n)[np.concatenate([closed, n + closed, n + sticking])]
-    rows = np.concatenate([held, np.concatenate([np.zeros(n), section / weights[n:]])[None]])
+    closed = normal[status != Status.DETACH]
+    held = tangential[status == Status.STICK if without_slip is None else without_slip]
+    fixed = np.eye(2 * n)[np.concatenate([closed, n + closed, n + held])]
+    rows = np.concatenate([fixed, np.concatenate([np.zeros(n), section / weights[n:]])[None]])
     _, sizes, turned = np.linalg.svd(rows)
     return turned[np.sum(sizes > 1e-12 * sizes[0]) :].T

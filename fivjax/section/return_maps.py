@@ -135,6 +135,7 @@ class ReturnMaps:
         self.tangential, self.normal = contact_coordinates(self.structure)
         # The weighted size below which a motion of a group has faded.
         weights = np.atleast_1d(self.weights[self.structure.size + self.tangential])
+        self.belts = np.unique(np.asarray(mechanics.belt_speed))
         belts = np.abs(np.asarray(mechanics.belt_speed)).reshape(len(longest), -1)
         fastest = np.max(weights * belts, axis=1)
         self.faded = FADED * fastest
@@ -178,15 +179,20 @@ class ReturnMaps:
         if np.ndim(status):
             places = np.asarray(self.tangential), np.asarray(self.normal)
             section = np.zeros_like(self.section) if self.jumped(y[None])[0] else self.section
-            return directions_of_several(self.weights, section, *places, status)
+            held = (status == Status.STICK) | ((status == Status.SLIDE) & self._without_slip(y))
+            return directions_of_several(self.weights, section, *places, status, held)
         return np.eye(len(self.weights))[:, self._free(np.atleast_1d(status), y[None])[0]]
+
+    def _without_slip(self, y: Float[np.ndarray, "*m 2n"]) -> Bool[np.ndarray, "..."]:
+        """Which contacts have the velocity of a belt, to the bit: they stick, or an impact has ended their slip."""
+        return np.isin(y[..., self.structure.size + self.tangential], self.belts)
 
     def _free(self, status: Int[np.ndarray, " m"], y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, "m 2n"]:
         """With one contact: which coordinates are free at states of the section. An impact leaves the gap at zero, and its rate
-        where it does not rebound, but any velocity, unless the contact sticks.
+        where it does not rebound, but any velocity, unless it ends the slip.
         """
         free, jumped, n = self.free[status], self.jumped(y), self.structure.size
-        free[jumped & (status != Status.STICK), n + self.tangential] = True
+        free[jumped & ~self._without_slip(y), n + self.tangential] = True
         for place in (self.normal, n + self.normal):
             free[:, place] &= ~jumped | (y[:, place] != 0)
         return free

@@ -60,9 +60,9 @@ def motion_in_cpp(form: MechanicsForm) -> str:
     """The code of `Motion` with all that it refers to."""
     # Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
     short_terms, short_steps = 6, 2
-    # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the sample next to
-    # it.
-    rise_steps, lowest_steps, peak_steps = 12, 6, 5
+    # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the best of so many
+    # points.
+    rise_steps, lowest_steps, peak_steps, peak_looks = 12, 6, 5, 8
     like = form.mechanics(np.zeros(form.numbers))
     n, normal = like.free_load.shape[0], like.normal
     at = blocks_of(n)
@@ -90,6 +90,7 @@ def motion_in_cpp(form: MechanicsForm) -> str:
         "RISE_STEPS": rise_steps,
         "LOWEST_STEPS": lowest_steps,
         "PEAK_STEPS": peak_steps,
+        "PEAK_LOOKS": peak_looks,
         **BRACKET,
     }
     real = {

@@ -214,19 +214,33 @@ struct Motion {
         return x;
     }
 
-    // The largest size of a polynomial near x = 0, for x between `low` and `high`.
+    // The largest size of a polynomial near x = 0, for x between `low` and `high`: by Newton's method from the best of a few
+    // points, as long as its size is concave there.
     CUDA_CALLABLE static double highest_of(const double* c, double low, double high) {
-        double x = 0.0, slope, bend;
-        for (int k = 0; k < PEAK_STEPS; ++k) {
-            bent_at(c, x, &slope, &bend);
-            x = within(x - slope / (bend == 0.0 ? 1.0 : bend), low, high);
+        double x = 0.0, highest = wp::abs(c[0]), slope, bend;
+        for (int k = 0; k <= PEAK_LOOKS; ++k) {
+            const double there = low + (high - low) * k / PEAK_LOOKS, size = wp::abs(value_at(c, there, &slope));
+            if (size > highest) {
+                highest = size;
+                x = there;
+            }
         }
-        return most(wp::abs(c[0]), wp::abs(value_at(c, x, &slope)));
+        for (int k = 0; k < PEAK_STEPS; ++k) {
+            const double value = bent_at(c, x, &slope, &bend);
+            if (!(value * bend < 0.0)) break;
+            x = within(x - slope / bend, low, high);
+        }
+        return most(highest, wp::abs(value_at(c, x, &slope)));
     }
 
     // The series of a guard; its first coefficients, which are zero up to rounding, are exactly zero.
     CUDA_CALLABLE static void guard(const double* both, int which, int zeros, double* found) {
         for (int k = 0; k < ORDER + 1; ++k) found[k] = k < zeros ? 0.0 : both[2 * k + which];
+    }
+
+    // The same with its roots at zero divided out.
+    CUDA_CALLABLE static void rest_of_guard(const double* both, int which, int zeros, double* found) {
+        for (int k = 0; k < ORDER + 1; ++k) found[k] = k + zeros > ORDER ? 0.0 : both[2 * (k + zeros) + which];
     }
 
     // The series of the tangential velocity, in m per interval, from those of displacements.
@@ -298,8 +312,9 @@ struct Motion {
                 const bool dips = b[DIPS + q] > 0.0;
                 if (!crosses && !dips) continue;
                 double c[ORDER + 1], end = b[ENDS + q], guess = b[q], slope_there;
-                guard(both, q, (int)b[ZEROS + q], c);
                 if (dips) {
+                    // Roots at zero do not count: without them the guard is positive there.
+                    rest_of_guard(both, q, (int)b[ZEROS + q], c);
                     const double low = lowest_of(c, guess);
                     if (value_at(c, low, &slope_there) <= 0.0) {
                         crosses = true;
@@ -308,6 +323,7 @@ struct Motion {
                     }
                 }
                 if (crosses) {
+                    guard(both, q, (int)b[ZEROS + q], c);
                     root[q] = root_of(c, b[ZEROS + q], guess, end, &slope[q]);
                     same[q] = ROUNDING * (wp::abs(c[0]) + wp::abs(c[1]) + wp::abs(c[2]) + wp::abs(c[3]));
                 }
@@ -382,11 +398,11 @@ struct Motion {
             speeds[i + 1] = sum;
         }
         // A parabola through three samples rises by less than half of their second difference above the highest of them. So most
-        // advances have no higher peak than those before.
+        // advances have no higher peak than those before. One within the first interval has its third sample behind it.
         double highest = most(before, wp::abs(after.last));
         const int last = steps >= INTERVALS - 1 ? INTERVALS : steps > 0.0 ? (int)steps + 1 : 1;
         double rough = most(wp::abs(speeds[0]), wp::abs(speeds[last])), bend = 0.0;
-        for (int k = 1; k < last; ++k) {
+        for (int k = 1; k < last || k == 1; ++k) {
             rough = most(rough, wp::abs(speeds[k]));
             bend = most(bend, wp::abs(speeds[k + 1] - 2.0 * speeds[k] + speeds[k - 1]));
         }

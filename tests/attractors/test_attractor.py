@@ -589,6 +589,21 @@ def test_a_cycle_meets_the_section_by_an_impact_after_which_it_sticks(along):
     np.testing.assert_allclose(found.amplitude, 0.4727571, rtol=1e-6)
 
 
+def test_a_cycle_meets_the_section_by_an_impact_that_ends_the_slip_and_slides_back():
+    """Without slip, but sliding: the forces lie outside the cone. The velocity is not free there either."""
+    stiffness = np.array([[2.133, 1.27, 0.717], [1.27, 4.342, 1.269], [0.717, 1.269, 1.826]])
+    damping = 1e-3 * np.array([[4.0, 2.0, 1.0], [2.0, 8.0, 2.0], [1.0, 2.0, 4.0]])
+    structure = fj.Structure(
+        np.diag([1.084, 1.033, 1.425]), damping, stiffness, [0.097, -1.0, 0.186], tangential=0, normal=1
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.696, 0.896), 1.033, fj.Pulse(1.0, 2.0, duration=2.0))
+    cycle = fj.limit_cycle(scene)
+    assert cycle.state[3] == 1.033 and cycle.contact.status == Status.SLIDE and cycle.reach > 0.01
+    found = fj.bistability_map(scene, p=[0.4, 4.0], progress=False)
+    assert found.verdict.values.tolist() == [fj.Verdict.LIMIT_CYCLE] * 2
+    np.testing.assert_allclose(found.amplitude, 1.54866026, rtol=1e-7)
+
+
 @pytest.mark.slow
 def test_a_cycle_that_meets_the_section_by_an_impact_is_followed_to_neighbours(paper_scene):
     """Its period's derivative, against differences of cycles that are searched for."""

@@ -89,3 +89,29 @@ def test_the_basin_of_benchmark_a_ends_where_a_trajectory_first_sticks():
         for j, dx in enumerate(b["dx"].values):
             run = solve_ivp(rate, (0.0, 400.0), [x, dx], events=meets, rtol=1e-9, atol=1e-11)
             assert int(b["verdict"][i, j]) == (1 if run.t_events[0].size else 0), (x, dx)
+
+
+@pytest.mark.parametrize("along", [1.0, -1.0])
+def test_a_lane_that_only_rebounds_has_no_other_event_and_comes_to_the_cycle_of_the_others(along):
+    """A rebound was annulled where the section is crossed right after it, in one of the two orientations; and what never changes
+    its contact mode was not asked whether it is captured. An impact of the cycle ends the slip: its highest speed is the belt's.
+    """
+    mass = [[1.046, 0.102, -0.032, -0.021], [0.102, 1.548, -0.068, -0.253]]
+    mass = np.array([*mass, [-0.032, -0.068, 1.212, -0.254], [-0.021, -0.253, -0.254, 1.789]])
+    damping = [[0.107, 0.014, 0.033, 0.012], [0.014, 0.148, 0.044, 0.03]]
+    damping = np.array([*damping, [0.033, 0.044, 0.119, 0.025], [0.012, 0.03, 0.025, 0.058]])
+    stiffness = [[3.279, 0.443, 1.119, 0.402], [0.443, 4.501, 1.497, 1.073]]
+    stiffness = np.array([*stiffness, [1.119, 1.497, 3.633, 0.9], [0.402, 1.073, 0.9, 1.422]])
+    signs = np.diag([along, 1.0, along, along])
+    structure = fj.Structure(
+        *(signs @ matrix @ signs for matrix in (mass, damping, stiffness)),
+        signs @ [0.102, -1.0, -0.128, 0.143],
+        tangential=0,
+        normal=1,
+        coordinates=["x", "gap", "z", "w"],
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.701), along * 1.146, fj.ConstantLoad(1.0), restitution=0.6)
+    for dx, z in ((-1.4, -1.6), (-1.8, -2.5)):
+        found = fj.basins(scene, dx=[along * dx], z=[along * z], progress=False)
+        assert found.contact_events.item() == 0 and found.verdict.item() == fj.Verdict.LIMIT_CYCLE
+        assert found.amplitude.item() == pytest.approx(1.146, rel=1e-9)

@@ -284,3 +284,24 @@ def test_a_map_says_what_it_is_and_survives_the_disk(paper_scene, tmp_path):
     assert back["amplitude"].attrs["units"] == "m/s" and back["mu"].attrs["units"] == "1"
     assert json.loads(back.attrs["scene"])["parameters"]["k1"] == 100e3
     assert json.loads(back["verdict"].attrs["meaning"])["0"].startswith("returns to steady sliding")
+
+
+def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_interval():
+    """There samples on both sides are slower, and the next one is behind the landing: amplitudes were up to 1.5 % too low."""
+    stiffness = np.array(
+        [
+            [2.5124, -0.4562, 0.7596, -0.1493, -0.3498],
+            [-0.4562, 3.2511, -0.4368, -1.4908, -0.6862],
+            [0.7596, -0.4368, 2.903, -0.2065, -0.4706],
+            [-0.1493, -1.4908, -0.2065, 3.1446, 1.1064],
+            [-0.3498, -0.6862, -0.4706, 1.1064, 3.1263],
+        ]
+    )
+    damping = 0.00211 * stiffness
+    mass = np.diag([0.6633, 1.4456, 1.4452, 1.0874, 0.9404])
+    structure = fj.Structure(mass, damping, stiffness, [0.1186, -1.0, 0.1086, -0.1773, -0.2306], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.6396, 0.8096), 1.1298, fj.Pulse(1.0, 2.0, duration=2.0), restitution=0.24)
+    found = fj.bistability_map(scene, p=[2.0], progress=False)
+    run = fj.simulate(scene, 600.0, 0.01)
+    seen = np.abs(np.asarray(run.velocity)[-3000:, 0]).max()
+    assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.05 * scene.belt_speed
