@@ -304,4 +304,4 @@ def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_inter
     found = fj.bistability_map(scene, p=[2.0], progress=False)
     run = fj.simulate(scene, 600.0, 0.01)
     seen = np.abs(np.asarray(run.velocity)[-3000:, 0]).max()
-    assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.05 * scene.belt_speed
+    assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.2
