@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..contact import Status
 from ..section.return_maps import ReturnMaps, Section
 from .closing import Closed, close
 from .motions import Motions
@@ -171,13 +172,32 @@ def _passes(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], points: Float[np.ndar
 
 def _trial(maps: ReturnMaps, closed: Closed, row: int, recurrence: Recurrence) -> CycleTrial | None:
     y, status, direction = closed.at.rows(row)
-    found = cycle_trial(y, status, direction, closed.jacobian[row], maps.weights, maps.free_directions(status, y))
+    free = maps.free_directions(status, y)
+    found = cycle_trial(y, status, direction, closed.jacobian[row], maps.weights * _just_opened(maps, y, status), free)
     if found is None or closed.crossings[row] <= CROSSINGS:
         return found
     # A cycle of many crossings that captures only what is nearer than this lies on a torus that is locked weakly.
     smallest = found.smallest if recurrence.settled else 1e-3 / LARGEST * found.largest
     # Its points lie close together.
     return found._replace(smallest=smallest, largest=found.largest / 8)
+
+
+def _just_opened(maps: ReturnMaps, y: Float[np.ndarray, " 2n"], status) -> Float[np.ndarray, " 2n"]:
+    """Factors on the weights with which the gap counts, and its rate, at a state of one contact that has just lifted off: as
+    small as they are then, so they are in all motions nearby. An ellipsoid in which they were free would hold states below the
+    belt, however small it is.
+    """
+    factors = np.ones(len(y))
+    if np.ndim(status) or status != Status.DETACH:
+        return factors
+    places = np.array([0, len(y) // 2]) + maps.normal
+    weighted = maps.weights * np.abs(y)
+    size, (gap, rate) = np.linalg.norm(weighted), weighted[places]
+    if 0 < gap < 1e-3 * size and rate > 0:
+        # The time since then, in units of the weights: of a gap that opens with the third power of time.
+        since = min(3 * gap / rate, 1.0)
+        factors[places] = np.maximum(since * size / weighted[places], 1.0)
+    return factors
 
 
 def _return_map(maps: ReturnMaps, group, centre: Section, crossings):
