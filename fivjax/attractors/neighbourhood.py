@@ -13,8 +13,8 @@ radius of $A$ and one. The discrete Lyapunov equation
 $$ (A/γ)^T H (A/γ) - H = -I $$
 
 has a positive definite solution, and in the norm $|x|_H = \sqrt{x^T H x}$ the linear map contracts by $γ$ in one period. In the
-Euclidean norm it need not, even if the cycle is stable. (Where the contact has just lifted off, the gap and its rate have larger
-weights: they are small in all motions nearby.)
+Euclidean norm it need not, even if the cycle is stable. (Where the contact has just lifted off, the gap and its rate have
+larger weights: they are small in all motions nearby.)
 
 **Radius.** Within an ellipsoid $|x|_H ≤ r$ on which every motion passes through the same events, $P$ is analytic, and its
 difference from $A x$ is of second order. So $r$ is halved, from a share of the cycle's size, until at all points checked (on
