@@ -604,10 +604,9 @@ def test_a_cycle_meets_the_section_by_an_impact_that_ends_the_slip_and_slides_ba
     np.testing.assert_allclose(found.amplitude, 1.54866026, rtol=1e-7)
 
 
-@pytest.mark.parametrize("along", [1.0, -1.0])
-def test_a_cycle_meets_the_section_just_after_it_has_lifted_off(along):
-    """With x reversed, at the other zero of the velocity: the gap is 1.5e-8 m there, and any ellipsoid in which it was free held
-    states below the belt. The whole map was undecided.
+def test_a_cycle_meets_the_section_just_after_it_has_lifted_off():
+    """The gap is 1.5e-8 m there, and any ellipsoid in which it was free held states below the belt: the whole map was undecided.
+    With x reversed the section is met at the other zero of the velocity, and the amplitude is the same.
     """
     stiffness = np.array(
         [
@@ -617,7 +616,7 @@ def test_a_cycle_meets_the_section_just_after_it_has_lifted_off(along):
             [1.198496, -0.735473, -0.324058, 2.351614],
         ]
     )
-    signs, damping = np.diag([along, 1.0, along, along]), (0.003 * stiffness).round(6)
+    signs, damping = np.diag([-1.0, 1.0, -1.0, -1.0]), (0.003 * stiffness).round(6)
     structure = fj.Structure(
         np.diag([1.438256, 1.158562, 0.954517, 1.266869]),
         signs @ damping @ signs,
@@ -626,9 +625,9 @@ def test_a_cycle_meets_the_section_just_after_it_has_lifted_off(along):
         tangential=0,
         normal=1,
     )
-    scene = fj.Scene(structure, fj.Coulomb(0.7331), along * 0.6129, fj.Pulse(1.0, 2.0, duration=2.0))
+    scene = fj.Scene(structure, fj.Coulomb(0.7331), -0.6129, fj.Pulse(1.0, 2.0, duration=2.0))
     cycle = fj.limit_cycle(scene)
-    assert cycle.reach > 1e-4 and (along > 0 or 0 < cycle.state[1] < 1e-7)
+    assert cycle.reach > 1e-4 and 0 < cycle.state[1] < 1e-7
     found = fj.bistability_map(scene, p=[0.4, 2.5], progress=False)
     assert found.verdict.values.tolist() == [fj.Verdict.LIMIT_CYCLE] * 2
     np.testing.assert_allclose(found.amplitude, 0.66760532, rtol=1e-7)
