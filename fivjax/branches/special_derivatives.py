@@ -19,8 +19,9 @@ from .multiple_shooting import images
 from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
-# Relative change of a parameter for differences of multipliers.
-APART = 1e-6
+# Relative change of a parameter for differences of rates, and of multipliers: of cycles that Newton's method corrects only where
+# they are off by more than rounding.
+APART, APART_ON_CURVE = 1e-6, 1e-5
 
 
 def derivatives_of_special_points(
@@ -111,7 +112,7 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
     """
     curve, cycle = special.curve, special.cycle
     value = float(np.asarray(family.at(cycle.parameter).parameters[name]))
-    by = APART * (abs(value) if value else 1.0)
+    by = APART_ON_CURVE * (abs(value) if value else 1.0)
     tangent = curve.tangent(cycle, None)
     sizes = np.max(np.abs(own), axis=1)
     across = np.linalg.lstsq(own / sizes[:, None], -slope / sizes, rcond=None)[0]
@@ -130,6 +131,6 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
         with_other = (4 * size(0.0, by) - 3 * size(0.0, 0.0) - size(0.0, 2 * by)) / (2 * by)
     else:
         with_other = (size(0.0, by) - size(0.0, -by)) / (2 * by)
-    with_own = (size(APART, 0.0) - size(-APART, 0.0)) / (2 * APART)
+    with_own = (size(APART_ON_CURVE, 0.0) - size(-APART_ON_CURVE, 0.0)) / (2 * APART_ON_CURVE)
     change = across - with_other / with_own * tangent
     return float(change[-1] * curve.scales[-1])
