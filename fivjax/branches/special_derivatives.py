@@ -19,8 +19,8 @@ from .multiple_shooting import images
 from .pseudo_arclength import Curve, Family, assembled, multipliers_of
 from .special_points import MEETS_SLIDING, Special, critical_multiplier
 
-# Relative change of a parameter for differences of rates, and of multipliers: of cycles that Newton's method corrects only where
-# they are off by more than rounding.
+# Relative change of a parameter for differences of rates; and of multipliers, of cycles that Newton's method corrects only
+# where they are off by more than rounding.
 APART, APART_ON_CURVE = 1e-6, 1e-5
 
 
