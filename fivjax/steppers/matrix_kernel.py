@@ -26,7 +26,7 @@ from .window import bracketed, fastest, first_is_safe, leading
 # The matrices of structures with more degrees of freedom take megabytes for each scene, which are read in every step.
 MOST_COORDINATES = 24
 # What a vector of `window.Bracket` has of both guards: the guess of the root, then what begins at these places.
-BRACKET = {"ZEROS": 2, "ENDS": 4, "CROSSES": 6, "SPENT": 8, "DIPS": 10, "BRACKET": 12}
+BRACKET = {"ZEROS": 2, "ENDS": 4, "CROSSES": 6, "SPENT": 8, "BRACKET": 10}
 
 
 class MechanicsForm(NamedTuple):
@@ -62,7 +62,7 @@ def motion_in_cpp(form: MechanicsForm) -> str:
     short_terms, short_steps = 6, 2
     # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the best of so many
     # points.
-    rise_steps, lowest_steps, peak_steps, peak_looks = 12, 6, 5, 8
+    rise_steps, lowest_steps, peak_steps, looks = 12, 6, 5, 8
     like = form.mechanics(np.zeros(form.numbers))
     n, normal = like.free_load.shape[0], like.normal
     at = blocks_of(n)
@@ -90,7 +90,8 @@ def motion_in_cpp(form: MechanicsForm) -> str:
         "RISE_STEPS": rise_steps,
         "LOWEST_STEPS": lowest_steps,
         "PEAK_STEPS": peak_steps,
-        "PEAK_LOOKS": peak_looks,
+        "PEAK_LOOKS": looks,
+        "LOWEST_LOOKS": looks,
         **BRACKET,
     }
     real = {

@@ -158,12 +158,23 @@ struct Motion {
         return value;
     }
 
-    // Where a guard that dips is lowest.
-    CUDA_CALLABLE static double lowest_of(const double* c, double x) {
+    // Where a guard is lowest, or the first point where it is seen not to be positive; the start if it is certain to be so
+    // everywhere. By Newton's method from the lowest of a few points, as long as it is convex there.
+    CUDA_CALLABLE static double lowest_of(const double* c) {
+        double least_value = c[0], x = 0.0, slope, bend, others = 0.0;
+        for (int k = 1; k < ORDER + 1; ++k) others += wp::abs(c[k]);
+        if (c[0] > others) return 0.0;
+        for (int k = 1; k <= LOWEST_LOOKS; ++k) {
+            const double there = (double)k / LOWEST_LOOKS, value = value_at(c, there, &slope);
+            if (value <= 0.0) return there;
+            if (value < least_value) {
+                least_value = value;
+                x = there;
+            }
+        }
         for (int k = 0; k < LOWEST_STEPS; ++k) {
-            double slope, bend;
-            bent_at(c, x, &slope, &bend);
-            x = within(bend > 0.0 ? x - slope / bend : x - slope, 0.0, 1.0);
+            if (bent_at(c, x, &slope, &bend) <= 0.0 || !(bend > 0.0)) break;
+            x = within(x - slope / bend, 0.0, 1.0);
         }
         return x;
     }
@@ -308,15 +319,14 @@ struct Motion {
             share = least(steps - i, 1.0);
             double root[2] = {INFINITE, INFINITE}, slope[2] = {0.0, 0.0}, same[2] = {0.0, 0.0};
             for (int q = 0; q < 2; ++q) {
+                if (b[SPENT + q] > 0.0) continue;
                 bool crosses = b[CROSSES + q] > 0.0;
-                const bool dips = b[DIPS + q] > 0.0;
-                if (!crosses && !dips) continue;
                 double c[ORDER + 1], end = b[ENDS + q], guess = b[q], slope_there;
-                if (dips) {
-                    // Roots at zero do not count: without them the guard is positive there.
+                if (!crosses) {
+                    // Positive at both ends, a guard may dip below zero in between. Roots at zero do not count.
                     rest_of_guard(both, q, (int)b[ZEROS + q], c);
-                    const double low = lowest_of(c, guess);
-                    if (value_at(c, low, &slope_there) <= 0.0) {
+                    const double low = lowest_of(c);
+                    if (c[0] > 0.0 && value_at(c, low, &slope_there) <= 0.0) {
                         crosses = true;
                         end = low;
                         guess = 0.5 * low;

@@ -11,12 +11,11 @@ from .propagation import INTERVALS
 class Bracket(eqx.Module):
     """Brackets of the first roots of the guards in [0, 1], from values and derivatives at both ends."""
 
-    guess: Float[Array, "2"]  # of the root; of the lowest point where the guard perhaps dips; else 1
+    guess: Float[Array, "2"]  # of the root, if it crosses; else 1
     zeros: Int[Array, "2"]  # number of roots at the start, which do not count
     end: Float[Array, "2"]  # where the guard is no longer positive, if it crosses
     crosses: Bool[Array, "2"]
     spent: Bool[Array, "2"]  # negative from the start
-    dips: Bool[Array, "2"]  # positive at both ends, but perhaps not in between
 
 
 def first_is_safe(
@@ -45,12 +44,8 @@ def bracketed(
     slope = jnp.where(zeros == 0, c[1], jnp.where(zeros == 1, c[2], jnp.where(zeros == 2, c[3], c[4])))
     bend = end - lead - slope
     guess = parabola_root(lead, slope, bend)
-    bottom = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
-    # The factors allow for the difference from a parabola.
-    dips = (lead > 0) & (end > 0) & (slope < 0) & (slope + 2.2 * bend > 0)
-    dips = dips & (lead + 0.5 * slope * bottom <= 0.1 * bend)
-    guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), jnp.where(dips, jnp.clip(bottom, 0.0, 1.0), 1.0))
-    return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent, dips)
+    guess = jnp.where(crosses, jnp.clip(guess, 0.0, 1.0), 1.0)
+    return Bracket(guess, zeros, jnp.ones_like(lead), crosses, spent)
 
 
 def fastest(speed: Float[Array, " i"], steps: Float[Array, ""]) -> Int[Array, ""]:

@@ -305,3 +305,23 @@ def test_the_highest_speed_of_a_motion_may_lie_in_a_flight_shorter_than_an_inter
     run = fj.simulate(scene, 600.0, 0.01)
     seen = np.abs(np.asarray(run.velocity)[-3000:, 0]).max()
     assert found.amplitude.item() == pytest.approx(seen, rel=1e-4) and seen > 1.2
+
+
+def test_a_gap_that_opens_further_and_closes_within_a_step_is_seen_to_close():
+    """It is positive at both ends of the step, and rises at the first: a landing was missed, and the motion came to the other of
+    two cycles. The kernel of whole trajectories follows it by series.
+    """
+    mass = np.array([[1.2945, -0.1307, 0.0827, 0.0435], [-0.1307, 1.1842, -0.1017, 0.0448]])
+    mass = np.vstack([mass, [[0.0827, -0.1017, 1.584, 0.0973], [0.0435, 0.0448, 0.0973, 1.066]]])
+    damping = np.array([[0.0059, -0.0009, -0.0001, 0.001], [-0.0009, 0.0054, -0.0009, -0.001]])
+    damping = np.vstack([damping, [[-0.0001, -0.0009, 0.0061, 0.0009], [0.001, -0.001, 0.0009, 0.0046]]])
+    stiffness = np.array([[2.9501, -0.5863, -0.1828, 0.7701], [-0.5863, 2.7372, -0.6288, -0.8623]])
+    stiffness = np.vstack([stiffness, [[-0.1828, -0.6288, 2.702, 0.5983], [0.7701, -0.8623, 0.5983, 2.2544]]])
+    structure = fj.Structure(mass, damping, stiffness, [-0.3662, -1.0, 0.3514, 0.1018], tangential=0, normal=1)
+    load = fj.Pulse(1.0, 0.0, duration=2.0)
+    scene = fj.Scene(structure, fj.Coulomb(0.7333), -0.7779, load, restitution=0.6)
+    found = fj.bistability_map(scene, p=[0.0, 0.2], progress=False)
+    for p, amplitude in zip((0.0, 0.2), found.amplitude.values, strict=True):
+        run = fj.simulate(scene.replace(p=p), 600.0, 0.02)
+        assert amplitude == pytest.approx(np.abs(np.asarray(run.velocity)[-2500:, 0]).max(), rel=1e-4)
+    assert abs(np.diff(found.amplitude)) > 1e-3
