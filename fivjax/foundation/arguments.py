@@ -178,6 +178,8 @@ def describe(value) -> str:
         return f"{value!r} ({type(value).__name__})"
     if isinstance(value, np.ndarray | jax.Array):
         return f"an array of {value.dtype} with shape {value.shape}"
+    if isinstance(value, list | tuple) and not value:
+        return f"an empty {type(value).__name__}"
     return f"of type {type(value).__name__}"
 
 
