@@ -142,8 +142,7 @@ def _followed_into(
 
 
 def _attracting(maps: ReturnMaps, group: Int[np.ndarray, " a"], tried: list[Approach], report) -> Int[np.ndarray, " d"]:
-    """Which of these tubes are drawn in: all that starts on their edges comes back. Starts where
-    paths begin, further out, are asked first."""
+    """Which of these tubes are drawn in: all that starts on their edges comes back, first further out, where paths begin."""
     left = np.arange(len(tried))
     for beyond in (True, False):
         if not len(left):

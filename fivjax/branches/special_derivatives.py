@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..contact import Status
 from ..linear.linearisation import sliding_rates
 from ..model.directions import direction_of, moved_along
+from ..model.scene import Scene
 from .branch_points import BranchPoint
 from .grazing import images_up_to_minimum, row_of
 from .multiple_shooting import images
@@ -54,7 +55,7 @@ def _derivative(family: Family, special: Special, name: str) -> float:
         null = left[:, -1] / np.max(np.abs(own), axis=1)
         return float(-(null @ slope) / (null @ own[:, -1]) * curve.scales[-1])
     if special.multiplier is not None:
-        return _of_multiplier(family, special, name, own, slope)
+        return _of_multiplier(family, special, name, direction, own, slope)
     if special.row is None:
         return np.nan
     last, row = 0.0, special.row
@@ -106,7 +107,9 @@ def _of_stability_limit(family: Family, limit: float, name: str) -> float:
     return -slope(name) / slope(family.name)
 
 
-def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray, slope: np.ndarray) -> float:
+def _of_multiplier(
+    family: Family, special: Special, name: str, direction: Scene, own: np.ndarray, slope: np.ndarray
+) -> float:
     """By differences of the multiplier's size along the curve, and across it with the other parameter: next to a fold, where it
     has no derivative by the curve's own parameter.
     """
@@ -118,7 +121,7 @@ def _of_multiplier(family: Family, special: Special, name: str, own: np.ndarray,
     across = np.linalg.lstsq(own / sizes[:, None], -slope / sizes, rcond=None)[0]
 
     def size(along: float, other: float) -> float:
-        moved = family._replace(scene=moved_along(family.scene, direction_of(family.scene, name), other))
+        moved = family._replace(scene=moved_along(family.scene, direction, other))
         there = Curve(moved, cycle.phases)
         # Converted to the units of its own curve.
         guess = (cycle.u + along * tangent + other * across) * curve.scales / there.scales

@@ -182,10 +182,9 @@ def raise_critical_perturbation(
     anew = critical_perturbation(here.scene, p_range=p_range, p_step=p_step, progress=False).isel(belt_speed=0)
     ended = np.array([float(np.asarray(here.scene.parameters[name])) for name in names])
     changes = dict(zip(names, zip(start.tolist(), ended.tolist(), strict=True), strict=True))
-    outcome, why = _outcome(here.p, target, _bracket(anew), why)
-    return RaisedCriticalKick(
-        here.scene, first.p, here.p, target, first.bracket, _bracket(anew), changes, outcome, why, taken
-    )
+    bracket = _bracket(anew)
+    outcome, why = _outcome(here.p, target, bracket, why)
+    return RaisedCriticalKick(here.scene, first.p, here.p, target, first.bracket, bracket, changes, outcome, why, taken)
 
 
 class _Iterate(NamedTuple):

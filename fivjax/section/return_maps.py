@@ -179,20 +179,20 @@ class ReturnMaps:
         if np.ndim(status):
             places = np.asarray(self.tangential), np.asarray(self.normal)
             section = np.zeros_like(self.section) if self.jumped(y[None])[0] else self.section
-            held = (status == Status.STICK) | ((status == Status.SLIDE) & self._without_slip(y))
-            return directions_of_several(self.weights, section, *places, status, held)
+            return directions_of_several(self.weights, section, *places, status, self._without_slip(status, y))
         return np.eye(len(self.weights))[:, self._free(np.atleast_1d(status), y[None])[0]]
 
-    def _without_slip(self, y: Float[np.ndarray, "*m 2n"]) -> Bool[np.ndarray, "..."]:
-        """Which contacts have the velocity of a belt, to the bit: they stick, or an impact has ended their slip."""
-        return np.isin(y[..., self.structure.size + self.tangential], self.belts)
+    def _without_slip(self, status: Int[np.ndarray, "..."], y: Float[np.ndarray, "*m 2n"]) -> Bool[np.ndarray, "..."]:
+        """Which contacts stick; or slide with the velocity of a belt, to the bit, because an impact has ended their slip."""
+        at_belt = np.isin(y[..., self.structure.size + self.tangential], self.belts)
+        return (status == Status.STICK) | ((status == Status.SLIDE) & at_belt)
 
     def _free(self, status: Int[np.ndarray, " m"], y: Float[np.ndarray, "m 2n"]) -> Bool[np.ndarray, "m 2n"]:
         """With one contact: which coordinates are free at states of the section. An impact leaves the gap at zero, and its rate
         where it does not rebound, but any velocity, unless it ends the slip.
         """
         free, jumped, n = self.free[status], self.jumped(y), self.structure.size
-        free[jumped & ~self._without_slip(y), n + self.tangential] = True
+        free[jumped & ~self._without_slip(status, y), n + self.tangential] = True
         for place in (self.normal, n + self.normal):
             free[:, place] &= ~jumped | (y[:, place] != 0)
         return free

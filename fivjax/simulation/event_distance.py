@@ -239,7 +239,7 @@ class _Seen:
             self.flights += begun
             self.flight[i] = self.flights if begun else 0
 
-    def _guard(self, i: int, status: np.ndarray, which: int) -> "_Guard":
+    def _guard(self, i: int, status: np.ndarray, which: int) -> _Guard:
         return _Guard(i, int(status[i]), which, int(self.flight[i]) if status[i] == Status.DETACH else 0)
 
     def _of_contact(self, i: int, status: np.ndarray, look: AdvanceMargins, t: float, begins: bool) -> list[int]:

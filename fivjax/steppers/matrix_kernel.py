@@ -60,7 +60,7 @@ def motion_in_cpp(form: MechanicsForm) -> str:
     """The code of `Motion` with all that it refers to."""
     # Terms of the series in the first steps of Newton's method for a root, and how many steps these are.
     short_terms, short_steps = 6, 2
-    # Steps for the root of a velocity that changes sign, for where a guard is lowest, and for a peak, from the best of so many
+    # Steps for the root of a velocity that changes sign; for where a guard is lowest, and for a peak, from the best of so many
     # points.
     rise_steps, lowest_steps, peak_steps, looks = 12, 6, 5, 8
     like = form.mechanics(np.zeros(form.numbers))
@@ -90,8 +90,7 @@ def motion_in_cpp(form: MechanicsForm) -> str:
         "RISE_STEPS": rise_steps,
         "LOWEST_STEPS": lowest_steps,
         "PEAK_STEPS": peak_steps,
-        "PEAK_LOOKS": looks,
-        "LOWEST_LOOKS": looks,
+        "LOOKS": looks,
         **BRACKET,
     }
     real = {

@@ -164,8 +164,8 @@ struct Motion {
         double least_value = c[0], x = 0.0, slope, bend, others = 0.0;
         for (int k = 1; k < ORDER + 1; ++k) others += wp::abs(c[k]);
         if (c[0] > others) return 0.0;
-        for (int k = 1; k <= LOWEST_LOOKS; ++k) {
-            const double there = (double)k / LOWEST_LOOKS, value = value_at(c, there, &slope);
+        for (int k = 1; k <= LOOKS; ++k) {
+            const double there = (double)k / LOOKS, value = value_at(c, there, &slope);
             if (value <= 0.0) return there;
             if (value < least_value) {
                 least_value = value;
@@ -229,8 +229,8 @@ struct Motion {
     // points, as long as its size is concave there.
     CUDA_CALLABLE static double highest_of(const double* c, double low, double high) {
         double x = 0.0, highest = wp::abs(c[0]), slope, bend;
-        for (int k = 0; k <= PEAK_LOOKS; ++k) {
-            const double there = low + (high - low) * k / PEAK_LOOKS, size = wp::abs(value_at(c, there, &slope));
+        for (int k = 0; k <= LOOKS; ++k) {
+            const double there = low + (high - low) * k / LOOKS, size = wp::abs(value_at(c, there, &slope));
             if (size > highest) {
                 highest = size;
                 x = there;
@@ -412,7 +412,8 @@ struct Motion {
         double highest = most(before, wp::abs(after.last));
         const int last = steps >= INTERVALS - 1 ? INTERVALS : steps > 0.0 ? (int)steps + 1 : 1;
         double rough = most(wp::abs(speeds[0]), wp::abs(speeds[last])), bend = 0.0;
-        for (int k = 1; k < last || k == 1; ++k) {
+        const int inner = last > 1 ? last : 2;
+        for (int k = 1; k < inner; ++k) {
             rough = most(rough, wp::abs(speeds[k]));
             bend = most(bend, wp::abs(speeds[k + 1] - 2.0 * speeds[k] + speeds[k - 1]));
         }
