@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable, Sequence
 from itertools import compress
 
@@ -17,7 +18,8 @@ from ..foundation.precision import own_settings
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers
 from .cpp_code import writer
 from .cpp_loops import scan
-from .cpp_numbers import WIDE, kind_of
+from .cpp_lanes import OF_LANES, REALS
+from .cpp_numbers import WIDE, converted, kind_of
 from .cpp_writer import Writer
 
 
@@ -71,9 +73,12 @@ class KernelSource:
         return ends, rows, end_dots, row_dots
 
 
-def traced_source(function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0) -> tuple:
+def traced_source(
+    function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0, lanes: bool = False
+) -> tuple:
     """A `KernelSource`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its
-    arrays that are `wide`. So many of the first arrays are `shared` by the trajectories of a group.
+    arrays that are `wide`. So many of the first arrays are `shared` by the trajectories of a group. `lanes` is whether it is for
+    several lanes side by side, without tangents.
     """
     like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
     instants = jax.ShapeDtypeStruct((2,), np.dtype("float64"))
@@ -100,7 +105,7 @@ def traced_source(function: Callable, form: Form, wide: tuple[bool, ...], shared
         # What is asked for: no more is written.
         jaxpr, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
         lengths = np.cumsum([len(ends), len(rows), len(end_dots)])
-        of_kernel = _WriterOfKernel(jaxpr, shared, len(like), lengths)
+        of_kernel = _WriterOfKernel(jaxpr, shared, len(like), lengths, lanes)
         # Numbers that are known are computed now, whatever is being traced around this.
         with jax.ensure_compile_time_eval():
             source = of_kernel.source(traced.consts)
@@ -162,14 +167,14 @@ def _places(avals, leading: int = 0) -> list[tuple[int, tuple[int, ...], str]]:
 class _WriterOfKernel:
     """Writes a traced function whose results are at the end, and in rows: values, and tangents."""
 
-    def __init__(self, jaxpr, shared: int, given: int, lengths):
+    def __init__(self, jaxpr, shared: int, given: int, lengths, lanes: bool):
         self.jaxpr, self.shared, self.given = jaxpr, shared, given
         self.ends, self.rows, self.end_dots, self.row_dots = (
             jaxpr.outvars[start:end] for start, end in zip([0, *lengths], [*lengths, None], strict=True)
         )
-        self.writer = writer(
-            {**dict.fromkeys(("shared", "given", "instants", "rows"), "double"), "dots": WIDE, "row_dots": WIDE}
-        )
+        self.kind = REALS if lanes else "double"
+        names = ("shared", "given", "instants", "rows")
+        self.writer = writer({**dict.fromkeys(names, self.kind), "dots": WIDE, "row_dots": WIDE}, lanes)
 
     def source(self, consts) -> str:
         writer, jaxpr = self.writer, self.jaxpr
@@ -183,7 +188,7 @@ class _WriterOfKernel:
         shared, given, dots = numbers[: self.shared], numbers[self.shared : self.given], numbers[self.given :]
         for name, own in (("shared", shared), ("given", given), ("dots", dots)):
             known |= dict(zip(own, _given(writer, name, own), strict=True))
-        known[instants] = View("instants", (0,), (2,), (1,), "double")
+        known[instants] = View("instants", (0,), (2,), (1,), self.kind)
 
         def read(atom) -> Value:
             return of_numbers(atom.val) if isinstance(atom, Literal) else known[atom]
@@ -200,13 +205,13 @@ class _WriterOfKernel:
             # Tangents that do not depend on what is perturbed are zero, as their array is from the start.
             if variable not in along and not (has_known_numbers(read(variable)) and not np.any(read(variable))):
                 raise NotImplementedError("Rows of a kernel's function must be results of its `scan`.")
-        for name, variables, kind in (("ends", self.ends, "double"), ("end_dots", self.end_dots, WIDE)):
+        for name, variables, kind in (("ends", self.ends, self.kind), ("end_dots", self.end_dots, WIDE)):
             start = 0
             for variable in variables:
                 for entry in writer.entries(read(variable)).ravel():
                     writer.put(f"{name}[{start}] = {writer.as_type(entry, kind)};")
                     start += 1
-        return writer.source
+        return _loaded(writer.source, {"shared": shared, "given": given}) if writer.lanes else writer.source
 
     def _rows_of(self, loop, k: int, kind: str) -> View:
         """Where the loop's rows of results with this number are written."""
@@ -233,6 +238,24 @@ def _given(writer: Writer, base: str, variables) -> list[Value]:
         if kind == "double":
             found.append(writer.small(view))
         else:
-            typed = [writer.line(f"({kind})({entry})", kind) for entry in view.entries().ravel()]
+            own = OF_LANES[kind] if writer.lanes else kind
+            typed = [writer.line(converted(entry, view.kind, own), own) for entry in view.entries().ravel()]
             found.append(np.array(typed, object).reshape(shape))
     return found
+
+
+def _loaded(source: str, arrays: dict[str, Sequence]) -> str:
+    """The code with what it reads of the lanes' rows put side by side before: single numbers, or all of a row if it goes through
+    parts of it by loops.
+    """
+    before = []
+    for name, variables in arrays.items():
+        places = sorted({int(place) for place in re.findall(rf"\b{name}\[(\d+)\]", source)})
+        before += [f"const {REALS} {name}_{place} = {name}[{place}];" for place in places]
+        source = re.sub(rf"\b{name}\[(\d+)\]", rf"{name}_\1", source)
+        if re.search(rf"\b{name}\b", source):
+            count = sum(count_of(variable.aval.shape) for variable in variables)
+            before.append(f"{REALS} {name}_all[{count}];")
+            before.append(f"for (int i = 0; i < {count}; ++i) {name}_all[i] = {name}[i];")
+            source = re.sub(rf"\b{name}\b", f"{name}_all", source)
+    return "\n".join([*before, source])

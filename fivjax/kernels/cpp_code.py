@@ -14,9 +14,9 @@ from .cpp_writer import Writer
 RULES = cpp_places.RULES | cpp_loops.RULES
 
 
-def writer(types: dict[str, str]) -> Writer:
-    """A writer of code that is given variables of these types."""
-    return Writer(RULES, cpp_elimination.CALLS, types)
+def writer(types: dict[str, str], lanes: bool = False) -> Writer:
+    """A writer of code that is given variables of these types, for one lane or for several side by side."""
+    return Writer(RULES, cpp_elimination.CALLS, types, lanes)
 
 
 def scalar_source(function: Callable, **lengths: int) -> tuple[str, int]:

@@ -7,6 +7,7 @@ from jax.extend.core import Jaxpr
 
 from ..foundation.jaxprs import carried_dependence, dependent_results, of_scan, solution
 from .cpp_arrays import Value, View, of_text
+from .cpp_lanes import TRUTHS, WHOLES
 from .cpp_numbers import WIDE, base_of, kind_of, same, text_of
 from .cpp_writer import Writer
 
@@ -18,11 +19,20 @@ def _while(writer: Writer, equation, operands) -> list[Value]:
     begin = operands[len(asked) + len(fixed) :]
     kinds, _ = _types_carried(writer, body.jaxpr, fixed, begin, [], equation.outvars)
     carry = [variable_from(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
+    before, where = writer.going, None
+    if writer.lanes:
+        writer.going = where = writer.name(TRUTHS, "m")
+        writer.put(f"{TRUTHS} {where} = {before};")
     writer.open("for (;;)")
     (going,) = writer.run(condition.jaxpr, condition.consts, [*asked, *carry])
-    writer.put(f"if (!({text_of(writer.entries(going).item())})) break;")
-    assign(writer, carry, writer.run(body.jaxpr, body.consts, [*fixed, *carry]))
+    if where is None:
+        writer.put(f"if (!({text_of(writer.entries(going).item())})) break;")
+    else:
+        writer.put(f"{where} = {where} & {writer.as_type(writer.entries(going).item(), TRUTHS)};")
+        writer.put(f"if (!any({where})) break;")
+    assign(writer, carry, writer.run(body.jaxpr, body.consts, [*fixed, *carry]), where)
     writer.close()
+    writer.going = before
     return carry
 
 
@@ -47,7 +57,7 @@ def scan(writer: Writer, equation, operands, length: str, rows_of: Callable[[int
     ]
     carry = [variable_from(writer, value, kind) for value, kind in zip(begin, kinds, strict=True)]
     rows = [
-        rows_of(k, WIDE if wide[len(begin) + k] else kind_of(variable.aval))
+        rows_of(k, _wider(writer, kind_of(variable.aval), wide[len(begin) + k]))
         for k, variable in enumerate(equation.outvars[len(begin) :])
     ]
     own = writer.name("int", "i")
@@ -77,14 +87,29 @@ def _cond(writer: Writer, equation, operands) -> list[Value]:
     flags = list(map(writer.is_wide, rest))
     wide = [any(each) for each in zip(*(dependent_results(branch.jaxpr, flags) for branch in branches), strict=True)]
     found = [
-        unset_variable(writer, variable.aval.shape, WIDE if is_wide else kind_of(variable.aval))
+        unset_variable(writer, variable.aval.shape, _wider(writer, kind_of(variable.aval), is_wide))
         for variable, is_wide in zip(equation.outvars, wide, strict=True)
     ]
+    if writer.lanes:
+        return _branches_of_lanes(writer, branches, writer.as_type(which, WHOLES), rest, found)
     for k, branch in enumerate(branches):
         test = f"if ({which} <= 0)" if k == 0 else f"else if ({which} == {k})" if k < last else "else"
         writer.open(test)
         assign(writer, found, writer.run(branch.jaxpr, branch.consts, rest))
         writer.close()
+    return found
+
+
+def _branches_of_lanes(writer: Writer, branches, which: str, rest, found: list[Value]) -> list[Value]:
+    """Each branch that any of the lanes takes, for these."""
+    before, last = writer.going, len(branches) - 1
+    for k, branch in enumerate(branches):
+        test = f"({which} <= 0)" if k == 0 else f"({which} == {k})" if k < last else f"({which} >= {last})"
+        writer.going = writer.line(f"{before} & {test}", TRUTHS)
+        writer.open(f"if (any({writer.going}))")
+        assign(writer, found, writer.run(branch.jaxpr, branch.consts, rest), writer.going)
+        writer.close()
+    writer.going = before
     return found
 
 
@@ -101,8 +126,15 @@ def _types_carried(writer: Writer, body: Jaxpr, fixed, begin, along, variables) 
     """The types of what a loop carries, and which of the body's results are wide."""
     wide = list(map(writer.is_wide, begin))
     wide, after = carried_dependence(body, list(map(writer.is_wide, fixed)), wide, list(map(writer.is_wide, along)))
-    kinds = [WIDE if is_wide else kind_of(variable.aval) for is_wide, variable in zip(wide, variables, strict=True)]
+    kinds = [_wider(writer, kind_of(variable.aval), own) for own, variable in zip(wide, variables, strict=True)]
     return kinds, after
+
+
+def _wider(writer: Writer, kind: str, is_wide: bool) -> str:
+    """The type of what a loop or branch changes; if that depends on the lane, so does all of it."""
+    if writer.lanes:
+        return writer.widened(kind)
+    return WIDE if is_wide else kind
 
 
 # ------------------------------------------------------------------------------------ what loops and branches change
@@ -123,13 +155,13 @@ def unset_variable(writer: Writer, shape, kind: str) -> Value:
     """The same, without a value yet."""
     if shape == ():
         found = writer.name(kind, "w")
-        writer.put(f"{kind} {found};")
+        writer.put(f"{kind} {found}{f' = ({kind})(0)' if writer.lanes else ''};")
         return of_text(found)
     return writer.small(writer.new(shape, kind))
 
 
-def assign(writer: Writer, targets: Sequence[Value], values: Sequence[Value]) -> None:
-    """Give these variables and arrays their new values, all at once."""
+def assign(writer: Writer, targets: Sequence[Value], values: Sequence[Value], where: str | None = None) -> None:
+    """Give these variables and arrays their new values, all at once; those of lanes `where` that holds, if it is said."""
     bases = {base_of(target) for target in targets}
     moves = []
     for target, value in zip(targets, values, strict=True):
@@ -148,9 +180,9 @@ def assign(writer: Writer, targets: Sequence[Value], values: Sequence[Value]) ->
         if target.shape == ():
             variable = target.item()
             kind = writer.type_of(variable)
-            writer.put(f"{variable} = {writer.as_type(writer.entries(value).item(), kind)};")
+            writer.set(variable, writer.as_type(writer.entries(value).item(), kind), where)
         else:
-            writer.copy(value, base_of(target), writer.types[base_of(target)])
+            writer.copy(value, base_of(target), writer.types[base_of(target)], where=where)
 
 
 def _kept(writer: Writer, entry, bases: set[str]):

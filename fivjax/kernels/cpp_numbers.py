@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 from ..foundation.numpy_primitives import function_of
+from . import cpp_lanes
 from .cpp_arrays import Value, View, of_numbers
 
 # Types in C++. What is wide is declared by the kernel: so many numbers in double precision.
@@ -95,6 +96,8 @@ def text_of(entry) -> str:
 
 def keeping_nan(name: str, form: str, kind: str) -> str:
     """The form of a primitive; of two numbers, the larger or smaller is no number where the first is none, as in JAX."""
+    if name in ("max", "min") and kind == cpp_lanes.REALS:
+        return cpp_lanes.BY_NUMBER[name]
     return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form
 
 
@@ -112,6 +115,9 @@ def equal(one, other) -> bool:
 
 
 def converted(text: str, own: str, kind: str) -> str:
+    """The text of a number of one type as one of another."""
+    if kind in cpp_lanes.KINDS:
+        return cpp_lanes.converted(text, own, kind)
     return text if own == kind else f"({kind})({text})"
 
 

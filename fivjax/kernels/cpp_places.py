@@ -6,6 +6,7 @@ import numpy as np
 
 from ..foundation.numpy_primitives import gathered_places, scattered_places
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers, reshaped
+from .cpp_lanes import KINDS, OF_LANES, WHOLES
 from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
 from .cpp_writer import FEW, Writer
 
@@ -18,6 +19,7 @@ FOLDED = {
     "reduce_and": "and",
     "reduce_or": "or",
 }
+CHOICE = "({0} ? {2} : {1})"
 RUNNING = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 
 
@@ -28,25 +30,66 @@ def _dynamic_slice(writer: Writer, equation, operands, kind: str) -> Value:
 
 
 def _from(writer: Writer, view: View, starts, sizes) -> View:
-    known, unknown = view.offset[0], list(view.offset[1:])
+    part, at = _part(writer, view, starts, sizes)
+    if at is None:
+        return part
+    # The lanes' numbers from different places, side by side.
+    into = writer.new(part.shape, OF_LANES.get(part.kind, part.kind))
+    for place in np.ndindex(part.shape):
+        writer.put(f"{into.at(place)} = picked({part.base}, {_address(part, at, place)});")
+    return into
+
+
+def _part(writer: Writer, view: View, starts, sizes) -> tuple[View, str | None]:
+    """The part of an array from these places on; if they differ from lane to lane, without what they add to the address, and
+    that.
+    """
+    known, unknown, of_lanes = view.offset[0], list(view.offset[1:]), []
     for start, size, own, stride in zip(starts, sizes, view.shape, view.strides, strict=True):
         at = writer.place(writer.entries(start).item(), own - size)
         if isinstance(at, str):
-            unknown += [f"{at} * {stride}" if stride != 1 else at] * (stride != 0)
+            into = of_lanes if writer.type_of(at) in KINDS else unknown
+            into += [f"{at} * {stride}" if stride != 1 else at] * (stride != 0)
         else:
             known += at * stride
-    return View(view.base, (known, *unknown), tuple(sizes), view.strides, view.kind)
+    part = View(view.base, (known, *unknown), tuple(sizes), view.strides, view.kind)
+    return part, writer.line(" + ".join(of_lanes), WHOLES) if of_lanes else None
+
+
+def _address(part: View, at: str, place) -> str:
+    """That of a number of a part of an array, for each lane."""
+    _, _, index = part.at(place).partition("[")
+    return f"{at} + ({WHOLES})({index[:-1]})"
+
+
+def _put(writer: Writer, into: View, starts, update, axes, how: str) -> None:
+    """Numbers into the part of an array from these places on, along these axes."""
+    sizes, kind = update.shape, into.kind
+    if axes is not None:
+        sizes = [update.shape[axes.index(axis)] if axis in axes else 1 for axis in range(into.ndim)]
+    part, at = _part(writer, into, starts, sizes)
+    part = part if axes is None else part.selected(part.offset, axes)
+    for place, entry in np.ndenumerate(writer.entries(update)):
+        own = writer.as_type(entry, kind)
+        if at is None:
+            writer.put(f"{part.at(place)} {how} {own};")
+        else:
+            writer.put(f"{'put' if how == '=' else 'add'}({part.base}, {_address(part, at, place)}, {own});")
 
 
 def _dynamic_update_slice(writer: Writer, equation, operands, kind: str) -> Value:
     value, update, *starts = operands
-    kind = WIDE if writer.is_wide(value) or writer.is_wide(update) else kind
+    into = _copied(writer, operands, value, kind)
+    _put(writer, into, starts, update, None, "=")
+    return writer.small(into)
+
+
+def _copied(writer: Writer, operands, value: Value, kind: str) -> View:
+    """A copy of an array, into which others of the operands are put."""
+    kind = writer.widened(kind) if any(map(writer.is_wide, operands)) else kind
     into = writer.new(value.shape, kind)
     writer.copy(value, into.base, kind)
-    part = _from(writer, into, starts, update.shape)
-    for place, entry in np.ndenumerate(writer.entries(update)):
-        writer.put(f"{part.at(place)} = {writer.as_type(entry, kind)};")
-    return writer.small(into)
+    return into
 
 
 def _gather(writer: Writer, equation, operands, kind: str) -> Value:
@@ -103,24 +146,18 @@ def _put_at(writer: Writer, equation, operands, kind: str, how: str) -> Value:
     numbers = equation.params["dimension_numbers"]
     if places.size != len(numbers.scatter_dims_to_operand_dims):
         raise NotImplementedError("Numbers put at several unknown places have no C++ here; put them one by one.")
-    kind = WIDE if writer.is_wide(value) or writer.is_wide(update) else kind
-    into = writer.new(value.shape, kind)
-    writer.copy(value, into.base, kind)
+    into = _copied(writer, operands, value, kind)
     starts = [of_numbers(0)] * len(value.shape)
-    sizes = [1 if axis in numbers.inserted_window_dims else size for axis, size in enumerate(value.shape)]
     for at, axis in zip(writer.entries(places).ravel(), numbers.scatter_dims_to_operand_dims, strict=True):
         starts[axis] = np.asarray(at, object)
     kept = [axis for axis in range(len(value.shape)) if axis not in numbers.inserted_window_dims]
-    part = _from(writer, into, starts, sizes)
-    part = part.selected(part.offset, kept)
-    for place, entry in np.ndenumerate(writer.entries(update)):
-        writer.put(f"{part.at(place)} {how} {writer.as_type(entry, kind)};")
+    _put(writer, into, starts, update, kept, how)
     return writer.small(into)
 
 
 def _concatenate(writer: Writer, equation, operands, kind: str) -> Value:
     axis = equation.params["dimension"]
-    kind = WIDE if any(map(writer.is_wide, operands)) else kind
+    kind = writer.widened(kind) if any(map(writer.is_wide, operands)) else kind
     into, start = writer.new(equation.outvars[0].aval.shape, kind), 0
     for part in operands:
         if part.size:
@@ -145,13 +182,17 @@ def _best_place(sign: str) -> Callable:
         (axis,) = equation.params["axes"]
         parts = np.moveaxis(writer.entries(operands[0]), axis, 0)
         found = np.empty(parts.shape[1:], object)
+        wide = writer.lanes and writer.is_wide(operands[0])
+        truth, number, real = (
+            writer.widened(own) if wide else own for own in ("bool", kind, kind_of(equation.invars[0].aval))
+        )
         for place in np.ndindex(found.shape):
             best, at = parts[(0, *place)], 0
             for i in range(1, len(parts)):
                 own = parts[(i, *place)]
-                better = writer.line(f"{text_of(own)} {sign} {text_of(best)}", "bool")
-                at = writer.line(f"({better} ? {i} : {text_of(at)})", kind)
-                best = writer.line(f"({better} ? {text_of(own)} : {text_of(best)})", writer.type_of(own))
+                better = writer.one("gt" if sign == ">" else "lt", f"{{}} {sign} {{}}", [own, best], truth)
+                at = writer.one("select_n", CHOICE, [better, at, i], number)
+                best = writer.one("select_n", CHOICE, [better, best, own], real)
             found[place] = at
         return found
 
@@ -162,6 +203,8 @@ def _sort(writer: Writer, equation, operands) -> list[Value]:
     """By insertion, which is stable; what belongs to the keys is moved with them."""
     if operands[0].ndim != 1 or equation.params["num_keys"] != 1:
         raise NotImplementedError("Only rows of numbers are sorted in C++ here, by one key.")
+    if writer.lanes:
+        raise NotImplementedError("Rows of several lanes side by side are not sorted in C++ here.")
     kinds = [
         WIDE if writer.is_wide(part) else kind_of(variable.aval)
         for part, variable in zip(operands, equation.outvars, strict=True)
@@ -199,9 +242,12 @@ def _running(name: str) -> Callable:
 
 def _same_bits(writer: Writer, equation, operands, kind: str) -> Value:
     own, value = kind_of(equation.invars[0].aval), writer.entries(operands[0])
+    if writer.lanes:
+        own, kind = OF_LANES[own], OF_LANES[kind]
     found = np.empty(value.shape, object)
     for place, entry in np.ndenumerate(value):
-        found[place] = writer.line(f"__builtin_bit_cast({kind}, {writer.line(text_of(entry), own)})", kind)
+        same = writer.line(writer.as_type(entry, own), own)
+        found[place] = writer.line(f"__builtin_bit_cast({kind}, {same})", kind)
     return found
 
 
@@ -226,7 +272,7 @@ def _product(writer: Writer, equation, operands, kind: str) -> Value:
 
     if count_of(shape) * count_of(lengths) > FEW:
         factors = _by_columns(writer, writer.view(left, kind)), writer.view(right, kind)
-        into = writer.new(shape, WIDE if WIDE in (factors[0].kind, factors[1].kind) else kind)
+        into = writer.new(shape, writer.widened(kind) if any(map(writer.is_wide, factors)) else kind)
         every = writer.name("int", "i")
         writer.put(
             f"for (int {every} = 0; {every} < {into.size}; ++{every}) {into.base}[{every}] = ({into.kind})(0.0);"

@@ -18,7 +18,9 @@ import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
 from ..foundation.jaxprs import within
+from . import cpp_lanes
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
+from .cpp_lanes import KINDS, OF_LANES, TRUTHS, WHOLES
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
@@ -43,11 +45,18 @@ class Writer:
     """Code that is being written, equation by equation."""
 
     def __init__(
-        self, rules: Mapping[str, Callable], calls: Mapping[str, Callable], types: dict[str, str] | None = None
+        self,
+        rules: Mapping[str, Callable],
+        calls: Mapping[str, Callable],
+        types: dict[str, str] | None = None,
+        lanes: bool = False,
     ):
         """`rules` are functions that write primitives, `calls` those that write calls of functions, by name; `types` are those
-        of the variables that the code is given.
+        of the variables that the code is given. `lanes` is whether the code is for several lanes side by side (`cpp_lanes`).
         """
+        self.lanes = lanes
+        # Of the lanes side by side, which go through the code that is being written.
+        self.going = cpp_lanes.ALL
         self.rules, self.calls = rules, calls
         self.lines: list[str] = []
         # The texts of functions that the code calls, by name.
@@ -136,13 +145,17 @@ class Writer:
         return "bool" if isinstance(entry, bool) else "int" if isinstance(entry, int) else "double"
 
     def as_type(self, entry, kind: str) -> str:
-        own = self.type_of(entry)
-        return text_of(entry) if own == kind else f"({kind})({text_of(entry)})"
+        return converted(text_of(entry), self.type_of(entry), kind)
 
     def is_wide(self, value: Value) -> bool:
+        wide = KINDS if self.lanes else (WIDE,)
         if isinstance(value, View):
-            return value.kind == WIDE
-        return any(isinstance(entry, str) and self.type_of(entry) == WIDE for entry in value.ravel())
+            return value.kind in wide
+        return any(isinstance(entry, str) and self.type_of(entry) in wide for entry in value.ravel())
+
+    def widened(self, kind: str) -> str:
+        """The type of numbers that are wide, by that of one of them."""
+        return OF_LANES.get(kind, kind) if self.lanes else WIDE
 
     # Arrays.
 
@@ -157,7 +170,7 @@ class Writer:
         """The value in a C array, of this type or wide."""
         if isinstance(value, View):
             return value
-        kind = WIDE if self.is_wide(value) else kind
+        kind = self.widened(kind) if self.is_wide(value) else kind
         entries = value.ravel().tolist()
         first = re.fullmatch(r"(\w+)\[(\d+)\]", str(entries[0])) if entries else None
         if first is not None and self.types[first[1]] == kind:
@@ -176,18 +189,24 @@ class Writer:
             self._blocks[-1][key] = base
         return View(base, (0,), value.shape, natural(value.shape), kind)
 
-    def copy(self, value: Value, base: str, kind: str, start: str = "0", strides=None) -> None:
-        """All numbers into a C array."""
+    def copy(
+        self, value: Value, base: str, kind: str, start: str = "0", strides=None, where: str | None = None
+    ) -> None:
+        """All numbers into a C array; those of lanes `where` that holds, if it is said."""
         strides = natural(value.shape) if strides is None else strides
         into = View(base, (0,) if start == "0" else (0, start), value.shape, strides, kind)
         if isinstance(value, View) and value.size > FEW:
             names = self.loops(value.shape)
-            self.put(f"{into.at(names)} = {converted(value.at(names), value.kind, kind)};")
+            self.set(into.at(names), converted(value.at(names), value.kind, kind), where)
             self.close(len(names))
             return
         entries = self.entries(value)
         for place in np.ndindex(value.shape):
-            self.put(f"{into.at(place)} = {self.as_type(entries[place], kind)};")
+            self.set(into.at(place), self.as_type(entries[place], kind), where)
+
+    def set(self, target: str, text: str, where: str | None = None) -> None:
+        """Give a variable another value; that of lanes `where` that holds, if it is said."""
+        self.put(f"{target} = {text if where is None else f'({where} ? {text} : {target})'};")
 
     def new(self, shape, kind: str) -> View:
         """A view of a new C array."""
@@ -239,6 +258,8 @@ class Writer:
             if len(cases) != 2:
                 raise NotImplementedError("A choice among more than two values has no C++ here; write `jnp.where`.")
             form = "({0} ? {2} : {1})"
+        elif name == "convert_element_type" and self.lanes and self.is_wide(operands[0]):
+            return self._converted_lanes(operands[0], OF_LANES[kind])
         elif name == "convert_element_type":
             value = operands[0]
             if self.is_wide(value) or (isinstance(value, View) and value.kind == kind):
@@ -251,7 +272,8 @@ class Writer:
             form = " * ".join(["{0}"] * abs(power))
             form = form if power > 0 else f"1.0 / ({form})"
         elif name == "rem":
-            form = "__builtin_fmod({}, {})" if kind == "double" else "({} % {})"
+            real = "wp::fmod({}, {})" if self._any_wide_lanes(operands) else "__builtin_fmod({}, {})"
+            form = real if kind == "double" else "({} % {})"
         elif name == "round":
             form = (
                 "wp::round({})"
@@ -259,13 +281,35 @@ class Writer:
                 else "wp::rint({})"
             )
         elif name in BY_NUMBER:
-            form = BY_NUMBER[name]
+            form = self.form_of(name, operands)
         else:
             raise NotImplementedError(f"The primitive `{name}` has no C++ here; write the function without it.")
         return self.each(name, form, operands, kind)
 
+    def form_of(self, name: str, operands: Sequence[Value]) -> str:
+        """The text of a primitive that acts on each number."""
+        own = cpp_lanes.BY_NUMBER if self._any_wide_lanes(operands) else {}
+        return own.get(name, BY_NUMBER[name])
+
+    def _any_wide_lanes(self, operands: Sequence[Value]) -> bool:
+        return self.lanes and any(map(self.is_wide, operands))
+
+    def _converted_lanes(self, value: Value, kind: str) -> Value:
+        if isinstance(value, View):
+            if value.kind == kind:
+                return value
+            into = self.new(value.shape, kind)
+            self.copy(value, into.base, kind)
+            return self.small(into)
+        found = np.empty(value.shape, object)
+        for place, entry in np.ndenumerate(value):
+            found[place] = self.line(self.as_type(entry, kind), kind)
+        return found
+
     def each(self, name: str, form: str, operands: Sequence[Value], kind: str) -> Value:
         """The same for each number."""
+        if self._any_wide_lanes(operands):
+            kind = OF_LANES.get(kind, kind)
         form = keeping_nan(name, form, kind)
         shape = np.broadcast_shapes(*(part.shape for part in operands))
         if count_of(shape) > FEW and not all(map(has_known_numbers, operands)):
@@ -287,11 +331,15 @@ class Writer:
                 views.append(self.view(part, self._plain_type(part, otherwise)).broadcast(shape))
         if kind == "double" and any(map(self.is_wide, operands)):
             kind = WIDE
+        types = [part.kind if isinstance(part, View) else self.type_of(part) for part in views]
+        wanted = self._types_of_operands(name, types, kind)
 
         def write() -> View:
             into = self.new(shape, kind)
             names = self.loops(shape)
             texts = [part.at(names) if isinstance(part, View) else text_of(part) for part in views]
+            if kind in KINDS:
+                texts = list(map(converted, texts, types, wanted))
             if kind == WIDE and name == "select_n":
                 texts[1:] = [f"(wide)({text})" for text in texts[1:]]
             text = form.format(*texts)
@@ -306,6 +354,16 @@ class Writer:
         # Numbers by their texts: 0.0 is not -0.0.
         told = (part if isinstance(part, View) else text_of(part) for part in views)
         return self.once((name, form, kind, shape, *told), arrays, write)
+
+    @staticmethod
+    def _types_of_operands(name: str, types: Sequence[str], kind: str) -> list[str]:
+        """Those that operands have if the result is of lanes side by side."""
+        if name == "select_n":
+            return [TRUTHS, *[kind] * (len(types) - 1)]
+        own = next((found for found in types if found in KINDS), kind)
+        # What holds is less than zero, as a number.
+        own = WHOLES if own == TRUTHS and name not in ("eq", "ne") else own
+        return [own if name in COMPARISONS else kind] * len(types)
 
     def _plain_type(self, value: Value, otherwise: str) -> str:
         """That of the numbers of an array."""
@@ -324,6 +382,11 @@ class Writer:
             kind = WIDE
             if name == "select_n":
                 texts[1:] = [self.as_type(part, WIDE) for part in parts[1:]]
+        types = list(map(self.type_of, parts))
+        if self.lanes and any(own in KINDS for own in types):
+            kind = OF_LANES.get(kind, kind)
+            wanted = self._types_of_operands(name, types, kind)
+            texts = list(map(self.as_type, parts, wanted))
         return self.line(form.format(*texts), kind)
 
     def folded(self, name: str, value: Value, axes, kind: str) -> Value:
@@ -352,6 +415,8 @@ class Writer:
         outer = self.loops(into.shape)
         total = self.name(value.kind, "s")
         neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)
+        if neutral is not None and value.kind in KINDS:
+            neutral = converted(neutral, "bool", value.kind)
         first = dict.fromkeys(axes, "0") | dict(zip(kept, outer, strict=True))
         start = value.at([first[axis] for axis in range(value.ndim)]) if neutral is None else neutral
         self.put(f"{value.kind} {total} = ({value.kind})({start});")
@@ -367,4 +432,7 @@ class Writer:
         """An index, kept between zero and the most, as JAX keeps it."""
         if not isinstance(entry, str):
             return min(max(int(entry), 0), most)
+        if (kind := self.type_of(entry)) in KINDS:
+            least, last = (converted(str(end), "int", kind) for end in (0, most))
+            return self.line(f"({entry} < {least} ? {least} : ({entry} > {last} ? {last} : {entry}))", kind)
         return self.line(f"({entry} < 0 ? 0 : ({entry} > {most} ? {most} : (int)({entry})))", "int")

@@ -21,6 +21,7 @@ from ..foundation.precision import is_known, known_to_numpy
 from .code import jvp_along, with_slopes
 from .kernel import Groups, any_kernel_of, kernel_of, width_for
 from .primitive import is_real, values
+from .warp_library import gpus_for
 
 # The instants of a function without rows.
 NO_ROWS = np.zeros(1)
@@ -88,19 +89,32 @@ class KernelFunction:
         return self.derived(args, still, instants, by_kernel=by_kernel)
 
     def of_many(
-        self, form: Form, given: Float[np.ndarray, "lanes numbers"], instants=NO_ROWS, pool: Executor | None = None
+        self,
+        form: Form,
+        given: Float[np.ndarray, "lanes numbers"],
+        instants=NO_ROWS,
+        pool: Executor | None = None,
+        side_by_side: bool = False,
     ):
         """The results for many trajectories, of which each has a row: all arrays of its arguments, one after the other. The
-        instants are one row, or one for each trajectory.
+        instants are one row, or one for each trajectory. Those `side_by_side` differ by rounding from others.
         """
-        kernel = kernel_of(self, form)
+        kernel = kernel_of(self, form, side_by_side=side_by_side)
         return kernel.results(*kernel.launched(given, np.atleast_2d(instants), pool=pool)[:2])
 
     def of_groups(
-        self, form: Form, shared: int, groups: Groups, given, pool: Executor | None = None, on_gpus: bool = True
+        self,
+        form: Form,
+        shared: int,
+        groups: Groups,
+        given,
+        pool: Executor | None = None,
+        on_gpus: bool = True,
+        side_by_side: bool = False,
     ):
         """The same where so many of the first arrays are `shared` by the trajectories of `groups`, on GPUs only if wanted."""
-        kernel = kernel_of(self, form, shared=shared)
+        side_by_side = side_by_side and not (on_gpus and gpus_for(len(given)))
+        kernel = kernel_of(self, form, shared=shared, side_by_side=side_by_side)
         ends, rows, *_ = kernel.launched(given, np.atleast_2d(NO_ROWS), pool=pool, groups=groups, on_gpus=on_gpus)
         return kernel.results(ends, rows)
 

@@ -12,7 +12,9 @@ from jaxtyping import Float, Int
 from ..foundation.argument_forms import Form
 from ..foundation.blocks import workers
 from ..foundation.kept_programs import kept_value
+from .c_functions import compiler
 from .code import source_from_plain, traced_source
+from .cpp_lanes import declarations
 from .lane_functions import AT_A_TIME, LaneFunction
 from .warp_library import gpus_for, warp
 from .xla_calls import Addresses
@@ -54,15 +56,28 @@ def width_for(directions: int, numbers: int) -> int:
 class Kernel:
     """A compiled kernel: of a `KernelFunction`, or of the one whose derivatives are taken, with so many directions."""
 
-    def __init__(self, function, form: Form, wide: tuple[bool, ...], width: int, shared: int):
+    def __init__(
+        self, function, form: Form, wide: tuple[bool, ...], width: int, shared: int, side_by_side: bool = False
+    ):
         own = function.differentiated if width else function.function
         self.function, self.form, self.wide, self.width = function, form, wide, width
-        self.text = source_from_plain(kept_value(traced_source, own, form, wide, shared))
+        lanes = lanes_side_by_side() if side_by_side else 1
+        try:
+            plain = kept_value(traced_source, own, form, wide, shared, lanes > 1)
+        except NotImplementedError:
+            # What has no code for several lanes may have it for one.
+            plain, lanes = kept_value(traced_source, own, form, wide, shared), 1
+        self.text = source_from_plain(plain)
         places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
-        body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)
+        if lanes > 1:
+            body, before = _body_of_lanes(self.text.source, self.text.widths, shared, lanes), declarations(lanes) + "\n"
+        else:
+            body = (_SHARED if shared else "") + _body(self.text.source, self.text.widths, width)
+            before = ""
         # One program, as everything about a kernel that is traced.
         self.traced_results = jax.jit(self.results)
-        self.of_lanes = LaneFunction(body, [f"{name}_" for name in places], [f"{name}_" for name in sizes])
+        names = [f"{name}_" for name in places], [f"{name}_" for name in sizes]
+        self.of_lanes = LaneFunction(body, *names, lanes, before)
 
     def launched(
         self,
@@ -80,7 +95,8 @@ class Kernel:
         found = tuple(np.zeros(shape) for shape in self.shapes(given.shape[:-1], instants.shape[-1]))
         rows = [np.ascontiguousarray(part) for part in (given, _NO_DOTS if dots is None else dots, instants)]
         # Several tangents side by side are a type of the compiler for CPUs.
-        if on_gpus and self.width <= 1 and (devices := gpus_for(len(given))):
+        alone = self.width <= 1 and self.of_lanes.side_by_side == 1
+        if on_gpus and alone and (devices := gpus_for(len(given))):
             self._launch_on(devices, rows, found, groups)
         else:
             self.launch([(array.ctypes.data, array.shape) for array in (*rows, *found)], pool, groups)
@@ -154,15 +170,23 @@ _ANY: dict = {}
 _making = threading.RLock()
 
 
-def kernel_of(function, form: Form, wide: tuple[bool, ...] = (), width: int = 0, shared: int = 0) -> Kernel:
+def kernel_of(
+    function,
+    form: Form,
+    wide: tuple[bool, ...] = (),
+    width: int = 0,
+    shared: int = 0,
+    side_by_side: bool = False,
+) -> Kernel:
     """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`. So
-    many of the first arrays are `shared` by the trajectories of a group.
+    many of the first arrays are `shared` by the trajectories of a group. Several trajectories `side_by_side` take a third of the
+    time that they take one by one; one alone takes longer.
     """
-    key = function, form.kept, wide, width, shared
+    key = function, form.kept, wide, width, shared, side_by_side
     if key not in _KERNELS:
         with _making:
             if key not in _KERNELS:
-                _KERNELS[key] = Kernel(function, form, wide, width, shared)
+                _KERNELS[key] = Kernel(function, form, wide, width, shared, side_by_side)
                 _ANY.setdefault((function, form.kept), _KERNELS[key])
     return _KERNELS[key]
 
@@ -187,5 +211,32 @@ double* ends = (double*)ends_ + lane_ * {ends};
 double* rows = (double*)rows_ + lane_ * count * {rows};
 wide* end_dots = (wide*)end_dots_ + lane_ * {end_dots};
 wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else 1};
+{source}
+"""
+
+
+def lanes_side_by_side() -> int:
+    """How many lanes go side by side on this processor: as many as its vectors have numbers in double precision, or two vectors."""
+    own = compiler()
+    if own is None:
+        return 1
+    return 8 if "avx512f" in own.target else 4
+
+
+def _body_of_lanes(source: str, widths: tuple[int, ...], shared: int, lanes: int) -> str:
+    """The code for several lanes side by side. After the last one it goes on with that."""
+    ends, rows, *_ = widths
+    group = f"for (int l = 0; l < {lanes}; ++l) shared.of[l] = (const double*)shared_ + (long long)each_ * groups[own[l]];"
+    return f"""
+const int lanes = last - lane < {lanes} ? last - lane : {lanes};
+long long own[{lanes}];
+for (int l = 0; l < {lanes}; ++l) own[l] = lane + (l < lanes ? l : lanes - 1);
+const long long count = count_;
+Rows given, instants{", shared" if shared else ""};
+for (int l = 0; l < {lanes}; ++l) given.of[l] = (const double*)given_ + own[l] * numbers_;
+for (int l = 0; l < {lanes}; ++l) instants.of[l] = (const double*)instants_ + own[l] * step_;
+{f"const int* groups = (const int*)groups_; {group}" if shared else ""}
+NewRows ends{{(double*)ends_ + own[0] * {ends}, {ends}, lanes}};
+NewRows rows{{(double*)rows_ + own[0] * count * {rows}, count * {rows}, lanes}};
 {source}
 """

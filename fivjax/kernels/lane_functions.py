@@ -25,8 +25,14 @@ class LaneFunction:
     The code must use nothing of Warp but what `c_functions` declares, too.
     """
 
-    def __init__(self, body: str, addresses: Sequence[str], numbers: Sequence[str] = ()):
+    def __init__(
+        self, body: str, addresses: Sequence[str], numbers: Sequence[str] = (), side_by_side: int = 1, before: str = ""
+    ):
+        """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the latest;
+        that is for CPUs only. `before` are declarations.
+        """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
+        self.side_by_side, self.before = side_by_side, before
 
     @functools.cached_property
     def on_cpu(self) -> Callable:
@@ -35,10 +41,12 @@ class LaneFunction:
             return functools.partial(launched, self.of_warp, "cpu")
         told = [*(f"unsigned long long {name}" for name in self.addresses), *(f"int {name}" for name in self.numbers)]
         names = ", ".join((*self.addresses, *self.numbers))
+        step, given = ("++lane", "lane") if self.side_by_side == 1 else (f"lane += {self.side_by_side}", "lane, last")
+        takes = ", ".join(f"const {one}" for one in [*(f"int {name}" for name in given.split(", ")), *told])
         source = (
-            f"static void of_lane(const int lane, {', '.join(f'const {one}' for one in told)}) {{\n{self.body}\n}}\n"
+            f"{self.before}static void of_lane({takes}) {{\n{self.body}\n}}\n"
             f'extern "C" void of_lanes(int first, int last, {", ".join(told)}) {{\n'
-            f"    for (int lane = first; lane < last; ++lane) of_lane(lane, {names});\n}}\n"
+            f"    for (int lane = first; lane < last; {step}) of_lane({given}, {names});\n}}\n"
         )
         numbers = [ctypes.c_int32] * len(self.numbers)
         types = [ctypes.c_int32, ctypes.c_int32, *[ctypes.c_uint64] * len(self.addresses), *numbers]
@@ -58,7 +66,7 @@ class LaneFunction:
         def run(part: tuple[int, int]) -> None:
             self.on_cpu(*part, *args)
 
-        in_threads(run, _parts(lanes, parts), pool or _threads(), min(parts, workers()))
+        in_threads(run, _parts(lanes, parts, self.side_by_side), pool or _threads(), min(parts, workers()))
 
     def on_gpus(
         self, devices: Sequence[str], rows: Sequence[np.ndarray], found: Sequence[np.ndarray], call: Callable
@@ -78,9 +86,9 @@ class LaneFunction:
                 whole[first:last] = array.numpy()
 
 
-def _parts(lanes: int, parts: int) -> Iterable[tuple[int, int]]:
-    ends = np.linspace(0, lanes, parts + 1).astype(int).tolist()
-    return [part for part in pairwise(ends) if part[0] < part[1]]
+def _parts(lanes: int, parts: int, at_a_time: int = 1) -> Iterable[tuple[int, int]]:
+    ends = np.linspace(0, -(-lanes // at_a_time), parts + 1).astype(int) * at_a_time
+    return [part for part in pairwise(np.minimum(ends, lanes).tolist()) if part[0] < part[1]]
 
 
 @functools.cache

@@ -69,7 +69,9 @@ class Capture:
         batch, tree, scene = self.batch, self.batch.shared.tree, self.batch.task.scene
         exact = batch.kernels is not None or isinstance(batch.task.method, EventExact)
         # Return maps are exact whatever follows the trajectories.
-        kernels = batch.matrix_kernels or section_kernels(scene, tree.mechanics, tree.longest_return, batch.pool)
+        kernels = batch.matrix_kernels or section_kernels(
+            scene, tree.mechanics, tree.longest_return, batch.pool, side_by_side=True
+        )
         known_to = ROUNDED if exact else INTERPOLATED
         return ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, kernels, batch.pool, known_to)
 

@@ -69,7 +69,8 @@ class TrajectoryKernels:
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further by series, in place."""
         columns, now = trajectories.tree
-        after = self._of_each(_follow, group, (columns, now, np.full(len(group), steps, np.int32)), on_gpus=True)
+        given = columns, now, np.full(len(group), steps, np.int32)
+        after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=True)
         trajectories.numbers[:, columns.shape[-1] :] = numbers_in_rows(after)
 
     def conclude(
@@ -89,12 +90,20 @@ class TrajectoryKernels:
         first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], own)
         return Form.of((self.of_task, self.first, *first))[0]
 
-    def _of_each(self, function: KernelFunction, group: np.ndarray, own: tuple, on_gpus: bool = False):
+    def _of_each(
+        self,
+        function: KernelFunction,
+        group: np.ndarray,
+        own: tuple,
+        on_gpus: bool = False,
+        side_by_side: bool = False,
+    ):
         """The results of a kernel for each trajectory, of its group's data and its own. What takes few steps is over on a CPU
         before another kernel is compiled.
         """
         form, given, parts = self._form(own), numbers_in_rows(own), []
         for rows in in_parts(len(group), 8 * given.shape[1]):
             groups = Groups.of(self.table, group[rows])
-            parts.append(function.of_groups(form, self.shared, groups, given[rows], self.pool, on_gpus)[0])
+            run = function.of_groups(form, self.shared, groups, given[rows], self.pool, on_gpus, side_by_side)
+            parts.append(run[0])
         return jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]

@@ -20,8 +20,8 @@ AT_A_TIME = 2**26
 class SectionKernels:
     """The return maps of groups, by their mechanics and longest returns (s), whose arrays have a leading axis over groups."""
 
-    def __init__(self, whose, pool: Executor | None):
-        self.whose, self.pool = whose, pool
+    def __init__(self, whose, pool: Executor | None, side_by_side: bool = False):
+        self.whose, self.pool, self.side_by_side = whose, pool, side_by_side
         self.table = numbers_in_rows(whose)
         # The state comes after what is the group's.
         self.state = len(jax.tree.leaves(whose))
@@ -32,7 +32,9 @@ class SectionKernels:
         form, given = self._rows(group, y, status, direction, crossings, peaks)
         numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
         parts = [
-            motion_to_section.of_many(form, given[rows], numbers[rows], self._pool_for(numbers[rows, -1]))
+            motion_to_section.of_many(
+                form, given[rows], numbers[rows], self._pool_for(numbers[rows, -1]), self.side_by_side
+            )
             for rows in in_parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
         ]
         end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]
@@ -67,9 +69,13 @@ class SectionKernels:
         return self.form, np.concatenate([self.table[group], y, *contact, own], axis=1)
 
 
-def section_kernels(scene: Scene, mechanics, longest_return, pool: Executor | None) -> SectionKernels | None:
-    """The kernels of groups of scenes like this one; None where there are none."""
-    return SectionKernels((mechanics, longest_return), pool) if has_kernel(scene, EventExact()) else None
+def section_kernels(
+    scene: Scene, mechanics, longest_return, pool: Executor | None, side_by_side: bool = False
+) -> SectionKernels | None:
+    """The kernels of groups of scenes like this one, for many trajectories if they go `side_by_side`; None where there are
+    none.
+    """
+    return SectionKernels((mechanics, longest_return), pool, side_by_side) if has_kernel(scene, EventExact()) else None
 
 
 def _on_section(end: Arrival):
