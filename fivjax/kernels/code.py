@@ -17,8 +17,8 @@ from ..foundation.plain_trees import from_text, structure_to_text
 from ..foundation.precision import own_settings
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers
 from .cpp_code import writer
-from .cpp_loops import scan
 from .cpp_lanes import OF_LANES, REALS
+from .cpp_loops import scan
 from .cpp_numbers import WIDE, converted, kind_of
 from .cpp_writer import Writer
 
@@ -77,8 +77,8 @@ def traced_source(
     function: Callable, form: Form, wide: tuple[bool, ...], shared: int = 0, lanes: bool = False
 ) -> tuple:
     """A `KernelSource`, in plain values, of a function of a form's arguments and of instants; with tangents along those of its
-    arrays that are `wide`. So many of the first arrays are `shared` by the trajectories of a group. `lanes` is whether it is for
-    several lanes side by side, without tangents.
+    arrays that are `wide`. So many of the first arrays are `shared` by the trajectories of a group. `lanes` is whether it is
+    for several lanes side by side, without tangents.
     """
     like = [jax.ShapeDtypeStruct(*array) for array in form.arrays]
     instants = jax.ShapeDtypeStruct((2,), np.dtype("float64"))
@@ -245,8 +245,8 @@ def _given(writer: Writer, base: str, variables) -> list[Value]:
 
 
 def _loaded(source: str, arrays: dict[str, Sequence]) -> str:
-    """The code with what it reads of the lanes' rows put side by side before: single numbers, or all of a row if it goes through
-    parts of it by loops.
+    """The code with what it reads of the lanes' rows put side by side before: single numbers, or all of a row if it goes
+    through parts of it by loops.
     """
     before = []
     for name, variables in arrays.items():

@@ -6,8 +6,8 @@ import numpy as np
 
 from ..foundation.numpy_primitives import gathered_places, scattered_places
 from .cpp_arrays import Value, View, count_of, has_known_numbers, natural, of_numbers, reshaped
-from .cpp_lanes import KINDS, OF_LANES, WHOLES
-from .cpp_numbers import BY_NUMBER, WIDE, kind_of, text_of
+from .cpp_lanes import KINDS, OF_LANES, TRUTHS, WHOLES
+from .cpp_numbers import BY_NUMBER, kind_of
 from .cpp_writer import FEW, Writer
 
 # Reductions, by the primitive that they repeat, and running totals.
@@ -29,15 +29,44 @@ def _dynamic_slice(writer: Writer, equation, operands, kind: str) -> Value:
     return writer.small(_from(writer, view, starts, sizes))
 
 
-def _from(writer: Writer, view: View, starts, sizes) -> View:
+def _from(writer: Writer, view: View, starts, sizes) -> Value:
     part, at = _part(writer, view, starts, sizes)
     if at is None:
         return part
+    # Of few places one is chosen in less time than numbers are gathered.
+    few = 4
+    ways = [
+        own - size + 1 for start, size, own in zip(starts, sizes, view.shape, strict=True) if _differs(writer, start)
+    ]
+    if len(ways) == 1 and ways[0] <= few and part.size <= FEW:
+        return _chosen(writer, view, starts, sizes, ways[0])
     # The lanes' numbers from different places, side by side.
     into = writer.new(part.shape, OF_LANES.get(part.kind, part.kind))
     for place in np.ndindex(part.shape):
         writer.put(f"{into.at(place)} = picked({part.base}, {_address(part, at, place)});")
     return into
+
+
+def _differs(writer: Writer, start) -> bool:
+    """Whether a place differs from lane to lane."""
+    entry = writer.entries(start).item()
+    return isinstance(entry, str) and writer.type_of(entry) in KINDS
+
+
+def _chosen(writer: Writer, view: View, starts, sizes, ways: int) -> np.ndarray:
+    """The part of an array from one of so few places on, which differs from lane to lane."""
+    (at,) = (writer.entries(start).item() for start in starts if _differs(writer, start))
+    parts = []
+    for way in range(ways):
+        own = [of_numbers(way) if _differs(writer, start) else start for start in starts]
+        parts.append(_from(writer, view, own, sizes).entries())
+    kind, found = writer.widened(view.kind), parts[-1]
+    for way in reversed(range(ways - 1)):
+        here, choice = writer.line(f"{at} <= ({WHOLES})({way})", TRUTHS), np.empty(found.shape, object)
+        for place in np.ndindex(found.shape):
+            choice[place] = writer.one("select_n", CHOICE, [here, found[place], parts[way][place]], kind)
+        found = choice
+    return found
 
 
 def _part(writer: Writer, view: View, starts, sizes) -> tuple[View, str | None]:
@@ -111,11 +140,13 @@ def _gather(writer: Writer, equation, operands, kind: str) -> Value:
             starts[axis] = of_numbers(batch[of_batch])
         for position, axis in enumerate(numbers.start_index_map):
             starts[axis] = np.asarray(places[(*batch, position)], object)
-        part = _from(writer, view, starts, sizes)
-        parts[batch] = part.selected(part.offset, kept)
+        parts[batch] = _from(writer, view, starts, sizes)
     for place in np.ndindex(found.shape):
         batch = tuple(at for axis, at in enumerate(place) if axis not in numbers.offset_dims)
-        found[place] = parts[batch].at([place[axis] for axis in numbers.offset_dims])
+        own = dict(zip(kept, (place[axis] for axis in numbers.offset_dims), strict=True))
+        index = tuple(own.get(axis, 0) for axis in range(view.ndim))
+        part = parts[batch]
+        found[place] = part.at(index) if isinstance(part, View) else part[index]
     return found
 
 
@@ -203,16 +234,18 @@ def _sort(writer: Writer, equation, operands) -> list[Value]:
     """By insertion, which is stable; what belongs to the keys is moved with them."""
     if operands[0].ndim != 1 or equation.params["num_keys"] != 1:
         raise NotImplementedError("Only rows of numbers are sorted in C++ here, by one key.")
-    if writer.lanes:
-        raise NotImplementedError("Rows of several lanes side by side are not sorted in C++ here.")
+    of_lanes = writer.lanes and any(map(writer.is_wide, operands))
     kinds = [
-        WIDE if writer.is_wide(part) else kind_of(variable.aval)
+        writer.widened(kind_of(variable.aval)) if of_lanes or writer.is_wide(part) else kind_of(variable.aval)
         for part, variable in zip(operands, equation.outvars, strict=True)
     ]
     rows = [writer.new(part.shape, kind) for part, kind in zip(operands, kinds, strict=True)]
     for row, part in zip(rows, operands, strict=True):
         writer.copy(part, row.base, row.kind)
     own, at = writer.name("int", "i"), writer.name("int", "i")
+    if of_lanes:
+        _sort_lanes(writer, rows, own, at)
+        return list(map(writer.small, rows))
     kept = [writer.name(kind, "x") for kind in kinds]
     writer.open(f"for (int {own} = 1; {own} < {rows[0].size}; ++{own})")
     for row, name in zip(rows, kept, strict=True):
@@ -224,6 +257,21 @@ def _sort(writer: Writer, equation, operands) -> list[Value]:
         writer.put(f"{row.base}[{at} + 1] = {name};")
     writer.close()
     return list(map(writer.small, rows))
+
+
+def _sort_lanes(writer: Writer, rows: list[View], own: str, at: str) -> None:
+    """The same for lanes side by side: neighbours change places where they must, until none can."""
+    writer.open(f"for (int {own} = {rows[0].size} - 1; {own} > 0; --{own})")
+    writer.open(f"for (int {at} = 0; {at} < {own}; ++{at})")
+    later = writer.name(TRUTHS)
+    writer.put(f"const {TRUTHS} {later} = {rows[0].base}[{at}] > {rows[0].base}[{at} + 1];")
+    for row in rows:
+        first, second = f"{row.base}[{at}]", f"{row.base}[{at} + 1]"
+        kept = writer.name(row.kind, "x")
+        writer.put(f"const {row.kind} {kept} = {first};")
+        writer.put(f"{first} = ({later} ? {second} : {kept});")
+        writer.put(f"{second} = ({later} ? {kept} : {second});")
+    writer.close(2)
 
 
 def _running(name: str) -> Callable:

@@ -179,8 +179,8 @@ def kernel_of(
     side_by_side: bool = False,
 ) -> Kernel:
     """The kernel of a function for arguments of a form; with tangents in so many directions, along arrays that are `wide`. So
-    many of the first arrays are `shared` by the trajectories of a group. Several trajectories `side_by_side` take a third of the
-    time that they take one by one; one alone takes longer.
+    many of the first arrays are `shared` by the trajectories of a group. Several trajectories `side_by_side` take a quarter of
+    the time that they take one by one; one alone takes longer.
     """
     key = function, form.kept, wide, width, shared, side_by_side
     if key not in _KERNELS:
@@ -216,7 +216,7 @@ wide* row_dots = (wide*)row_dots_ + lane_ * {f"count * {row_dots}" if width else
 
 
 def lanes_side_by_side() -> int:
-    """How many lanes go side by side on this processor: as many as its vectors have numbers in double precision, or two vectors."""
+    """How many lanes go side by side on this processor: what one of its vectors holds, or two of the shortest."""
     own = compiler()
     if own is None:
         return 1
@@ -226,7 +226,9 @@ def lanes_side_by_side() -> int:
 def _body_of_lanes(source: str, widths: tuple[int, ...], shared: int, lanes: int) -> str:
     """The code for several lanes side by side. After the last one it goes on with that."""
     ends, rows, *_ = widths
-    group = f"for (int l = 0; l < {lanes}; ++l) shared.of[l] = (const double*)shared_ + (long long)each_ * groups[own[l]];"
+    group = (
+        f"for (int l = 0; l < {lanes}; ++l) shared.of[l] = (const double*)shared_ + (long long)each_ * groups[own[l]];"
+    )
     return f"""
 const int lanes = last - lane < {lanes} ? last - lane : {lanes};
 long long own[{lanes}];

@@ -28,8 +28,8 @@ class LaneFunction:
     def __init__(
         self, body: str, addresses: Sequence[str], numbers: Sequence[str] = (), side_by_side: int = 1, before: str = ""
     ):
-        """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the latest;
-        that is for CPUs only. `before` are declarations.
+        """For several lanes side by side, of which `lane` is the first, the body is told by `last` where they end at the
+        latest; that is for CPUs only. `before` are declarations.
         """
         self.body, self.addresses, self.numbers = body, tuple(addresses), tuple(numbers)
         self.side_by_side, self.before = side_by_side, before

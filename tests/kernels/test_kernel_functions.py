@@ -1,5 +1,6 @@
 """JAX functions written out as C++ and computed by kernels: against JAX itself, with loops, branches, tables and tangents."""
 
+import functools
 import itertools
 import re
 
@@ -70,6 +71,123 @@ def test_what_a_kernel_computes_is_what_jax_does(size):
     for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert own.dtype == other.dtype
         np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-12)
+
+
+def rows_of(size, lanes):
+    """Lanes of different numbers and lengths of loops."""
+    random = np.random.default_rng(size)
+    _, matrix, _ = given(size)
+    numbers = [random.normal(size=(lanes, size)), np.broadcast_to(matrix.ravel(), (lanes, size * size))]
+    return np.concatenate([*numbers, random.integers(0, 12, (lanes, 1))], axis=1)
+
+
+@pytest.mark.parametrize("size", [4, 9])
+def test_lanes_side_by_side_are_what_they_are_alone(size):
+    """They go through loops of different lengths, other branches and other places; and none depends on its neighbours."""
+    rows, instants = rows_of(size, 21), np.random.default_rng(0).normal(size=(21, 6))
+    form = Form.of(given(size))[0]
+    alone, found = (KERNEL.of_many(form, rows, instants, side_by_side=side) for side in (False, True))
+    assert kernel_of(KERNEL, form.kept, side_by_side=True).of_lanes.side_by_side > 1
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-12)
+    some = np.random.default_rng(1).permutation(21)[:10]
+    again = KERNEL.of_many(form, rows[some], instants[some], side_by_side=True)
+    for own, other in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(own, other[some])
+
+
+def by_numbers(args, instants):
+    x, y = args
+    bits = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.uint64)
+    whole, true = jnp.round(jnp.where(jnp.isfinite(x), 3 * jnp.tanh(x), 0.0)).astype(jnp.int32), x > y
+    return {
+        "smooth": [
+            jnp.exp(x),
+            jnp.log(jnp.abs(x)),
+            jnp.log1p(jnp.abs(x)),
+            jnp.expm1(x),
+            jnp.tanh(x),
+            jnp.cbrt(x),
+            2.0**x,
+        ],
+        "rounded": [
+            jnp.sign(x),
+            jnp.floor(x),
+            jnp.ceil(x),
+            jnp.round(x),
+            jnp.fmod(x, y),
+            jnp.clip(x, -0.5, y),
+            x**3,
+            x**-2,
+        ],
+        "powers": [jnp.abs(x) ** y, jnp.arctan2(x, y), jnp.hypot(x, y), jax.nn.sigmoid(x), jax.lax.rsqrt(jnp.abs(x))],
+        "whole": [
+            whole,
+            whole % 2,
+            jnp.maximum(whole, 1),
+            whole.astype(x.dtype),
+            true.astype(jnp.int32),
+            -whole,
+            whole * whole,
+        ],
+        "true": [
+            true,
+            ~true,
+            true & (x > 0),
+            true | (y > 0),
+            true ^ (x > 0),
+            jnp.isfinite(x),
+            whole == 1,
+            jnp.isnan(x / y),
+        ],
+        "extreme": [
+            jnp.maximum(x, y),
+            jnp.minimum(x, y),
+            jnp.argmax(x),
+            jnp.argmin(x),
+            jnp.argmax(true),
+            jnp.max(x),
+            jnp.any(true),
+        ],
+        "power of two": jax.lax.bitcast_convert_type(bits(x) & bits(jnp.array(jnp.inf)), x.dtype),
+    }, ()
+
+
+def test_functions_of_lanes_side_by_side_are_those_of_jax():
+    """With numbers that are none, infinite or zero, too."""
+    random, kernel = np.random.default_rng(3), KernelFunction(by_numbers)
+    rows = random.normal(size=(40, 6)) * np.exp(random.uniform(-3, 3, (40, 1)))
+    rows[:, 0] = [
+        *np.geomspace(1e-300, 1e300, 20),
+        *-np.geomspace(1e-300, 1e300, 14),
+        0.0,
+        np.inf,
+        -np.inf,
+        np.nan,
+        709.7,
+        -745.1,
+    ]
+    form = Form.of((rows[0, :3], rows[0, 3:]))[0]
+    found, _ = kernel.of_many(form, rows, side_by_side=True)
+    with jax.enable_x64(True):
+        expected, _ = jax.jit(jax.vmap(lambda row: by_numbers((row[:3], row[3:]), None)))(rows)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        if own.dtype == float:
+            # The cube root of very large and small numbers is the one with such an error: that of XLA.
+            np.testing.assert_allclose(own, other, rtol=2e-14, atol=1e-307)
+        else:
+            np.testing.assert_array_equal(own, other)
+
+
+@pytest.mark.parametrize("size", [3, 6])
+def test_systems_of_lanes_side_by_side_are_solved(size):
+    """Whose largest entries are in other rows from lane to lane."""
+    random = np.random.default_rng(size)
+    matrices, rights = random.normal(size=(11, size, size)), random.normal(size=(11, size, 2))
+    kernel, form = KernelFunction(lambda args, instants: (solve(*args), ())), Form.of((matrices[0], rights[0]))[0]
+    rows = np.concatenate([matrices.reshape(11, -1), rights.reshape(11, -1)], axis=1)
+    found, _ = kernel.of_many(form, rows, side_by_side=True)
+    np.testing.assert_allclose(found, np.linalg.solve(matrices, rights), rtol=1e-9)
 
 
 def loss(of, x, matrix, instants):
