@@ -19,7 +19,7 @@ OF_LANES = {
 KINDS = (REALS, TRUTHS, WHOLES)
 # The primitives that are written in another way than for one lane.
 BY_NUMBER = {
-    "sign": "({0} > (reals)(0.0) ? (reals)(1.0) : ({0} < (reals)(0.0) ? (reals)(-1.0) : {0}))",
+    "sign": "sign({})",
     "exp2": "wp::pow((reals)(2.0), {})",
     "log1p": "wp::log1p({})",
     "expm1": "wp::expm1({})",
@@ -98,6 +98,8 @@ def declarations(lanes: int) -> str:
         *(_of_vectors(name, own) for name, own in BY_VECTORS.items() if own),
         _of_numbers("fmod", ("x", "y"), "__builtin_fmod"),
         SERIES,
+        "template <class T> static inline T sign(const T x) {",
+        "  return (x > (T)(0) ? (T)(1) : (x < (T)(0) ? (T)(-1) : x)); }",
         # Numbers at places of arrays that differ from lane to lane.
         "template <class T> static inline T picked(const T* all, const wholes at) {",
         f"  T found; for (int l = 0; l < {lanes}; ++l) found[l] = all[at[l]][l]; return found; }}",

@@ -80,11 +80,12 @@ class AbstractFriction(eqx.Module):
         slope, bend = self.variation(slip_speed)
         return slope, jnp.full_like(bend, jnp.inf) if self.may_have_kinks else bend
 
-    def largest(self, fastest: Float[Array, ""]) -> Float[Array, ""]:
-        """The largest coefficient from rest to this slip speed (m/s), as far as looking at some speeds shows."""
+    def largest(self, fastest: Float[Array, "*contacts"]) -> Float[Array, "*contacts"]:
+        """The largest coefficient from rest to each of these slip speeds (m/s), as far as looking at some speeds shows."""
         # Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
         looked_at = np.linspace(0.0, 1.0, 33)
-        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(fastest * looked_at)))
+        speeds = looked_at.reshape(-1, *(1,) * jnp.ndim(fastest)) * fastest
+        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(speeds), axis=0))
 
     def in_time(self, slip_speed: Float[Array, ""], order: int) -> NextTerm:
         """How the Taylor series in time of μ goes on from this slip speed, up to some order."""

@@ -128,6 +128,7 @@ def by_numbers(args, instants):
             whole.astype(x.dtype),
             true.astype(jnp.int32),
             -whole,
+            jnp.sign(whole),
             whole * whole,
         ],
         "true": [
