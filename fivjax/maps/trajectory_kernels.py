@@ -14,6 +14,7 @@ from ..foundation.flattened import Flattened, flatten
 from ..kernels.functions import KernelFunction
 from ..kernels.kernel import Groups, kernel_of
 from ..section.by_kernel import in_parts, numbers_in_rows
+from ..steppers.kernel_scope import goes_side_by_side
 from ..steppers.propagation import Propagation
 from .groups import Task
 from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
@@ -48,7 +49,7 @@ class TrajectoryKernels:
     """The kernels for a batch, with the data of its groups."""
 
     def __init__(self, task: Task, shared: Flattened, pool: Executor):
-        self.of_task = TaskConstants.of(task)
+        self.of_task, self.side_by_side = TaskConstants.of(task), goes_side_by_side(task.scene)
         # Without the matrices of `Propagation`, which have a kernel of their own.
         without = eqx.tree_at(lambda own: own.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
         of_groups = in_pairs(jax.tree.map(np.asarray, without))
@@ -70,7 +71,7 @@ class TrajectoryKernels:
         """Trajectories so many steps further by series, in place."""
         columns, now = trajectories.tree
         given = columns, now, np.full(len(group), steps, np.int32)
-        after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=True)
+        after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=self.side_by_side)
         trajectories.numbers[:, columns.shape[-1] :] = numbers_in_rows(after)
 
     def conclude(

@@ -10,7 +10,7 @@ from ..contact import Contact
 from ..foundation.argument_forms import Form
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
-from ..steppers.kernel_scope import has_kernel
+from ..steppers.kernel_scope import goes_side_by_side, has_kernel
 from .crossings import Arrival, ByMethod, Point, motion_to_section
 
 # Rows of numbers for a kernel are put together for so many bytes at a time.
@@ -75,7 +75,9 @@ def section_kernels(
     """The kernels of groups of scenes like this one, for many trajectories if they go `side_by_side`; None where there are
     none.
     """
-    return SectionKernels((mechanics, longest_return), pool, side_by_side) if has_kernel(scene, EventExact()) else None
+    if not has_kernel(scene, EventExact()):
+        return None
+    return SectionKernels((mechanics, longest_return), pool, side_by_side and goes_side_by_side(scene))
 
 
 def _on_section(end: Arrival):

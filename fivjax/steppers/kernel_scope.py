@@ -34,6 +34,13 @@ def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
     )
 
 
+def goes_side_by_side(scene: Scene) -> bool:
+    """Whether many motions of such scenes take less time side by side in a processor's vectors: with more contacts, all of them
+    wait in most steps for an event of one.
+    """
+    return len(scene.structure.contacts) <= 3
+
+
 @functools.cache
 def _tell_once() -> None:
     warnings.warn(
