@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..attractors.approach import Approach
 from ..attractors.catalogue import Attractors, CapturingSet, Catalogue
-from ..attractors.cycles import Recurrence, StableCycle
+from ..attractors.cycles import Recurrence
 from ..attractors.divergence import long_divergence
 from ..attractors.long_run import fates
 from ..attractors.motions import Motions, far_apart
@@ -193,14 +193,17 @@ def later(
     return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 
-def attractor_columns(count: int, attractor: dict[int, CapturingSet], chaotic: np.ndarray):
-    """Kind, amplitude, period, multiplier, reach and contraction of the attractor of each of so many trajectories."""
+def attractor_columns(count: int, attractor: dict[int, CapturingSet], chaotic: np.ndarray) -> dict[str, np.ndarray]:
+    """What results say of the attractor of each of so many trajectories, by their names of it."""
     kind = np.where(chaotic, CHAOTIC, NO_ATTRACTOR).astype(np.int8)
-    amplitude, period, multiplier, reach, contraction = np.full((5, count), np.nan)
+    told = ("amplitude", "period", "reach", "contraction", "multiplier")
+    numbers = dict(zip(told, np.full((len(told), count), np.nan), strict=True))
     for row, captor in attractor.items():
         one = captor.cycle if isinstance(captor, Approach) else captor
         kind[row] = APPROACHED if one is not captor else TORUS if isinstance(one, Torus) else PERIODIC
-        amplitude[row], period[row], reach[row] = one.amplitude, one.period, one.reach
-        contraction[row] = one.contraction
-        multiplier[row] = one.multiplier if isinstance(one, StableCycle) else np.nan
-    return kind, amplitude, period, multiplier, reach, contraction
+        for name in told:
+            numbers[name][row] = getattr(one, name, np.nan)
+    return {
+        "amplitude": numbers.pop("amplitude"),
+        **{f"attractor_{k}": v for k, v in {"kind": kind, **numbers}.items()},
+    }

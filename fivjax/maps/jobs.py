@@ -25,7 +25,7 @@ from .capture import Capture, attractor_columns
 from .following import Batch, advance_all, begin_all
 from .groups import Task, groups_of
 from .job_files import JobFile, JobState
-from .results import EndedTrajectories, Verdicts, not_run, record
+from .results import Verdicts, not_run, record
 
 # How long trajectories are followed after the last jump of their load, unless told: so many periods of the slowest mode, or so
 # many seconds if none oscillates.
@@ -140,9 +140,9 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             pending, now, finished & (verdict == Verdict.UNDECIDED), proving=task.limits.t_max is None
         )
         verdict[list(late.attractor)], verdict[late.sliding] = Verdict.LIMIT_CYCLE, Verdict.SLIDING
-        ended = EndedTrajectories(verdict, *attractor_columns(len(pending), entered | late.attractor, late.chaotic))
+        ended = verdict, attractor_columns(len(pending), entered | late.attractor, late.chaotic)
         rows = np.flatnonzero(finished)
-        record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, ended)))
+        record(verdicts, pending[finished], *(_rows(part, rows) for part in (late.now, *ended)))
         pending, trajectories = pending[~finished], trajectories.compacted(np.flatnonzero(~finished))
         # A run that begins here comes to the same: it finds nothing more to conclude.
         file.note(state(), at_once=done == known_from or done >= own_from)

@@ -49,18 +49,11 @@ def not_run(total: int, energy: bool) -> Verdicts:
         "energy_residual",
         "energy_exchanged",
     )
-    return Verdicts(
+    numbers = {name: np.full(total, np.nan) for name in Verdicts._fields}
+    return Verdicts(**numbers)._replace(
         verdict=np.full(total, Verdict.NOT_RUN, np.int8),
-        amplitude=np.full(total, np.nan),
         attractor_kind=np.full(total, NO_ATTRACTOR, np.int8),
-        attractor_period=np.full(total, np.nan),
-        attractor_multiplier=np.full(total, np.nan),
-        attractor_reach=np.full(total, np.nan),
-        attractor_contraction=np.full(total, np.nan),
-        bound=np.full(total, np.nan),
-        decided_at=np.full(total, np.nan),
         events=np.zeros(total, np.int32),
-        last_event=np.full(total, np.nan),
         energy={name: np.full(total, np.nan) for name in energies} if energy else {},
     )
 
@@ -71,27 +64,13 @@ def by_name(verdicts: Verdicts) -> dict[str, np.ndarray]:
     return {**parts.pop("energy"), **parts}
 
 
-class EndedTrajectories(NamedTuple):
-    """Verdicts of trajectories, and the attractors that have captured them."""
-
-    verdict: np.ndarray
-    kind: np.ndarray
-    amplitude: np.ndarray
-    period: np.ndarray
-    multiplier: np.ndarray
-    reach: np.ndarray
-    contraction: np.ndarray
-
-
-def record(verdicts: Verdicts, index: np.ndarray, now: Progress, ended: EndedTrajectories) -> None:
-    """Write the results of trajectories that have ended at their indices."""
-    verdict = ended.verdict
-    verdicts.amplitude[index] = np.where(verdict == Verdict.SLIDING, 0.0, ended.amplitude)
-    verdicts.attractor_kind[index] = ended.kind
-    verdicts.attractor_period[index] = ended.period
-    verdicts.attractor_multiplier[index] = ended.multiplier
-    verdicts.attractor_reach[index] = ended.reach
-    verdicts.attractor_contraction[index] = ended.contraction
+def record(
+    verdicts: Verdicts, index: np.ndarray, now: Progress, verdict: np.ndarray, attractors: dict[str, np.ndarray]
+) -> None:
+    """Write the results of trajectories that have ended at their indices, with those of their attractors by name."""
+    for name, values in attractors.items():
+        getattr(verdicts, name)[index] = values
+    verdicts.amplitude[index[verdict == Verdict.SLIDING]] = 0.0
     verdicts.decided_at[index] = np.where(verdict >= 0, now.t, np.nan)
     verdicts.bound[index] = np.where(verdict == Verdict.SLIDING, now.bound, np.nan)
     verdicts.events[index] = now.events

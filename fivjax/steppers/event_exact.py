@@ -184,13 +184,6 @@ class EventExact(AbstractStepper):
         end, _ = value_and_slope(states, h / unit)
         return Within(inside, 0.5 * h * weights, times, end)
 
-    def series(
-        self, mechanics: Mechanics, contact: Contact, load: Float[Array, ""], y: State
-    ) -> tuple[Float[Array, "coefficient state"], Float[Array, ""]]:
-        """Taylor coefficients in time of the motion in one contact mode, and the unit of that time, in s."""
-        unit = time_unit(mechanics)
-        return series_of(mechanics, contact, load, y, self.order_, unit).states, unit
-
     def in_one_mode(
         self,
         mechanics: Mechanics,

@@ -17,7 +17,7 @@ from fivjax.attractors.catalogue import Attractors
 from fivjax.maps import checkpoint, job_files, jobs, plan
 from fivjax.maps.job_files import JobState
 from fivjax.maps.matrix_kernels import MatrixKernels
-from fivjax.maps.results import EndedTrajectories, not_run, record
+from fivjax.maps.results import not_run, record
 from tests.helpers import killed_map
 
 AXES = {"mu": [0.1, 0.2, 0.227], "p": [1.02, 1.1, 1.19, 1.5, 3.0]}
@@ -138,9 +138,9 @@ def test_an_interrupt_inside_a_record_makes_no_trajectory_look_finished():
         def t(self):
             raise KeyboardInterrupt
 
-    verdicts, none = not_run(1, energy=False), np.full(1, np.nan)
+    verdicts = not_run(1, energy=False)
     with pytest.raises(KeyboardInterrupt):
-        record(verdicts, np.array([0]), Unreadable(), EndedTrajectories(np.array([1]), np.array([0]), *[none] * 5))
+        record(verdicts, np.array([0]), Unreadable(), np.array([1]), {"amplitude": np.array([1.0])})
     assert verdicts.verdict[0] == fj.Verdict.NOT_RUN
 
 
