@@ -6,12 +6,12 @@ import jax
 import numpy as np
 
 from ..foundation.precision import own_settings
-from . import cpp_elimination, cpp_loops, cpp_places
+from . import cpp_elimination, cpp_loops, cpp_places, cpp_reductions
 from .cpp_arrays import View
 from .cpp_numbers import text_of
 from .cpp_writer import Writer
 
-RULES = cpp_places.RULES | cpp_loops.RULES
+RULES = cpp_places.RULES | cpp_reductions.RULES | cpp_loops.RULES
 
 
 def writer(types: dict[str, str], lanes: bool = False) -> Writer:

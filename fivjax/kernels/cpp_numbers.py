@@ -1,5 +1,7 @@
 """Numbers in C++ code that is being written: their types, the text of arithmetic, and what is known of it beforehand."""
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 
@@ -99,6 +101,16 @@ def keeping_nan(name: str, form: str, kind: str) -> str:
     if name in ("max", "min") and kind == cpp_lanes.REALS:
         return cpp_lanes.BY_NUMBER[name]
     return form.replace(" ?", " || {0} != {0} ?") if name in ("max", "min") and kind == "double" else form
+
+
+def types_of_operands(name: str, types: Sequence[str], kind: str) -> list[str]:
+    """Those that operands have if the result is of lanes side by side."""
+    if name == "select_n":
+        return [cpp_lanes.TRUTHS, *[kind] * (len(types) - 1)]
+    own = next((found for found in types if found in cpp_lanes.KINDS), kind)
+    # What holds is less than zero, as a number.
+    own = cpp_lanes.WHOLES if own == cpp_lanes.TRUTHS and name not in ("eq", "ne") else own
+    return [own if name in COMPARISONS else kind] * len(types)
 
 
 def without_repeats(value: Value) -> Value:

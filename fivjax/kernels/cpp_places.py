@@ -10,17 +10,7 @@ from .cpp_lanes import KINDS, OF_LANES, TRUTHS, WHOLES
 from .cpp_numbers import BY_NUMBER, kind_of
 from .cpp_writer import FEW, Writer
 
-# Reductions, by the primitive that they repeat, and running totals.
-FOLDED = {
-    "reduce_sum": "add",
-    "reduce_prod": "mul",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_and": "and",
-    "reduce_or": "or",
-}
 CHOICE = "({0} ? {2} : {1})"
-RUNNING = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 
 
 def _dynamic_slice(writer: Writer, equation, operands, kind: str) -> Value:
@@ -274,20 +264,6 @@ def _sort_lanes(writer: Writer, rows: list[View], own: str, at: str) -> None:
     writer.close(2)
 
 
-def _running(name: str) -> Callable:
-    def of(writer: Writer, equation, operands, kind: str) -> Value:
-        axis, backwards = equation.params["axis"], equation.params["reverse"]
-        parts = list(np.moveaxis(writer.entries(operands[0]), axis, 0))[:: -1 if backwards else 1]
-        found = [np.asarray(parts[0], object)]
-        for part in parts[1:]:
-            found.append(
-                writer.entries(writer.each(name, BY_NUMBER[name], [found[-1], np.asarray(part, object)], kind))
-            )
-        return np.moveaxis(np.stack(found[:: -1 if backwards else 1]), 0, axis)
-
-    return of
-
-
 def _same_bits(writer: Writer, equation, operands, kind: str) -> Value:
     own, value = kind_of(equation.invars[0].aval), writer.entries(operands[0])
     if writer.lanes:
@@ -371,9 +347,4 @@ RULES: dict[str, Callable] = {
     "sort": _sort,
     "bitcast_convert_type": _same_bits,
     "dot_general": _product,
-}
-RULES |= {name: _running(of) for name, of in RUNNING.items()}
-RULES |= {
-    name: lambda writer, equation, operands, kind, of=of: writer.folded(of, operands[0], equation.params["axes"], kind)
-    for name, of in FOLDED.items()
 }

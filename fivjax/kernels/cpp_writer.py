@@ -8,7 +8,6 @@ A function may be traced through `jax.jvp`. Then some of what it is given are ta
 by side, one for each direction. What depends on one is wide, too, and the rest is computed once for all directions.
 """
 
-import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
@@ -20,7 +19,7 @@ from jax.extend.core import Jaxpr, Literal
 from ..foundation.jaxprs import within
 from . import cpp_lanes
 from .cpp_arrays import MOVING, MOVING_ENTRIES, Value, View, count_of, has_known_numbers, natural, of_numbers
-from .cpp_lanes import KINDS, OF_LANES, TRUTHS, WHOLES
+from .cpp_lanes import KINDS, OF_LANES
 from .cpp_numbers import (
     BY_NUMBER,
     COMPARISONS,
@@ -32,6 +31,7 @@ from .cpp_numbers import (
     of_known,
     simpler,
     text_of,
+    types_of_operands,
     without_repeats,
 )
 
@@ -301,10 +301,8 @@ class Writer:
             into = self.new(value.shape, kind)
             self.copy(value, into.base, kind)
             return self.small(into)
-        found = np.empty(value.shape, object)
-        for place, entry in np.ndenumerate(value):
-            found[place] = self.line(self.as_type(entry, kind), kind)
-        return found
+        found = [self.line(self.as_type(entry, kind), kind) for entry in value.ravel()]
+        return np.array(found, object).reshape(value.shape)
 
     def each(self, name: str, form: str, operands: Sequence[Value], kind: str) -> Value:
         """The same for each number."""
@@ -332,7 +330,7 @@ class Writer:
         if kind == "double" and any(map(self.is_wide, operands)):
             kind = WIDE
         types = [part.kind if isinstance(part, View) else self.type_of(part) for part in views]
-        wanted = self._types_of_operands(name, types, kind)
+        wanted = types_of_operands(name, types, kind)
 
         def write() -> View:
             into = self.new(shape, kind)
@@ -355,16 +353,6 @@ class Writer:
         told = (part if isinstance(part, View) else text_of(part) for part in views)
         return self.once((name, form, kind, shape, *told), arrays, write)
 
-    @staticmethod
-    def _types_of_operands(name: str, types: Sequence[str], kind: str) -> list[str]:
-        """Those that operands have if the result is of lanes side by side."""
-        if name == "select_n":
-            return [TRUTHS, *[kind] * (len(types) - 1)]
-        own = next((found for found in types if found in KINDS), kind)
-        # What holds is less than zero, as a number.
-        own = WHOLES if own == TRUTHS and name not in ("eq", "ne") else own
-        return [own if name in COMPARISONS else kind] * len(types)
-
     def _plain_type(self, value: Value, otherwise: str) -> str:
         """That of the numbers of an array."""
         if isinstance(value, View):
@@ -385,48 +373,9 @@ class Writer:
         types = list(map(self.type_of, parts))
         if self.lanes and any(own in KINDS for own in types):
             kind = OF_LANES.get(kind, kind)
-            wanted = self._types_of_operands(name, types, kind)
+            wanted = types_of_operands(name, types, kind)
             texts = list(map(self.as_type, parts, wanted))
         return self.line(form.format(*texts), kind)
-
-    def folded(self, name: str, value: Value, axes, kind: str) -> Value:
-        """A reduction over some axes."""
-        if value.size > FEW and not has_known_numbers(value):
-            return self._folded_in_loops(name, self.view(value, kind), axes)
-        value = self.entries(value)
-        for axis in sorted(axes, reverse=True):
-            parts = [np.asarray(part, object) for part in np.moveaxis(value, axis, 0)]
-            # By pairs, which do not wait for one another.
-            while len(parts) > 1:
-                pairs = zip(parts[::2], parts[1::2], strict=False)
-                last = parts[len(parts) // 2 * 2 :]
-                parts = [*(self.each(name, BY_NUMBER[name], list(pair), kind) for pair in pairs), *last]
-            value = parts[0]
-        return value
-
-    def _folded_in_loops(self, name: str, value: View, axes) -> Value:
-        write = functools.partial(self._fold_in_loops, name, value, axes)
-        return self.small(self.once((name, value, tuple(axes)), [value], write))
-
-    def _fold_in_loops(self, name: str, value: View, axes) -> View:
-        kept = [axis for axis in range(value.ndim) if axis not in axes]
-        into = self.new([value.shape[axis] for axis in kept], value.kind)
-        form = keeping_nan(name, BY_NUMBER[name], value.kind)
-        outer = self.loops(into.shape)
-        total = self.name(value.kind, "s")
-        neutral = {"add": "0", "mul": "1", "and": "true", "or": "false"}.get(name)
-        if neutral is not None and value.kind in KINDS:
-            neutral = converted(neutral, "bool", value.kind)
-        first = dict.fromkeys(axes, "0") | dict(zip(kept, outer, strict=True))
-        start = value.at([first[axis] for axis in range(value.ndim)]) if neutral is None else neutral
-        self.put(f"{value.kind} {total} = ({value.kind})({start});")
-        inner = self.loops([value.shape[axis] for axis in axes])
-        place = dict(zip(axes, inner, strict=True)) | dict(zip(kept, outer, strict=True))
-        self.put(f"{total} = {form.format(total, value.at([place[axis] for axis in range(value.ndim)]))};")
-        self.close(len(inner))
-        self.put(f"{into.at(outer)} = {total};")
-        self.close(len(outer))
-        return into
 
     def place(self, entry, most: int):
         """An index, kept between zero and the most, as JAX keeps it."""
