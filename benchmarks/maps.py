@@ -266,25 +266,36 @@ def watched_memory():
 
 
 def steps() -> None:
-    """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads."""
+    """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads; and that of a step by
+    series, under falling friction, one trajectory after the other and side by side.
+    """
     from fivjax.maps.following import Batch, begin_all
     from fivjax.maps.groups import Task
     from fivjax.steppers.propagation import Propagation
 
     mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
-    with jax.enable_x64(True), ThreadPoolExecutor(1) as pool:
-        batch = Batch(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16), mu[:, None], pool)
-        trajectories = begin_all(batch, group, np.full((len(group), 1), 1.3))
-        kernels, prepared = batch.matrix_kernels, batch.shared.tree.prepared
-        kernels.follow(group, trajectories, steps)
-        found = []
-        for _ in range(5):
-            start = time.perf_counter()
-            kernels.follow(group, trajectories, steps)
-            found.append(time.perf_counter() - start)
-    table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / len(mu)
-    print(f"{1e6 * min(found) / (steps * len(group)):.2f} µs a trajectory-step")
-    print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
+
+    def least(task: Task, side_by_side: bool = True) -> tuple[float, Batch]:
+        with ThreadPoolExecutor(1) as pool:
+            batch, found = Batch(task, mu[:, None], pool), []
+            batch.kernels.side_by_side = side_by_side
+            trajectories = begin_all(batch, group, np.full((len(group), 1), 1.3))
+            for _ in range(6):
+                start = time.perf_counter()
+                (batch.matrix_kernels or batch.kernels).follow(group, trajectories, steps)
+                found.append(time.perf_counter() - start)
+        return 1e6 * min(found[1:]) / (steps * len(group)), batch
+
+    with jax.enable_x64(True):
+        one, batch = least(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16))
+        prepared = batch.shared.tree.prepared
+        table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / len(mu)
+        print(f"{one:.2f} µs a trajectory-step")
+        print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
+        own = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.14, 0.5), 1.0, fj.Pulse(100.0, 1.2))
+        task = Task(own, fj.EventExact(), ("mu_static",), ("p",), {}, width=16)
+        alone, together = (least(task, side_by_side)[0] for side_by_side in (False, True))
+        print(f"by series, under falling friction: {alone:.2f} µs one after the other, {together:.2f} µs side by side")
 
 
 def paper_map(points: int, **options):
