@@ -108,6 +108,13 @@ def test_where_a_law_has_kinks_sliding_is_not_proved_and_the_map_says_why():
     assert "`Table` may have kinks" in m.attrs["withheld"]
 
 
+def test_one_law_for_several_contacts_is_looked_at_up_to_the_slip_speed_of_each():
+    fastest = np.array([0.5, 2.0, 40.0])
+    with jax.enable_x64(True):
+        for law in (Table(), Looped(), Branched()):
+            assert law.largest(fastest).tolist() == [float(law.largest(one)) for one in fastest]
+
+
 class FromOutside(fj.AbstractFriction):
     """Computed by Python at each step, as by a model that is no JAX function."""
 
