@@ -84,8 +84,10 @@ class AbstractFriction(eqx.Module):
         """The largest coefficient from rest to each of these slip speeds (m/s), as far as looking at some speeds shows."""
         # Slip speeds at which the largest coefficient of a law is looked for, as shares of the fastest.
         looked_at = np.linspace(0.0, 1.0, 33)
-        speeds = looked_at.reshape(-1, *(1,) * jnp.ndim(fastest)) * fastest
-        return jnp.maximum(self.static, jnp.max(jax.vmap(self)(speeds), axis=0))
+        speeds = jnp.multiply.outer(looked_at, fastest)
+        # A law is one of a single speed.
+        mu = jax.vmap(self)(jnp.ravel(speeds)).reshape(speeds.shape)
+        return jnp.maximum(self.static, jnp.max(mu, axis=0))
 
     def in_time(self, slip_speed: Float[Array, ""], order: int) -> NextTerm:
         """How the Taylor series in time of μ goes on from this slip speed, up to some order."""
@@ -129,6 +131,19 @@ class AbstractFriction(eqx.Module):
             # The largest value at this speed and above.
             largest = np.maximum.accumulate(np.abs(values)[::-1])[::-1]
             refuse(largest > np.asarray(bound) * (1 + 1e-9) + 1e-12, f"stay within the bound of `variation` on {what}")
+
+    def check_for_several(self, contacts: int) -> None:
+        """Refuse a law of one speed only as the law of so many contacts."""
+        with jax.enable_x64(True):
+            try:
+                found = jax.eval_shape(self.__call__, jax.ShapeDtypeStruct((contacts,), np.dtype("float64")))
+            except (TypeError, ValueError):
+                found = None
+        if getattr(found, "shape", None) != (contacts,):
+            raise TypeError(
+                f"The friction law `{type(self).__name__}` takes one slip speed only, but is that of {contacts} contacts. Use "
+                "`jnp.where` in place of `jax.lax.cond` in it, or give each contact its law: `friction=[law, law, …]`."
+            )
 
     def _check_result(self) -> None:
         """Refuse a law that is no JAX function from a real number to a real number in double precision."""

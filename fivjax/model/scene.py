@@ -85,6 +85,8 @@ class Scene(eqx.Module):
         friction = jax.tree.map(real_if_real, friction)
         own_load: AbstractLoad = jax.tree.map(real_if_real, load)
         friction.check(belt_speed)
+        if count > 1 and not isinstance(friction, FrictionPerContact):
+            friction.check_for_several(count)
         own_load.check()
         self.structure = structure
         self.friction = friction

@@ -1,5 +1,7 @@
 """Friction laws of a user's own: tables, loops and branches against SciPy, restarted at every kink."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -113,6 +115,22 @@ def test_one_law_for_several_contacts_is_looked_at_up_to_the_slip_speed_of_each(
     with jax.enable_x64(True):
         for law in (Table(), Looped(), Branched()):
             assert law.largest(fastest).tolist() == [float(law.largest(one)) for one in fastest]
+
+
+def test_a_law_of_one_speed_is_refused_for_several_contacts_unless_each_has_its_own():
+    own = fj.Structure(
+        np.eye(4),
+        0.1 * np.eye(4),
+        np.eye(4),
+        [0.0, -1.0, 0.0, -1.0],
+        contacts=[fj.ContactPoint(0, 1), fj.ContactPoint(2, 3)],
+    )
+    scene = functools.partial(fj.Scene, own, belt_speed=2.0, load=fj.ConstantLoad(1.0))
+    with pytest.raises(
+        TypeError, match=r"`Branched` takes one slip speed only, but is that of 2 contacts\. Use `jnp.where`"
+    ):
+        scene(Branched())
+    assert len(scene([Branched(), Branched()]).structure.contacts) == len(scene(Looped()).structure.contacts) == 2
 
 
 class FromOutside(fj.AbstractFriction):
