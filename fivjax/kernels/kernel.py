@@ -65,8 +65,11 @@ class Kernel:
         try:
             plain = kept_value(traced_source, own, form, wide, shared, lanes > 1)
         except NotImplementedError:
+            if lanes == 1:
+                raise
             # What has no code for several lanes may have it for one.
-            plain, lanes = kept_value(traced_source, own, form, wide, shared), 1
+            lanes = 1
+            plain = kept_value(traced_source, own, form, wide, shared, False)
         self.text = source_from_plain(plain)
         places, sizes = (*GIVEN, *FOUND, *(OF_GROUPS if shared else ())), (*SIZES, *(("each",) if shared else ()))
         if lanes > 1:
