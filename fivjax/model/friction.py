@@ -139,7 +139,8 @@ class AbstractFriction(eqx.Module):
                 found = jax.eval_shape(self.__call__, jax.ShapeDtypeStruct((contacts,), np.dtype("float64")))
             except (TypeError, ValueError):
                 found = None
-        if getattr(found, "shape", None) != (contacts,):
+        # What does not change with speed may be one number for all.
+        if getattr(found, "shape", None) not in ([(), (contacts,)] if self.constant else [(contacts,)]):
             raise TypeError(
                 f"The friction law `{type(self).__name__}` takes one slip speed only, but is that of {contacts} contacts. Use "
                 "`jnp.where` in place of `jax.lax.cond` in it, or give each contact its law: `friction=[law, law, …]`."
