@@ -55,26 +55,34 @@ def march_to_roots(
     a simple root the march converges quadratically. Roots at zero, where the status began, are divided out; with an `exact`
     start, a small value there is no rounding error. What is small is told on [0, `near`]: over a long time a straight motion
     makes any value at the start small. A march that uses up its steps has still shown that there is no root up to where it
-    came.
+    came; and one that has passed the root of an earlier polynomial ends there.
     """
     count = c.shape[1]
     rounding = jnp.zeros((3, count), c.dtype) if rounding is None else rounding
     exact = jnp.zeros(count, bool) if exact is None else exact
+
+    def further(first, of_one):
+        # Roots that differ by rounding only are found.
+        x, found = _first_root(*of_one, near=near, until=jnp.minimum(first * (1 + 16 * jnp.finfo(c.dtype).eps), 1.0))
+        return jnp.minimum(first, x), (x, found)
+
     # One after the other: a march of few steps does not wait for a long one.
-    return jax.lax.map(lambda of_one: _first_root(*of_one, near=near), (c.T, rounding.T, exact))
+    return jax.lax.scan(further, jnp.ones((), c.dtype), (c.T, rounding.T, exact))[1]
 
 
 def _first_root(
-    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], *, near: Float[Array, ""] | float
+    c: Float[Array, " k"], rounding: Float[Array, "3"], exact: Bool[Array, ""], *, near, until
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    eps, size = float(jnp.finfo(c.dtype).eps), jnp.sum(jnp.abs(c))
-    of_near = size - (1 - near) * jnp.sum(jnp.abs(c[1:]))
+    eps, sizes = float(jnp.finfo(c.dtype).eps), jnp.abs(c)
+    size = jnp.sum(sizes)
+    of_near = size - (1 - near) * (size - sizes[0])
     powers = [1.0, near, near * near]
     first = [[own[k] * power for k, power in enumerate(powers)] for own in (c, rounding)]
-    zeros = zero_at_start(first[0], of_near, first[1], exact)
-    c = jax.lax.dynamic_slice(jnp.pad(c, (0, 3)), (sum(zero.astype(jnp.int32) for zero in zeros),), c.shape)
+    one, two, three = zero_at_start(first[0], of_near, first[1], exact)
+    for by, divided in ((2, two), (1, (one & ~two) | three)):
+        c = jnp.where(divided, jnp.concatenate([c[by:], jnp.zeros(by, c.dtype)]), c)
     k = np.arange(len(c))
-    falling = jnp.maximum(-c, 0.0)
+    falling = jnp.where(c < 0, -c, 0.0)
     # Its negative coefficients alone cannot use it up.
     lasts = c[0] > jnp.sum(falling[1:])
     bound_2, bound_3 = (jnp.sum(falling * of.astype(c.dtype)) for of in (k * (k - 1), k * (k - 1) * (k - 2)))
@@ -84,26 +92,29 @@ def _first_root(
 
     def going(carry):
         x, step, count = carry
-        return ~spent & (x < 1) & (step > 2 * eps * x) & (count < MOST_ROOT_STEPS)
+        return ~spent & (x < until) & (step > 2 * eps * x) & (count < MOST_ROOT_STEPS)
+
+    def cubic(slope, bend):
+        return ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
 
     def march(carry):
         x, _, count = carry
         value, slope, bend = jax.lax.cond(
             x > 0, lambda x: value_slope_and_bend(c, x), lambda x: (c[0], c[1], 2 * c[2]), x
         )
-        value = jnp.maximum(value, 0.0)
+        value = jnp.where(value > 0, value, 0.0)
         root = jnp.sqrt(slope**2 + 2 * bound_2 * value)
         # Two forms of the same root, each used where it has no cancellation.
         falls = slope < 0
         step = ratio(jnp.where(falls, 2 * value, slope + root), jnp.where(falls, root - slope, bound_2), huge)
-        cubic = ratio(0.5 * bend + jnp.sqrt(0.25 * bend**2 + (2 / 3) * bound_3 * slope), bound_3 / 3, huge)
-        step = jnp.where((slope >= 0) & (bend >= 0), jnp.maximum(step, cubic), step)
+        rises = (slope >= 0) & (bend >= 0)
+        step = jax.lax.cond(rises, lambda *way: jnp.maximum(step, cubic(*way)), lambda *_: step, slope, bend)
         return x + step, step, count + 1
 
     none = jnp.zeros_like(size)
     begin = jnp.where(lasts, 1.0, none), none + 1, jnp.zeros((), jnp.int32)
     x, step, _ = jax.lax.while_loop(going, march, begin)
-    found = spent | ((x < 1) & (step <= 2 * eps * x))
+    found = spent | ((x < until) & (step <= 2 * eps * x))
     return jnp.where(size > 0, jnp.minimum(x, 1.0), 1.0), found & (size > 0)
 
 

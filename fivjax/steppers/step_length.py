@@ -1,5 +1,7 @@
 """How long the steps of a Taylor series may be for a given error, in units of the fastest vibration."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -51,15 +53,16 @@ def trusted(states: Float[Array, "k state"], tolerance: float) -> Float[Array, "
     # At rest, but accelerated: a load has just jumped.
     starts = size(2) > 0
 
-    logs = [jnp.log(tolerance * size(j)) for j in (0, 1, 2)]
-
-    def reach(last):
-        # The logarithm of h where |c_last| h^last = tolerance |c_j| h^j; the larger h of j = 0 and 1, because either
-        # coefficient may vanish. In slow motion of a stiff structure the last term may underflow; it then counts as the
-        # smallest normal number.
+    def reach(last, first):
+        # The logarithm of h where |c_last| h^last = tolerance |c_j| h^j. In slow motion of a stiff structure the last term may
+        # underflow; it then counts as the smallest normal number.
         end = jnp.log(jnp.maximum(size(last), tiny))
-        steps = [(logs[j] - end) / (last - j) for j in (0, 1, 2)]
-        return jnp.where(moves, jnp.maximum(steps[0], steps[1]), steps[2])
+        return [(jnp.log(tolerance * size(j)) - end) * (1.0 / (last - j)) for j in first]
 
-    longest = jnp.minimum(jnp.exp(jnp.minimum(reach(order), reach(order - 1))), LONGEST_STEP)
+    def nearest(*first):
+        # The larger h, because either coefficient may vanish.
+        return jnp.minimum(*(functools.reduce(jnp.maximum, reach(last, first)) for last in (order, order - 1)))
+
+    reached = jax.lax.cond(moves, lambda: nearest(0, 1), lambda: nearest(2))
+    longest = jnp.minimum(jnp.exp(reached), LONGEST_STEP)
     return jnp.where(moves | starts, longest, jnp.inf)

@@ -229,7 +229,12 @@ def test_first_roots_of_random_polynomials_agree_with_all_their_roots():
     coefficients = rng.normal(size=(400, 8)) / np.arange(1, 9)
     coefficients[:, 0] = np.abs(coefficients[:, 0]) + 1e-3
     with jax.enable_x64(True):
-        x, fires = map(np.asarray, jax.jit(march_to_roots)(jnp.asarray(coefficients.T)))
+        alone = jax.jit(jax.vmap(lambda c: march_to_roots(c[:, None])))
+        x, fires = (np.asarray(part)[:, 0] for part in alone(jnp.asarray(coefficients)))
+        together = [np.asarray(part) for part in jax.jit(march_to_roots)(jnp.asarray(coefficients[:9].T))]
+    # Side by side the first root of all is found, and none before it.
+    first = np.argmin(np.where(fires, x, np.inf)[:9])
+    assert together[1][first] and together[0][first] == x[first] == np.min(together[0])
     for row, position, fired in zip(coefficients, x, fires, strict=True):
         roots = np.roots(row[::-1])
         real = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0) & (roots.real < 1)].real)
