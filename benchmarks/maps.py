@@ -188,8 +188,7 @@ def falling() -> None:
 
 
 def without_kernels(points: int):
-    scope, sharing = (f"fivjax.{module}.is_installed" for module in ("steppers.kernel_scope", "maps.groups"))
-    with mock.patch(scope, return_value=False), mock.patch(sharing, return_value=False):
+    with mock.patch("fivjax.steppers.kernel_scope.is_installed", return_value=False):
         return paper_map(points)
 
 
@@ -266,36 +265,40 @@ def watched_memory():
 
 
 def steps() -> None:
-    """The time of a trajectory-step by a kernel on one core, and the size of the matrices that it reads; and that of a step by
-    series, under falling friction, one trajectory after the other and side by side.
+    """The time of a trajectory-step by a kernel on one core, and of a cycle of vibration, under constant and falling friction:
+    one trajectory after the other, and side by side.
     """
     from fivjax.maps.following import Batch, begin_all
     from fivjax.maps.groups import Task
-    from fivjax.steppers.propagation import Propagation
 
-    mu, group, steps = np.linspace(0.2, 0.227, 4), np.repeat(np.arange(4), 64), 1600
+    group, steps = np.repeat(np.arange(4), 64), 1600
 
-    def least(task: Task, side_by_side: bool = True) -> tuple[float, Batch]:
+    def least(task: Task, ends: tuple[float, float], side_by_side: bool) -> tuple[float, float]:
+        """The shortest time of a step, and of 1/68 s of motion, in µs."""
         with ThreadPoolExecutor(1) as pool:
-            batch, found = Batch(task, mu[:, None], pool), []
+            batch, found = Batch(task, np.linspace(*ends, 4)[:, None], pool), []
             batch.kernels.side_by_side = side_by_side
             trajectories = begin_all(batch, group, np.full((len(group), 1), 1.3))
             for _ in range(6):
-                start = time.perf_counter()
-                (batch.matrix_kernels or batch.kernels).follow(group, trajectories, steps)
-                found.append(time.perf_counter() - start)
-        return 1e6 * min(found[1:]) / (steps * len(group)), batch
+                before, start = np.sum(trajectories.tree[1].t), time.perf_counter()
+                batch.kernels.follow(group, trajectories, steps)
+                found.append((time.perf_counter() - start, np.sum(trajectories.tree[1].t) - before))
+        taken, moved = min(found[1:])
+        return 1e6 * taken / (steps * len(group)), 1e6 * taken / (68 * moved)
 
+    laws = {
+        "constant friction, 3 m/s": (scene(), "mu", (0.2, 0.227)),
+        "falling friction, 1 m/s": (
+            fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.14, 0.5), 1.0, fj.Pulse(100.0, 1.2)),
+            "mu_static",
+            (0.2, 0.227),
+        ),
+    }
     with jax.enable_x64(True):
-        one, batch = least(Task(scene(), Propagation(), ("mu",), ("p",), {}, width=16))
-        prepared = batch.shared.tree.prepared
-        table = 8 * sum(np.size(part) for part in (prepared.window, prepared.series, prepared.sizes)) / len(mu)
-        print(f"{one:.2f} µs a trajectory-step")
-        print(f"the matrices of a structure: {table / 1e3:.0f} kB, in cache")
-        own = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.2, 0.14, 0.5), 1.0, fj.Pulse(100.0, 1.2))
-        task = Task(own, fj.EventExact(), ("mu_static",), ("p",), {}, width=16)
-        alone, together = (least(task, side_by_side)[0] for side_by_side in (False, True))
-        print(f"by series, under falling friction: {alone:.2f} µs one after the other, {together:.2f} µs side by side")
+        for what, (own, name, ends) in laws.items():
+            for how, side_by_side in (("one after the other", False), ("side by side", True)):
+                step, cycle = least(Task(own, fj.EventExact(), (name,), ("p",), {}), ends, side_by_side)
+                print(f"{what}, {how}: {step:.2f} µs a step, {cycle:.2f} µs a cycle of 68 Hz", flush=True)
 
 
 def paper_map(points: int, **options):

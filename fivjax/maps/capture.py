@@ -20,7 +20,6 @@ from ..attractors.motions import Motions, far_apart
 from ..attractors.search import TOGETHER, search_groups
 from ..attractors.tori import TUBES, Torus
 from ..contact import Status
-from ..section.by_kernel import section_kernels
 from ..section.return_maps import INTERPOLATED, ROUNDED, ReturnMaps, Section
 from ..steppers.event_exact import EventExact
 from .following import Batch, bounds
@@ -68,12 +67,10 @@ class Capture:
     def _return_maps(self) -> ReturnMaps:
         batch, tree, scene = self.batch, self.batch.shared.tree, self.batch.task.scene
         exact = batch.kernels is not None or isinstance(batch.task.method, EventExact)
-        # Return maps are exact whatever follows the trajectories.
-        kernels = batch.matrix_kernels or section_kernels(
-            scene, tree.mechanics, tree.longest_return, batch.pool, side_by_side=True
-        )
         known_to = ROUNDED if exact else INTERPOLATED
-        return ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, kernels, batch.pool, known_to)
+        return ReturnMaps(
+            scene.structure, tree.mechanics, tree.longest_return, batch.section_kernels, batch.pool, known_to
+        )
 
     def state(self) -> tuple[np.ndarray, dict[int, Attractors], dict[int, Attractors]]:
         """What is known of attractors by now: the last parts of `JobState`."""
@@ -173,7 +170,8 @@ class Capture:
         """
         scene, crossed = self.batch.task.scene, np.all(np.isfinite(now.crossing), axis=1)
         without_events = not scene.friction.constant or (growing and len(scene.structure.contacts) > 1)
-        slides = (np.array(now.contact.status) == Status.SLIDE).reshape(len(crossed), -1).all(axis=1)
+        slides = np.array(now.contact.status) == Status.SLIDE
+        slides = np.all(slides, axis=tuple(range(1, slides.ndim)))
         return crossed if without_events else crossed & ((now.events > 0) | ~slides)
 
 

@@ -88,7 +88,7 @@ def map_dataset(
         dataset["p_crit_low"] = (others, crossing.low.reshape(over))
         dataset["p_crit_high"] = (others, crossing.high.reshape(over))
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
-    dataset.attrs.update(kernels_by(method, scene, bool(verdicts.energy)))
+    dataset.attrs.update(kernels_by(method, scene))
     meaning, withheld = dict(MEANING), why_withheld(scene)
     if withheld is not None:
         dataset.attrs["withheld"] = withheld

@@ -19,11 +19,11 @@ from ..foundation.blocks import BLOCK_OF_SEVERAL, in_blocks
 from ..foundation.compiling import compiled
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.kept_programs import kept
+from ..section.by_kernel import SectionKernels, section_kernels
 from ..section.return_maps import BLOCK, Section, of_block
 from ..simulation.ending import UNBOUNDED_FROM
 from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
 from .groups import GroupConstants, Task, constants_of
-from .matrix_kernels import MatrixKernels, begin_building
 from .one_trajectory import (
     Progress,
     TaskConstants,
@@ -40,8 +40,6 @@ class Batch:
     """Groups whose trajectories are followed together: their task, the data that each of them shares, and what computes."""
 
     def __init__(self, task: Task, of_groups: Float[np.ndarray, "g k"], pool: Executor):
-        if task.by_kernel:
-            begin_building(task, pool)
         self.task, self.pool = task, pool
         self.shared = constants_of(task, of_groups)
         # Of several contacts a trajectory takes more memory.
@@ -50,20 +48,23 @@ class Batch:
     @cached_property
     def kernels(self) -> TrajectoryKernels | None:
         """The kernels of trajectories, if there are any."""
-        by_kernel = self.task.by_kernel or self.task.by_series
-        return TrajectoryKernels(self.task, self.shared, self.pool) if by_kernel else None
+        return TrajectoryKernels(self.task, self.shared, self.pool) if self.task.by_kernel else None
 
     @cached_property
-    def matrix_kernels(self) -> MatrixKernels | None:
-        """The kernels that step by matrices, if any do."""
-        return MatrixKernels(self.shared, self.pool) if self.task.by_kernel else None
+    def section_kernels(self) -> SectionKernels | None:
+        """Those of return maps, which are exact whatever follows the trajectories."""
+        tree = self.shared.tree
+        return section_kernels(self.task.scene, tree.mechanics, tree.longest_return, self.pool, side_by_side=True)
 
 
 def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
     """Trajectories at their beginning, each with its kick and initial values in `columns`."""
     task = batch.task
     if batch.kernels is not None:
-        return batch.kernels.begin(group, columns)
+        begun = batch.kernels.begin(group, columns)
+        if task.from_afar and batch.section_kernels is not None:
+            batch.section_kernels.begin_building()
+        return begun
 
     def function(*block):
         return _begin_block(TaskConstants.of(task), *block)
@@ -90,7 +91,7 @@ def _follow_by_kernel(
 ) -> None:
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events
-    (batch.matrix_kernels or kernels).follow(group, trajectories, steps)
+    kernels.follow(group, trajectories, steps)
     # While its mode changes again and again, nothing can be proved of a trajectory.
     asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
     if len(asks):

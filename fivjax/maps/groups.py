@@ -1,13 +1,13 @@
 """The data that trajectories of one structure share, worked out once for all of them.
 
 Trajectories that differ only in their kick or their initial state make a *group*: they have the same mechanics, the same
-matrices of their stepper, the same proofs and the same attractors.
+proofs and the same attractors.
 """
 
 import functools
 from collections.abc import Sequence
 from importlib import metadata
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,16 +17,11 @@ from jaxtyping import Array, Float
 from ..contact import Mechanics
 from ..foundation.flattened import Flattened, flatten
 from ..foundation.numpy_evaluation import by_numpy
-from ..kernels.warp_library import is_installed
 from ..linear.linearisation import linear_sliding
-from ..model.friction import Coulomb
 from ..model.scene import Scene
 from ..section.about_sliding import longest_return, mechanics_about_sliding
 from ..steppers.base import AbstractStepper
-from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import has_kernel
-from ..steppers.matrix_kernel import MOST_COORDINATES
-from ..steppers.propagation import MATRIX_ROWS, Propagation
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 
@@ -39,7 +34,6 @@ class GroupConstants(eqx.Module):
 
     values: Float[Array, " k"]  # the parameters that are not those of the kick
     mechanics: Mechanics
-    prepared: Any  # see `AbstractStepper.prepare`
     modes: SlidingModes
     drift: StickingDrift | None  # None with several contacts
     weights: Float[Array, " state"]  # see `Structure.weights`
@@ -58,7 +52,7 @@ class Task(NamedTuple):
     """The data that all trajectories of a run have in common: whose they are, and how they are followed."""
 
     scene: Scene  # on the way to a worker with NumPy arrays, because JAX arrays lose double precision when they are unpickled
-    method: AbstractStepper | Propagation
+    method: AbstractStepper
     names: tuple[str, ...]  # parameters that differ between groups
     of_kick: tuple[str, ...]  # parameters of the kick
     states: dict[str, int]  # initial displacements and velocities, with their indices in the state
@@ -69,32 +63,18 @@ class Task(NamedTuple):
 
     @property
     def by_kernel(self) -> bool:
-        """Whether kernels follow the trajectories by matrices prepared for each group."""
-        return isinstance(self.method, Propagation)
-
-    @property
-    def by_series(self) -> bool:
-        """Whether kernels follow the trajectories by Taylor series, as `simulate` does."""
-        return isinstance(self.method, EventExact) and has_kernel(self.scene, self.method)
+        """Whether kernels follow the trajectories, as they do in `simulate`."""
+        return followed_by_kernel(self.scene, self.method)
 
 
-def batch_stepper(method: AbstractStepper, scene: Scene) -> AbstractStepper | Propagation:
-    """The stepper that gives the same motion of many trajectories in less time, if there is one."""
-    one = len(scene.structure.contacts) == 1
-    if method != EventExact() or not scene.friction.constant or not one:
-        return method
-    small = scene.structure.size <= MOST_COORDINATES
-    # Only of a law that is known can it be said that a kernel can be made of it.
-    if small and isinstance(scene.friction, Coulomb) and is_installed():
-        return Propagation()
-    return method
+def followed_by_kernel(scene: Scene, method: AbstractStepper) -> bool:
+    """Whether kernels follow the trajectories of a map of such scenes."""
+    return has_kernel(scene, method, called_by_xla=False)
 
 
-def kernels_by(method: AbstractStepper, scene: Scene, energy: bool) -> dict[str, str]:
+def kernels_by(method: AbstractStepper, scene: Scene) -> dict[str, str]:
     """The version of Warp, where its kernels follow the trajectories of such a run."""
-    by = method if energy else batch_stepper(method, scene)
-    by_kernel = isinstance(by, Propagation) or has_kernel(scene, by)
-    return {"warp": metadata.version("warp-lang")} if by_kernel else {}
+    return {"warp": metadata.version("warp-lang")} if followed_by_kernel(scene, method) else {}
 
 
 def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
@@ -103,9 +83,8 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     m = 2 * (n - 1)
     own = 8 * (3 * 2 * n + 60)
     modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
-    prepared = 8 * MATRIX_ROWS * (2 * n + 2) * 4 * (n + 1)
     attractor = 8 * 512 * 2 * n  # mostly so many states are kept of a torus
-    return int(own + 3 * (modes + prepared + attractor) / sharing)
+    return int(own + 3 * (modes + attractor) / sharing)
 
 
 def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -125,16 +104,16 @@ def constants_of(task: Task, distinct: np.ndarray) -> Flattened:
     for start in range(0, len(distinct), size):
         # Padded with copies, so that there is one size.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = _prepare(task.scene, task.method, task.names, distinct[rows])
+        part = _prepare(task.scene, task.names, distinct[rows])
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, linear, *_ in parts)))
     numbers = form = None
     for start in range(0, len(distinct), size):
         # Written into the result one by one, because they are large and should not be in memory twice.
-        mechanics, prepared, _, drifts, weights, longest = parts.pop(0)
+        mechanics, _, drifts, weights, longest = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(GroupConstants(distinct[rows], mechanics, prepared, own_modes, drifts, weights, longest))
+        part = flatten(GroupConstants(distinct[rows], mechanics, own_modes, drifts, weights, longest))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)
@@ -142,7 +121,7 @@ def constants_of(task: Task, distinct: np.ndarray) -> Flattened:
 
 # By NumPy, because XLA would compile it for longer than a map takes; and always so, because all maps are rounded alike.
 @functools.partial(by_numpy, always=True)
-def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[str, ...], values):
+def _prepare(scene: Scene, names: tuple[str, ...], values):
     def one(row):
         own = with_values(scene, names, row)
         # Worked out from the structure's parameters once, not wherever they are used.
@@ -150,7 +129,7 @@ def _prepare(scene: Scene, method: AbstractStepper | Propagation, names: tuple[s
         mechanics = mechanics_about_sliding(own)
         drift = None if mechanics.several else sticking_drift(own)
         weights = own.structure.weights
-        return mechanics, method.prepare(mechanics), linear_sliding(own), drift, weights, longest_return(own)
+        return mechanics, linear_sliding(own), drift, weights, longest_return(own)
 
     return jax.vmap(one)(values)
 

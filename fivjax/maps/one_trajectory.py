@@ -19,7 +19,6 @@ from ..simulation.energy import EnergyData, Ledger, enter, mechanical_energy, op
 from ..simulation.jump_instants import next_jump
 from ..steppers.base import AbstractStepper, Advance
 from ..steppers.core import Segment, end_after
-from ..steppers.propagation import Propagation
 from ..verdicts.sliding_proof import margin_share_bound
 from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
@@ -44,14 +43,13 @@ class Progress(eqx.Module):
         Array, ""
     ]  # on the share of its margins that it can still use up, once it slides for ever; else infinite
     energy: "EnergyRecord | None" = None  # the energy ledger, if asked for
-    steps: "LoadSteps | None" = None  # for a kernel
 
 
 class Setting(eqx.Module):
     """The data with which a trajectory is followed."""
 
     scene: Scene
-    method: AbstractStepper | Propagation
+    method: AbstractStepper
     shared: GroupConstants
 
 
@@ -62,7 +60,7 @@ class TaskConstants(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     of_kick: tuple[str, ...] = eqx.field(static=True)
     states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
-    method: AbstractStepper | Propagation = eqx.field(static=True)
+    method: AbstractStepper = eqx.field(static=True)
     energy: bool = eqx.field(static=True)
 
     @classmethod
@@ -83,37 +81,24 @@ class EnergyRecord(eqx.Module):
     vibration: Float[Array, ""]  # energy of the vibration just after the last jump of the load, J; NaN before
 
 
-class LoadSteps(eqx.Module):
-    """The load of one trajectory as numbers."""
-
-    jumps: Float[Array, " k"]  # s
-    loads: Float[Array, " k+1"]  # before, between and after them, as deviations from the final load, N
-
-    def __init__(self, load: AbstractLoad):
-        self.jumps = load.jumps
-        ends = jnp.concatenate([self.jumps[:1] - 1.0, self.jumps, self.jumps[-1:] + 1.0])
-        between = 0.5 * (ends[:-1] + ends[1:]) if self.jumps.shape[0] else jnp.zeros(1)
-        self.loads = jax.vmap(load)(between) - load.final
+def _load_steps(load: AbstractLoad) -> Float[Array, " k+1"]:
+    """A load before, between and after its jumps, as deviations from the final load, N."""
+    jumps = load.jumps
+    ends = jnp.concatenate([jumps[:1] - 1.0, jumps, jumps[-1:] + 1.0])
+    between = 0.5 * (ends[:-1] + ends[1:]) if jumps.shape[0] else jnp.zeros(1)
+    return jax.vmap(load)(between) - load.final
 
 
-def begin(
-    scene: Scene,
-    shared: GroupConstants,
-    places: tuple[int, ...],
-    values,
-    *,
-    energy: bool = False,
-    for_kernel: bool = False,
-) -> Progress:
+def begin(scene: Scene, shared: GroupConstants, places: tuple[int, ...], values, *, energy: bool = False) -> Progress:
     """A trajectory at the sliding equilibrium of its scene, before the kick. At these places of its state it has `values`
     (totals, not deviations) instead, where they are not NaN.
     """
     modes = shared.modes
     q, _ = steady_sliding(scene, scene.load.force)
     equilibrium = jnp.concatenate([q, jnp.zeros_like(q)])
-    steps = LoadSteps(scene.load)
+    loads = _load_steps(scene.load)
     # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
-    y = equilibrium - modes.linear.equilibrium + _started_by(scene, steps) * jnp.abs(equilibrium)
+    y = equilibrium - modes.linear.equilibrium + _started_by(scene, loads) * jnp.abs(equilibrium)
     own = jnp.zeros_like(y)
     if places:
         at = np.array(places)
@@ -126,7 +111,7 @@ def begin(
     )
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(scene)]))
     mechanics, weights = shared.mechanics, scene.structure.weights
-    largest = jnp.max(jnp.abs(steps.loads + scene.load.final)) / jnp.abs(scene.load.final)
+    largest = jnp.max(jnp.abs(loads + scene.load.final)) / jnp.abs(scene.load.final)
     belt = jnp.max(weights[scene.structure.size + mechanics.tangential] * jnp.abs(scene.belt_speed))
     return Progress(
         t=jnp.zeros((), y.dtype),
@@ -143,11 +128,10 @@ def begin(
         verdict=jnp.where(finite, verdict, Verdict.NOT_FINITE).astype(jnp.int8),
         bound=jnp.full((), jnp.inf, y.dtype),
         energy=EnergyRecord(open_ledger(EnergyData(scene), y), jnp.full((), jnp.nan, y.dtype)) if energy else None,
-        steps=steps if for_kernel else None,
     )
 
 
-def _started_by(scene: Scene, steps: LoadSteps) -> Float[Array, ""] | float:
+def _started_by(scene: Scene, loads: Float[Array, " k"]) -> Float[Array, ""] | float:
     """The share of its size by which an equilibrium is off at first: rounding. Without a kick it is more where friction depends
     on slip speed: a smaller motion is lost beside the belt's there, and friction does not follow it.
     """
@@ -155,7 +139,7 @@ def _started_by(scene: Scene, steps: LoadSteps) -> Float[Array, ""] | float:
     if scene.friction.constant:
         return eps
     noticed = 2.0**22 * eps
-    without_kick = jnp.max(jnp.abs(steps.loads)) <= noticed * jnp.abs(scene.load.final)
+    without_kick = jnp.max(jnp.abs(loads)) <= noticed * jnp.abs(scene.load.final)
     return jnp.where(without_kick, noticed, eps)
 
 
@@ -176,8 +160,7 @@ def with_step(setting: Setting, now: Progress) -> Progress:
     longest = method.dt if now.energy is None else min(method.dt, 1.0)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final
-    assert not isinstance(method, Propagation)
-    after = method.advance(setting.shared.prepared, now.contact, load, now.y, t - now.t, at_section=True)
+    after = method.advance(setting.shared.mechanics, now.contact, load, now.y, t - now.t, at_section=True)
     y, contact, rise = after.y, after.contact, after.rise
     t = end_after(after, now.t, t, jnp.asarray(True))
     changed = contact.status != now.contact.status
@@ -197,7 +180,6 @@ def with_step(setting: Setting, now: Progress) -> Progress:
         verdict=now.verdict,
         bound=now.bound,
         energy=None if now.energy is None else _with_entry(setting, now.energy, now, load, after, t),
-        steps=now.steps,
     )
 
 

@@ -16,8 +16,7 @@ from jaxtyping import Float, Int
 from ..foundation.blocks import MANY
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
-from ..steppers.propagation import Propagation
-from .groups import OF_KICK, Limits, Task, batch_stepper, bytes_per_trajectory, groups_of
+from .groups import OF_KICK, Limits, Task, bytes_per_trajectory, followed_by_kernel, groups_of
 
 # Indices of trajectories in a run; those of one job, for instance.
 Indices = Int[np.ndarray, " r"]
@@ -187,9 +186,10 @@ def cut_into_jobs(unit: Int[np.ndarray, " r"], places: Indices, most: int) -> li
     return [places[order[a:b]] for a, b in zip(ends, [*ends[1:], len(places)], strict=True) if b > a]
 
 
-# The most trajectories of a job, with `Propagation` and with other steppers: a second or two of work, because an interrupt
-# loses as much, and a job must end before its worker is lost; and enough that few groups are in several jobs. A long run has
-# jobs that are up to so many times as large, while there are so many of them: to follow more at once takes less of Python.
+# The most trajectories of a job, if kernels follow those of one contact under constant friction, and if not: a second or two of
+# work, because an interrupt loses as much, and a job must end before its worker is lost; and enough that few groups are in
+# several jobs. A long run has jobs that are up to so many times as large, while there are so many of them: to follow more at
+# once takes less of Python.
 IN_A_JOB, IN_A_LONG_JOB = 8192, 1024
 TIMES_AS_LARGE, JOBS = 8, 8
 # The most groups of a job, for the same reason: most of the work on a small group are its attractors.
@@ -215,11 +215,10 @@ def plan_of(
 ) -> Plan:
     """The plan of a run of these trajectories, or of those at `places`; see `engine.run_to_verdict`."""
     states = trajectories.states
-    followed = method if limits.energy else batch_stepper(method, scene)
     per_group = trajectories.total / trajectories.group_count
     each = bytes_per_trajectory(scene, per_group)
     count = trajectories.total if places is None else len(places)
-    jobs = trajectories.jobs(places, largest_job_size(followed, each, per_group, count))
+    jobs = trajectories.jobs(places, largest_job_size(takes_long(scene, method, limits.energy), each, per_group, count))
     counts, later = np.zeros(trajectories.group_count, np.int64), []
     for number, own in enumerate(jobs):
         groups, here = np.unique(trajectories.groups(own), return_counts=True)
@@ -232,7 +231,7 @@ def plan_of(
     in_rows = np.sum(-(-counts // side_by_side)) * side_by_side
     task = Task(
         scene=jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, scene),
-        method=followed,
+        method=method,
         names=tuple(name for name in trajectories.names if name not in OF_KICK and name not in states),
         of_kick=tuple(name for name in trajectories.names if name in OF_KICK),
         states=states,
@@ -249,11 +248,17 @@ def plan_of(
     return Plan(task, trajectories, jobs, (first, later), each * max(map(len, jobs), default=0))
 
 
-def largest_job_size(method: AbstractStepper | Propagation, each: float, per_group: float, count: int) -> int:
+def takes_long(scene: Scene, method: AbstractStepper, energy: bool) -> bool:
+    """Whether a trajectory takes several times what one of a single contact under constant friction takes by kernels."""
+    one = len(scene.structure.contacts) == 1
+    return energy or not (one and scene.friction.constant and followed_by_kernel(scene, method))
+
+
+def largest_job_size(takes_long: bool, each: float, per_group: float, count: int) -> int:
     """The most trajectories of a job, of so many in the run, if each takes `each` bytes and so many, on average, are of one
     group.
     """
-    by_time = IN_A_JOB if isinstance(method, Propagation) else IN_A_LONG_JOB
+    by_time = IN_A_LONG_JOB if takes_long else IN_A_JOB
     times = min(max(count // (JOBS * by_time), 1), TIMES_AS_LARGE)
     memory = 2.5e8  # of a job, bytes: trajectories in small groups take much
     return max(1, min(by_time * times, int(memory // each), int(GROUPS_IN_A_JOB * per_group)))

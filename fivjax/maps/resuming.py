@@ -15,8 +15,8 @@ from ..model.scene import Scene
 from ..section.about_sliding import mechanics_about_sliding
 from ..steppers.base import AbstractStepper
 from .checkpoint import Checkpoint
-from .groups import batch_stepper, bytes_per_trajectory, kernels_by
-from .plan import Grid, largest_job_size
+from .groups import bytes_per_trajectory, kernels_by
+from .plan import Grid, largest_job_size, takes_long
 from .store import Store, is_store
 
 
@@ -36,7 +36,7 @@ def keeper_at(
     run = {
         "fivjax": metadata.version("fivjax"),
         **{package: metadata.version(package) for package in packages},
-        **kernels_by(method, scene, energy),
+        **kernels_by(method, scene),
         "device": jax.devices()[0].device_kind,
         "scene": describe(scene),
         "method": re.sub(r" at 0x[0-9a-f]+", "", repr(method)),
@@ -49,7 +49,7 @@ def keeper_at(
     per_group = grid.total / grid.group_count
     each = bytes_per_trajectory(scene, per_group)
     # The chunks are those of a short run: a store that is resumed with more points, or fewer, finds the same ones.
-    tile = grid.tile(largest_job_size(method if energy else batch_stepper(method, scene), each, per_group, 1))
+    tile = grid.tile(largest_job_size(takes_long(scene, method, energy), each, per_group, 1))
     return Store(path, run, grid, tile, energy)
 
 
@@ -63,6 +63,6 @@ def _code_of_method(method: AbstractStepper, scene: Scene) -> dict[str, str]:
 
 def _of_method(method: AbstractStepper, scene: Scene, y, one):
     mechanics = mechanics_about_sliding(scene)
-    prepared, contact = method.prepare(mechanics), physics.status_from_forces(mechanics, one, y)
-    advances = [method.advance(prepared, contact, one, y, one, at_section) for at_section in (False, True)]
-    return prepared, advances, method.within(prepared, contact, one, y, one)
+    contact = physics.status_from_forces(mechanics, one, y)
+    advances = [method.advance(mechanics, contact, one, y, one, at_section) for at_section in (False, True)]
+    return advances, method.within(mechanics, contact, one, y, one)

@@ -2,7 +2,6 @@
 
 from concurrent.futures import Executor
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +14,6 @@ from ..kernels.functions import KernelFunction
 from ..kernels.kernel import Groups, kernel_of
 from ..section.by_kernel import in_parts, numbers_in_rows
 from ..steppers.kernel_scope import goes_side_by_side
-from ..steppers.propagation import Propagation
 from .groups import Task
 from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
 
@@ -23,14 +21,12 @@ from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
 def _begin_one(args, instants):
     of_task, shared, row = args
     scene, own = of_task.setting(shared, row).scene, row[len(of_task.of_kick) :]
-    for_kernel = isinstance(of_task.method, Propagation)
-    return begin(scene, shared, of_task.states, own, energy=of_task.energy, for_kernel=for_kernel), ()
+    return begin(scene, shared, of_task.states, own, energy=of_task.energy), ()
 
 
 def _follow_one(args, instants):
-    """So many steps further, by series."""
+    """So many steps further."""
     of_task, shared, row, now, steps = args
-    shared = eqx.tree_at(lambda own: own.prepared, shared, shared.mechanics, is_leaf=lambda leaf: leaf is None)
     setting = of_task.setting(shared, row)
     begin = depending_on((setting.scene, shared.mechanics), now)
     return jax.lax.fori_loop(0, steps, lambda _, now: with_step(setting, now), begin), ()
@@ -50,9 +46,7 @@ class TrajectoryKernels:
 
     def __init__(self, task: Task, shared: Flattened, pool: Executor):
         self.of_task, self.side_by_side = TaskConstants.of(task), goes_side_by_side(task.scene)
-        # Without the matrices of `Propagation`, which have a kernel of their own.
-        without = eqx.tree_at(lambda own: own.prepared, shared.tree, None, is_leaf=lambda leaf: leaf is None)
-        of_groups = in_pairs(jax.tree.map(np.asarray, without))
+        of_groups = in_pairs(jax.tree.map(np.asarray, shared.tree))
         self.first = jax.tree.map(lambda leaf: leaf[0], of_groups)
         rows = numbers_in_rows(of_groups)
         of_all = numbers_in_rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.of_task))
@@ -62,13 +56,19 @@ class TrajectoryKernels:
     def begin(self, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
         """Trajectories at their beginning, each with its kick and initial values."""
         progress: Progress = self._of_each(_begin, group, (columns,))
-        # What concludes is compiled while other kernels are.
-        form = self._form((columns, progress, progress.t))
-        self.pool.submit(lambda: kernel_of(_conclude, form, shared=self.shared).of_lanes.on_cpu)
+        to_follow = self._form((columns, progress, np.zeros(len(columns), np.int32)))
+        to_conclude = self._form((columns, progress, progress.t))
+
+        def build():
+            kernel_of(_follow, to_follow, shared=self.shared, side_by_side=self.side_by_side).of_lanes.on_cpu  # noqa: B018
+            kernel_of(_conclude, to_conclude, shared=self.shared).of_lanes.on_cpu  # noqa: B018
+
+        # What comes later is compiled meanwhile.
+        self.pool.submit(build)
         return flatten((columns, progress))
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
-        """Trajectories so many steps further by series, in place."""
+        """Trajectories so many steps further, in place."""
         columns, now = trajectories.tree
         given = columns, now, np.full(len(group), steps, np.int32)
         after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=self.side_by_side)

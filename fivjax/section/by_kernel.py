@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from ..contact import Contact
 from ..foundation.argument_forms import Form
+from ..kernels.kernel import kernel_of
 from ..model.scene import Scene
 from ..steppers.event_exact import EventExact
 from ..steppers.kernel_scope import goes_side_by_side, has_kernel
@@ -21,19 +22,38 @@ class SectionKernels:
     """The return maps of groups, by their mechanics and longest returns (s), whose arrays have a leading axis over groups."""
 
     def __init__(self, whose, pool: Executor | None, side_by_side: bool = False):
-        self.whose, self.pool, self.side_by_side = whose, pool, side_by_side
+        self.pool, self.side_by_side = pool, side_by_side
         self.table = numbers_in_rows(whose)
-        # The state comes after what is the group's.
-        self.state = len(jax.tree.leaves(whose))
-        self.form: Form | None = None
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], whose)
+        mechanics, _ = first
+        of_contacts = np.zeros(np.shape(mechanics.belt_speed))
+        start = Point(np.zeros(2 * len(mechanics.free_load)), Contact(of_contacts.astype(np.int32), of_contacts))
+        last = np.int32(1), np.float64(np.inf), np.bool_(False)
+        self.form = Form.of((ByMethod(EventExact()), first, start, *last))[0].kept
+        # The state comes after what is the group's; derivatives are by it.
+        state = len(jax.tree.leaves(whose))
+        self.wide = tuple(place == state for place in range(len(self.form.arrays)))
+        self.size = len(start.y)
+        # Differences of motions side by side take as long as derivatives of one. A kernel of tangents of several contacts is
+        # compiled for a minute, and used for a few motions.
+        self.has_derivatives = not (side_by_side or mechanics.several)
+
+    def begin_building(self) -> None:
+        """Begin to compile the kernel in a thread, before it is needed."""
+        if self.pool is not None:
+            self.pool.submit(
+                lambda: kernel_of(motion_to_section, self.form, side_by_side=self.side_by_side).of_lanes.on_cpu
+            )
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """As `return_maps.Kernels.returns`."""
-        form, given = self._rows(group, y, status, direction, crossings, peaks)
+        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
+        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
+        """
+        given = self._rows(group, y, status, direction, crossings, peaks)
         numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
         parts = [
             motion_to_section.of_many(
-                form, given[rows], numbers[rows], self._pool_for(numbers[rows, -1]), self.side_by_side
+                self.form, given[rows], numbers[rows], self._pool_for(numbers[rows, -1]), self.side_by_side
             )
             for rows in in_parts(len(group), 8 * (given.shape[1] + kept * y.shape[1]))
         ]
@@ -44,10 +64,11 @@ class SectionKernels:
 
     def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""
-        form, given = self._rows(group, y, status, direction, crossings, False)
-        wide = tuple(place == self.state for place in range(len(form.arrays)))
+        given = self._rows(group, y, status, direction, crossings, False)
         last = np.broadcast_to(np.asarray(crossings, float), len(y))[:, None]
-        found = motion_to_section.derived_of_many(form, given, last, wide, np.eye(y.shape[1]), self._pool_for(last))
+        found = motion_to_section.derived_of_many(
+            self.form, given, last, self.wide, np.eye(self.size), self._pool_for(last)
+        )
         (end, _), (slopes, _) = found
         return (*_on_section(end), end.at.time), slopes.at.point.y
 
@@ -57,16 +78,11 @@ class SectionKernels:
         return self.pool if np.sum(crossings) >= least_in_threads else None
 
     def _rows(self, group, y, status, direction, crossings, peaks: bool):
-        if self.form is None:
-            contact = Contact(np.asarray(status, np.int32)[0], np.asarray(direction, float)[0])
-            whose = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.whose)
-            last = np.int32(1), np.float64(np.inf), np.bool_(False)
-            self.form = Form.of((ByMethod(EventExact()), whose, Point(np.asarray(y)[0], contact), *last))[0].kept
         # In the order of that tree.
         own = np.empty((len(y), 3))
         own[:, 0], own[:, 1], own[:, 2] = crossings, np.inf, peaks
         contact = (np.reshape(part, (len(y), -1)) for part in (status, direction))
-        return self.form, np.concatenate([self.table[group], y, *contact, own], axis=1)
+        return np.concatenate([self.table[group], y, *contact, own], axis=1)
 
 
 def section_kernels(
@@ -75,7 +91,7 @@ def section_kernels(
     """The kernels of groups of scenes like this one, for many trajectories if they go `side_by_side`; None where there are
     none.
     """
-    if not has_kernel(scene, EventExact()):
+    if not has_kernel(scene, EventExact(), called_by_xla=False):
         return None
     return SectionKernels((mechanics, longest_return), pool, side_by_side and goes_side_by_side(scene))
 

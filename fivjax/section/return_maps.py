@@ -1,14 +1,14 @@
 """The Poincaré section's return map for many states of many groups in one batch, exact through every contact event.
 
 A group is one scene, or what the trajectories of a map have in common that differ in their kicks only. Kernels compute the map
-where there are some; derivatives, which those by matrices do not have, are then central differences. Without kernels, XLA does
-in blocks of one size.
+where there are some; derivatives are then central differences in maps and with several contacts. Without kernels, XLA does in
+blocks of one size.
 """
 
 import functools
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,16 +95,6 @@ class Images(NamedTuple):
     peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
 
 
-class Kernels(Protocol):
-    """Kernels that compute return maps, as `by_kernel.SectionKernels` does, perhaps without derivatives."""
-
-    def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
-        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
-        """
-        ...
-
-
 class ReturnMaps:
     """The return maps of all groups.
 
@@ -117,7 +107,7 @@ class ReturnMaps:
         structure: Structure,
         mechanics,
         longest_return: Float[np.ndarray, " g"],
-        kernels: Kernels | None,
+        kernels: SectionKernels | None,
         pool: Executor,
         known_to: float = ROUNDED,
     ):
@@ -246,10 +236,7 @@ class ReturnMaps:
         self, group, at: Section, crossings
     ) -> tuple[Section, Float[np.ndarray, " m"], Float[np.ndarray, "m 2n 2n"]]:
         """The same crossing, its time (s), and the derivative of the map, for deviations that a row's contact mode allows."""
-        # A kernel of tangents of several contacts is compiled for a minute, and used for a few motions.
-        if self.kernels is not None and (
-            len(self.structure.contacts) > 1 or not isinstance(self.kernels, SectionKernels)
-        ):
+        if self.kernels is not None and not self.kernels.has_derivatives:
             return self._differences(group, at, crossings)
         if self.kernels is not None:
             (*section, time), derivatives = self.kernels.derived(group, *at, crossings)

@@ -2,6 +2,5 @@
 
 Read first: `base`, what every stepper does; `event_exact`, by Taylor series (`motion_series`, `step_length`,
 `law_agreement`) up to the next root of a guard (`guard_roots`); `core`, steps joined to a motion. `where_switched` is the
-teaching counterpart. `propagation`, `window` and `matrix_kernel` step by matrices under constant friction, for maps;
-`kernel_scope` says which motions kernels follow.
+teaching counterpart; `kernel_scope` says which motions kernels follow.
 """

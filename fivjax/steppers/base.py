@@ -108,10 +108,6 @@ class AbstractStepper(diffrax.AbstractSolver[StepperState]):
     term_structure: ClassVar = diffrax.ODETerm
 
     @abc.abstractmethod
-    def prepare(self, mechanics: Mechanics):
-        """What `advance` needs of a scene, worked out once: the mechanics themselves, or matrices made from them."""
-
-    @abc.abstractmethod
     def advance(
         self,
         mechanics: Mechanics,

@@ -19,15 +19,15 @@ from .event_exact import EventExact
 LARGEST, MOST_CONTACTS = 48, 4
 
 
-def has_kernel(scene: Scene, method: AbstractStepper) -> bool:
-    """Whether a kernel follows the motions of such scenes by this method."""
+def has_kernel(scene: Scene, method: AbstractStepper, called_by_xla: bool = True) -> bool:
+    """Whether a kernel follows the motions of such scenes by this method; on a CPU, if programs of XLA may call it."""
     if not isinstance(method, EventExact):
         return False
     if not is_installed():
         _tell_once()
         return False
     return (
-        jax.default_backend() == "cpu"
+        (not called_by_xla or jax.default_backend() == "cpu")
         and scene.structure.size <= LARGEST
         and len(scene.structure.places) <= MOST_CONTACTS
         and _laws_can_be_written(scene)

@@ -57,9 +57,6 @@ class WhereSwitched(AbstractStepper):
         # Of the smooth motion between events.
         return self.solver.order(terms)
 
-    def prepare(self, mechanics: Mechanics) -> Mechanics:
-        return mechanics
-
     def step(self, terms, t0, t1, y0: State, args: Scene, solver_state: StepperState, made_jump):
         mechanics, contact = solver_state.mechanics, solver_state.contact
         # Steps end at jumps of the load, so the load at mid-step is that of the whole step.

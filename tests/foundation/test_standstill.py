@@ -71,12 +71,12 @@ def test_a_batch_of_trajectories_has_no_lapack():
     scene, names = chain(12, 1), ("mu",)
     method = EventExact()
     own = np.full((2, 1), 0.3)
-    prepare = lambda rows: groups._prepare.__wrapped__(scene, method, names, rows)  # noqa: E731
-    of_preparing, (mechanics, prepared, linear, *rest) = of_program(prepare, own)
+    prepare = lambda rows: groups._prepare.__wrapped__(scene, names, rows)  # noqa: E731
+    of_preparing, (mechanics, linear, *rest) = of_program(prepare, own)
     assert "while" in of_preparing or "scan" in of_preparing, "elimination is a loop"
     for part in ("matrix", "frictionless"):
         getattr(linear, part)[:] = -np.eye(linear.matrix.shape[-1])
-    shared = flatten(groups.GroupConstants(own, mechanics, prepared, groups.sliding_modes(linear), *rest))
+    shared = flatten(groups.GroupConstants(own, mechanics, groups.sliding_modes(linear), *rest))
     columns = flatten(np.zeros((2, 1)))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 

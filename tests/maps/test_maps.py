@@ -14,7 +14,7 @@ import xarray as xr
 
 import fivjax as fj
 from fivjax.maps import engine, plan
-from fivjax.maps.matrix_kernels import MatrixKernels
+from fivjax.maps.trajectory_kernels import TrajectoryKernels
 from tests.helpers import oracle, reference
 
 SPEEDS = np.array([0.5, 1.0, 1.5, 3.0, 5.0, 10.0, 100.0])
@@ -243,7 +243,7 @@ def test_undecided_trajectories_are_labelled_and_counted(paper_scene):
 
 def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
     """Ctrl-C in the middle of a run: the decided trajectories are returned, the others labelled, and the user is told."""
-    real, calls = MatrixKernels.follow, []
+    real, calls = TrajectoryKernels.follow, []
 
     def interrupted(*args):
         calls.append(1)
@@ -251,7 +251,7 @@ def test_an_interrupted_map_keeps_what_it_has(paper_scene, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(MatrixKernels, "follow", interrupted)
+    monkeypatch.setattr(TrajectoryKernels, "follow", interrupted)
     with pytest.warns(UserWarning, match="Interrupted"):
         m = fj.bistability_map(paper_scene, mu=[0.227], p=[1.01, 1.015, 1.02, 1.19], progress=False).isel(mu=0)
     assert m["verdict"].values.tolist() == [0, 0, 0, fj.Verdict.NOT_RUN]

@@ -1,4 +1,4 @@
-"""The section's return map by kernels with matrices: the one that the series stepper has."""
+"""The section's return map by kernels, side by side: the one that the series stepper has by XLA."""
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
@@ -9,11 +9,10 @@ import pytest
 
 import fivjax as fj
 from fivjax.maps.groups import Task, constants_of
-from fivjax.maps.matrix_kernels import MatrixKernels
 from fivjax.section.about_sliding import sliding_state
+from fivjax.section.by_kernel import section_kernels
 from fivjax.section.free_directions import directions_of_several, zero_on_section
 from fivjax.section.return_maps import ReturnMaps, Section, section_at
-from fivjax.steppers.propagation import Propagation
 
 CROSSINGS = 6
 
@@ -22,10 +21,9 @@ CROSSINGS = 6
 def maps():
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.2), belt_speed=2.0)
     with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
-        task = Task(scene, Propagation(), ("mu",), (), {}, width=8)
-        shared = constants_of(task, np.array([[0.12], [0.2], [0.227]]))
-        tree = shared.tree
-        yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, MatrixKernels(shared, pool), pool)
+        tree = constants_of(Task(scene, fj.EventExact(), ("mu",), (), {}), np.array([[0.12], [0.2], [0.227]])).tree
+        kernels = section_kernels(scene, tree.mechanics, tree.longest_return, pool, side_by_side=True)
+        yield ReturnMaps(scene.structure, tree.mechanics, tree.longest_return, kernels, pool)
 
 
 @pytest.fixture(scope="module")
@@ -67,16 +65,11 @@ def test_crossings_are_the_series_stepper_s(maps, exactly, starts):
 def test_a_motion_has_as_many_segments_as_its_returns_need():
     """Between two returns their number is limited, but not over all: 60,000 returns to a cycle of five events."""
     scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(mu=0.227), belt_speed=1.0)
-    group, by_series = np.zeros(1, int), ReturnMaps.of(scene)
-    at = by_series.in_contact(group, fj.limit_cycle(scene).points[:1])
-    with jax.enable_x64(True), ThreadPoolExecutor(2) as pool:
-        shared = constants_of(Task(scene, Propagation(), ("mu",), (), {}, width=8), np.array([[0.227]]))
-        by_matrices = copy.copy(by_series)
-        by_matrices.kernels = MatrixKernels(shared, pool)
-        for one in (by_series, by_matrices):
-            found = one.returns(group, at, 60_000)
-            assert found.events.tolist() == [300_000]
-            np.testing.assert_allclose(found.at.y, at.y, rtol=1e-9, atol=1e-15)
+    group, maps = np.zeros(1, int), ReturnMaps.of(scene)
+    at = maps.in_contact(group, fj.limit_cycle(scene).points[:1])
+    found = maps.returns(group, at, 60_000)
+    assert found.events.tolist() == [300_000]
+    np.testing.assert_allclose(found.at.y, at.y, rtol=1e-9, atol=1e-15)
 
 
 def test_of_no_states_there_are_no_images(maps, exactly, starts):
