@@ -37,7 +37,7 @@ def higher_peak(
 
 
 def peak_of_series(
-    speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""], before: Float[Array, ""] | float = 0.0
+    speeds: Float[Array, " order"], h: Float[Array, ""], end: Float[Array, ""], before: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The largest speed of a series up to its end, or `before` if that is larger."""
     # To first order the value at a peak does not depend on its instant; but at the advance's end, where an event ends it or the
@@ -61,4 +61,4 @@ def peak_of_series(
         peak, _ = value_and_slope(speeds, jnp.where(x >= until, end, x))
         return jnp.maximum(before, jnp.where(h > 0, jnp.abs(peak), 0.0))
 
-    return jax.lax.cond(highest + bend / 8 <= before, lambda: jnp.asarray(before, speeds.dtype), peak)
+    return jax.lax.cond(highest + bend / 8 <= before, lambda: before, peak)

@@ -14,8 +14,6 @@ from fivjax.contact import Mechanics, status_from_forces
 from fivjax.foundation.compiling import compiled
 from fivjax.kernels import functions, warp_library
 from fivjax.kernels import kernel as built
-from fivjax.kernels.cpp_code import scalar_source
-from fivjax.kernels.lane_functions import LaneFunction
 from fivjax.kernels.warp_library import LEAST_ON_GPUS, gpus_for, warp
 from fivjax.maps.following import Batch, begin_all
 from fivjax.maps.groups import Task
@@ -244,15 +242,11 @@ def everything(x, y):
 
 
 def test_arithmetic_written_out_is_that_of_jax():
-    source, size = scalar_source(everything, x=2, y=3)
-    ends = f"double* found = (double*)founds + {size} * lane;\n"
-    given = "const double *x = (const double*)xs + 2 * lane, *y = (const double*)ys + 3 * lane;\n"
     random = np.random.default_rng(0)
     x, y = 3 * random.normal(size=(50, 2)), 3 * random.normal(size=(50, 3))  # where negative, not a number
     y[0], x[1] = 0.0, 0.0
-    found = np.zeros((50, size))
-    evaluate = LaneFunction(given + ends + source, ("xs", "ys", "founds"))
-    evaluate.on_cpu(0, 50, *(array.ctypes.data for array in (x, y, found)))
+    evaluate = functions.KernelFunction(lambda args, _: (everything(*args), ()))
+    found = np.array([evaluate((a, b))[0] for a, b in zip(x, y, strict=True)])
     with jax.enable_x64(True):
         expected = np.array([everything(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(x, y, strict=True)])
     assert np.any(np.isnan(expected))
