@@ -43,7 +43,7 @@ class _Drift(NamedTuple):
     time: Float[np.ndarray, " m"]  # that it took, s
     events: Int[np.ndarray, " m"]  # contact events on it
     passed: Float[np.ndarray, " m"]  # the time of these and of as many returns before, s
-    met: Int[np.ndarray, " m"]  # and all events
+    changes: Int[np.ndarray, " m"]  # and how often a contact's status changed on them
     steady: Bool[np.ndarray, " m"]  # whether the drift was the same before
     growth: Float[np.ndarray, " m"]  # the logarithm of that of the motions' size
     grows: Bool[np.ndarray, " m"]  # which are without events and do nothing but grow, or decay
@@ -63,8 +63,8 @@ def creep(
     motions: Motions,
     arrived: Callable[[Int[np.ndarray, " r"], Section], Bool[np.ndarray, " r"]],
 ) -> tuple[Bool[np.ndarray, " m"], Section, Float[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Which motions creep; and where these are, how much later (s), and after how many more contact events, when they have
-    `arrived` (told by their rows and states), or creep no more.
+    """Which motions creep; and where these are, how much later (s), and after how many more changes of a contact's status, when
+    they have `arrived` (told by their rows and states), or creep no more.
     """
     # A leap is this share of the motion's size at most.
     longest_leap = 0.05
@@ -78,7 +78,7 @@ def creep(
     creeps = np.zeros(len(group), bool)
     share, settles, plainly = np.full(len(group), np.nan), np.full(len(group), 128), np.zeros(len(group), int)
     rows, here = np.arange(len(group)), _measure_drift(maps, motions)
-    time, events = here.passed.copy(), here.met.copy()
+    time, changes = here.passed.copy(), here.changes.copy()
     for _ in range(1024):
         length, size = np.linalg.norm(here.way, axis=1), np.linalg.norm(maps.weights * here.at.y, axis=1)
         # What has faded is of interest only if it grows again.
@@ -121,14 +121,16 @@ def creep(
         creeps[done] = True
         last.put(done, there.at.rows(kept))
         time[done] += (np.where(plain, 0.0, skipped * here.time) + settled.time + there.passed)[kept]
-        events[done] += ((times * here.events).astype(int) + settled.events + there.met)[kept]
+        # As many in each return of a leap as in those before it.
+        leapt_over = (0.5 * times * here.changes).astype(int)
+        changes[done] += (leapt_over + settled.changes + there.changes)[kept]
         # From where they have got to; the others try a shorter leap.
         there.put(~kept, here.rows(~kept))
         left = ~kept
         if len(done):
             left[kept] = ~arrived(done, last.rows(done))
         rows, here = rows[left], there.rows(left)
-    return creeps, last, time, events
+    return creeps, last, time, changes
 
 
 def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
@@ -138,9 +140,9 @@ def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     end = maps.returns(group, middle.at, DRIFT_RETURNS)
     before, way = (maps.weights * (after.y - earlier.y) for earlier, after in ((at, middle.at), (middle.at, end.at)))
     steady = _alike(before, way) & (middle.events == end.events)
-    passed, met = middle.time + end.time, middle.events + end.events
+    passed, changes = middle.time + end.time, middle.changes + end.changes
     growth, straight = _growth(maps.weights * end.at.y, way)
-    return _Drift(end.at, way, end.time, end.events, passed, met, steady, growth, straight & (end.events == 0))
+    return _Drift(end.at, way, end.time, end.events, passed, changes, steady, growth, straight & (end.events == 0))
 
 
 def _trusted(share: Float[np.ndarray, " m"], change: Float[np.ndarray, " m"], grows: Bool[np.ndarray, " m"]):

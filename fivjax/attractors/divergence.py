@@ -32,7 +32,7 @@ class Divergence(NamedTuple):
     closing_in: Bool[np.ndarray, " m"]  # neighbours close in exponentially, as they do on a cycle
     at: Section  # where the motions are then
     time: Float[np.ndarray, " m"]  # which that took, s
-    events: Int[np.ndarray, " m"]  # contact events on the way
+    changes: Int[np.ndarray, " m"]  # of a contact's status on the way
 
 
 class _Growth(NamedTuple):
@@ -40,7 +40,7 @@ class _Growth(NamedTuple):
 
     growth: Float[np.ndarray, " m"]  # the logarithm of the growth of their distance per return
     time: Float[np.ndarray, " m"]  # s
-    events: Int[np.ndarray, " m"]
+    changes: Int[np.ndarray, " m"]
     at: Section
     beside: Float[np.ndarray, "m 2n"]  # neighbours in the direction in which those from before are by then
     path: Float[np.ndarray, "m k 2n"]  # the motions' weighted states on the section
@@ -57,15 +57,15 @@ def long_divergence(
     arriving = 8
     group = motions.group
     first = maps.returns(*motions, 1)
-    _, time, events, at, beside, _ = _growth(maps, Motions(group, first.at), _beside(first.at))
-    time, events = time + first.time, events + first.events
+    _, time, changes, at, beside, _ = _growth(maps, Motions(group, first.at), _beside(first.at))
+    time, changes = time + first.time, changes + first.changes
     running, last = np.arange(len(group)), Section(*(part.copy() for part in at))
     parted, least, most, furthest = np.zeros((4, len(group)))
     for turn in range(MOST_WINDOWS):
         before = np.linalg.norm(maps.weights * at.y, axis=1)
-        growth, taken, met, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
+        growth, taken, more, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
-        events[running] += met
+        changes[running] += more
         # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades. What
         # rounding does to neighbours of a tiny motion is neither.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -87,7 +87,7 @@ def long_divergence(
         # Where they have parted by more than on a torus before they close in, the motion was chaotic for a time: another
         # solver's rounding may lead to another attractor.
         chaotic = furthest >= np.where(closing_in, 7.0, chaotic_from)
-    return Divergence(chaotic, closing_in & ~chaotic, last, time, events)
+    return Divergence(chaotic, closing_in & ~chaotic, last, time, changes)
 
 
 def diverges_along(
@@ -148,11 +148,11 @@ def _growth(maps: ReturnMaps, motions: Motions, beside) -> _Growth:
     size = np.linalg.norm(weights * at.y, axis=1, keepdims=True)
     apart = np.linalg.norm(weights * (beside - at.y), axis=1)
     pair = Section(*(np.concatenate(parts) for parts in zip(at, at._replace(y=beside), strict=True)))
-    pair, events, time, path, _ = maps.returns(np.tile(group, 2), pair, WINDOW_RETURNS, WINDOW_RETURNS)
+    pair, _, changes, time, path, _ = maps.returns(np.tile(group, 2), pair, WINDOW_RETURNS, WINDOW_RETURNS)
     own = slice(None, len(group))
     at, other = pair.rows(own), pair.rows(slice(len(group), None))
     away = weights * (other.y - at.y)
     beside, distance = _brought_near(maps, at.y, away, size)
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log(distance / apart) / WINDOW_RETURNS
-    return _Growth(growth, time[own], events[own], at, beside, weights * path[own])
+    return _Growth(growth, time[own], changes[own], at, beside, weights * path[own])

@@ -30,7 +30,8 @@ Slides = Callable[[Motions], Bool[np.ndarray, " r"]]
 
 class Fates(NamedTuple):
     """What becomes of trajectories: which are chaotic, the attractors of others, by row, and which have no events any more, at
-    least for some time. Where they are when that is known, how much later that is, and their contact events on the way.
+    least for some time. Where they are when that is known, how much later that is, and how often a contact's status has changed
+    on the way.
     """
 
     chaotic: Bool[np.ndarray, " m"]
@@ -38,13 +39,13 @@ class Fates(NamedTuple):
     without_events: Bool[np.ndarray, " m"]
     at: Section
     time: Float[np.ndarray, " m"]  # s
-    events: Int[np.ndarray, " m"]
+    changes: Int[np.ndarray, " m"]
 
 
 def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) -> Fates:
     """What becomes of these motions; their loads are final. The catalogue gets the attractors that are found."""
     maps, group = catalogue.maps, motions.group
-    at, events, time, *_ = maps.returns(*motions, 1)
+    at, _, changes, time, *_ = maps.returns(*motions, 1)
     attractor: dict[int, CapturingSet] = {}
     chaotic, without_events = np.zeros((2, len(group)), bool)
     left, onward = np.all(np.isfinite(at.y), axis=1), np.ones(len(group), bool)
@@ -60,29 +61,29 @@ def fates(catalogue: Catalogue, motions: Motions, slides: Slides | None = None) 
             chaotic[rows], without_events[rows] = found.chaotic, found.without_events
             at.put(rows, found.at)
             time[rows] += found.time
-            events[rows] += found.events
+            changes[rows] += found.changes
             attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
             # Where none of these comes to anything, neither do others that go on.
             ended = found.chaotic | found.without_events
             ended[list(found.attractor)] = True
             onward &= np.isin(group, group[rows[ended]])
-    return Fates(chaotic, attractor, without_events, at, time, events)
+    return Fates(chaotic, attractor, without_events, at, time, changes)
 
 
 class _Underway(NamedTuple):
-    """Motions that are followed on: where they are by now, how much later that is (s), and their contact events on the way.
-    All change in place.
+    """Motions that are followed on: where they are by now, how much later that is (s), and how often a contact's status has
+    changed on the way. All are written in place.
     """
 
     motions: Motions
     time: Float[np.ndarray, " m"]
-    events: Int[np.ndarray, " m"]
+    changes: Int[np.ndarray, " m"]
 
-    def move(self, rows, at: Section, time, events) -> None:
-        """These are further, after so much more time and so many more events."""
+    def move(self, rows, at: Section, time, changes) -> None:
+        """These are further, after so much more time and so many more changes."""
         self.motions.at.put(rows, at)
         self.time[rows] += time
-        self.events[rows] += events
+        self.changes[rows] += changes
 
 
 def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray, " m"], slides: Slides | None) -> Fates:
@@ -99,9 +100,9 @@ def _slow_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     if len(rows):
         found = _long_fates(catalogue, run.motions.rows(rows), onward[rows], slides)
         chaotic[rows], without_events[rows] = found.chaotic, found.without_events
-        run.move(rows, found.at, found.time, found.events)
+        run.move(rows, found.at, found.time, found.changes)
         attractor |= {int(rows[row]): one for row, one in found.attractor.items()}
-    return Fates(chaotic, attractor, without_events, run.motions.at, run.time, run.events)
+    return Fates(chaotic, attractor, without_events, run.motions.at, run.time, run.changes)
 
 
 def _slide_on(
@@ -128,7 +129,7 @@ def _slide_on(
         if not len(rows):
             return certain
         later = maps.returns(*run.motions.rows(rows), returns)
-        run.move(rows, later.at, later.time, later.events)
+        run.move(rows, later.at, later.time, later.changes)
         rows = left(rows[(later.events == 0) & np.all(np.isfinite(later.at.y), axis=1)])
     asked = np.zeros(len(certain), bool)
     asked[rows] = True
@@ -142,8 +143,8 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     """
     maps, group = catalogue.maps, motions.group
     followed = long_divergence(maps, motions, arrived=catalogue.has_captured)
-    now, chaotic, time, events = followed.at, followed.chaotic, followed.time, followed.events
-    run = _Underway(Motions(group, now), time, events)
+    now, chaotic = followed.at, followed.chaotic
+    run = _Underway(Motions(group, now), followed.time, followed.changes)
     attractor: dict[int, CapturingSet] = {}
     left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
     asks, further, without_events = left.copy(), *np.zeros((2, len(group)), bool)
@@ -168,7 +169,7 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     rows = np.flatnonzero(left & (further | followed.closing_in) & ~without_events)
     if len(rows):
         chaotic[rows] = long_divergence(maps, run.motions.rows(rows)).chaotic
-    return Fates(chaotic, attractor, without_events, now, time, events)
+    return Fates(chaotic, attractor, without_events, now, run.time, run.changes)
 
 
 def _creep(
@@ -202,7 +203,7 @@ def _drift(maps: ReturnMaps, run: _Underway, asked: Bool[np.ndarray, " m"]) -> B
         own = np.array([is_drifting(maps.weights * one) for one in seen.path])
         rows = rows[own]
         later = maps.returns(run.motions.group[rows], seen.at.rows(own), ONWARD)
-        run.move(rows, later.at, seen.time[own] + later.time, seen.events[own] + later.events)
+        run.move(rows, later.at, seen.time[own] + later.time, seen.changes[own] + later.changes)
         drifting[rows] = True
     return drifting
 

@@ -135,7 +135,7 @@ def _trace(maps: ReturnMaps, motions: Motions, tori: list[list[Torus]], count: i
             # Most are left out after this, and peaks take as long as the motion.
             at, more = maps.path(group[running], at, AT_A_TIME)
         else:
-            at, _, taken, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
+            at, _, _, taken, more, highest = maps.returns(group[running], at, AT_A_TIME, AT_A_TIME, peaks=True)
             peaks, times = (
                 np.concatenate([earlier, latest[:, None]], axis=1)[:, -kept // AT_A_TIME :]
                 for earlier, latest, kept in ((peaks, highest, LONGER), (times, taken, LONGEST))

@@ -160,7 +160,7 @@ class Capture:
             now.bound[asks[sliding]] = bound
             sliding = sliding[bound < 1]
         decided = np.array([*found.attractor, *sliding], int)
-        now = later(now, asks[decided], found.time[decided], found.events[decided])
+        now = later(now, asks[decided], found.time[decided], found.changes[decided])
         return Late(chaotic, {int(asks[row]): one for row, one in found.attractor.items()}, asks[sliding], now)
 
     def _may_be_captured(self, now: Progress, growing: bool = False) -> Bool[np.ndarray, " m"]:
@@ -181,13 +181,13 @@ def section_of(now: Progress) -> Section:
 
 
 def later(
-    now: Progress, rows: Int[np.ndarray, " r"], time: Float[np.ndarray, " r"], events: Int[np.ndarray, " r"]
+    now: Progress, rows: Int[np.ndarray, " r"], time: Float[np.ndarray, " r"], changes: Int[np.ndarray, " r"]
 ) -> Progress:
-    """These trajectories after so much more time (s) and so many more events. When the last of them was is not known."""
+    """These trajectories after so much more time (s) and so many more changes of status. When the last was is not known."""
     t, total, last_event = (np.array(part) for part in (now.t, now.events, now.last_event))
     t[rows] += time
-    total[rows] += events
-    last_event[rows[events > 0]] = np.nan
+    total[rows] += changes
+    last_event[rows[changes > 0]] = np.nan
     return eqx.tree_at(lambda now: (now.t, now.events, now.last_event), now, (t, total, last_event))
 
 

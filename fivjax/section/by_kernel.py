@@ -46,8 +46,9 @@ class SectionKernels:
             )
 
     def returns(self, group: Int[np.ndarray, " m"], y, status, direction, crossings, peaks: bool, kept: int):
-        """The `crossings`-th crossing from each row: state, status, direction, number of events, time (s), the last `kept`
-        crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section is not reached.
+        """The `crossings`-th crossing from each row: state, status, direction, numbers of events and of changes of status, time
+        (s), the last `kept` crossings and, with `peaks`, the largest tangential speed (m/s) on the way. NaN where the section
+        is not reached.
         """
         given = self._rows(group, y, status, direction, crossings, peaks)
         numbers = np.broadcast_to(crossings, len(y))[:, None] - np.arange(kept, dtype=float)[::-1]
@@ -60,7 +61,8 @@ class SectionKernels:
         end, path = jax.tree.map(lambda *part: np.concatenate(part), *parts) if len(parts) > 1 else parts[0]
         (y, status, direction), (at, _, arrived, peak) = _on_section(end), end
         peak = np.where(arrived, peak, np.nan)
-        return y, status, direction, at.events.astype(np.int32), at.time, path.point.y, peak
+        events, changes = at.events.astype(np.int32), at.changes.astype(np.int32)
+        return y, status, direction, events, changes, at.time, path.point.y, peak
 
     def derived(self, group: Int[np.ndarray, " m"], y, status, direction, crossings):
         """The same crossing: state, status, direction and time (s) there, and the derivative of the map."""

@@ -42,7 +42,8 @@ class Crossing(NamedTuple):
 
     point: Point
     time: Float[Array, ""]  # s
-    events: Int[Array, ""]
+    events: Int[Array, ""]  # rebounds among them
+    changes: Int[Array, ""]  # of a contact's status
 
 
 class Arrival(NamedTuple):
@@ -68,6 +69,7 @@ class _Carry(NamedTuple):
     left: Float[Array, ""]  # of the longest time, s
     crossed: Int[Array, ""]
     events: Int[Array, ""]
+    changes: Int[Array, ""]
     segments: Int[Array, ""]  # since the last crossing
     peak: Float[Array, ""]
 
@@ -92,7 +94,7 @@ def to_crossing(
     contact = Contact(start.contact.status.astype(jnp.int32), start.contact.direction)
     # The longest wait for a return depends on the scene; the time of the return does not, so the wait has no derivative.
     longest = jax.lax.stop_gradient(longest)
-    begin = _Carry(start.y, contact, kick, longest, none, none, none, zero)
+    begin = _Carry(start.y, contact, kick, longest, none, none, none, none, zero)
     begin = depending_on((mechanics, longest), begin)
 
     def further(way: _Carry) -> _Carry:
@@ -123,6 +125,7 @@ def to_crossing(
             left,
             way.crossed + crosses,
             way.events + (jnp.any(after.ended) & ~kicked),
+            way.changes + (jnp.any(after.contact.status != way.contact.status) & ~kicked),
             jnp.where(crosses, 0, way.segments + 1),
             peak,
         )
@@ -134,7 +137,7 @@ def to_crossing(
         return jax.lax.while_loop(going, further, way)
 
     def here(way: _Carry) -> Crossing:
-        return Crossing(Point(way.y, way.contact), longest - way.left, way.events)
+        return Crossing(Point(way.y, way.contact), longest - way.left, way.events, way.changes)
 
     def row(way: _Carry, number):
         number = number.astype(jnp.int32)

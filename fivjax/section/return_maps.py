@@ -90,6 +90,7 @@ class Images(NamedTuple):
 
     at: Section
     events: Int[np.ndarray, " m"]  # contact events on the way
+    changes: Int[np.ndarray, " m"]  # and changes of a contact's status, which rebounds are not
     time: Float[np.ndarray, " m"]  # s
     path: Float[np.ndarray, "m kept 2n"]  # the last states on the section, newest last; NaN if there were fewer
     peak: Float[np.ndarray, " m"]  # the largest tangential speed on the way, m/s; 0 unless asked for
@@ -203,17 +204,19 @@ class ReturnMaps:
         if not len(group):
             # Blocks are never empty.
             nothing = np.zeros(0)
-            return Images(at, nothing.astype(np.int32), nothing, np.zeros((0, kept, at.y.shape[1])), nothing)
+            none = nothing.astype(np.int32)
+            return Images(at, none, none, nothing, np.zeros((0, kept, at.y.shape[1])), nothing)
         if self.kernels is not None or kept <= KEPT:
             return self._returns(group, at, crossings, kept, peaks)
         parts: list[Images] = []
         for start in range(0, kept, KEPT):
             part = min(KEPT, kept - start)
             parts.append(self._returns(group, parts[-1].at if parts else at, part, part, peaks))
-        _, events, time, paths, peak = zip(*parts, strict=True)
+        _, events, changes, time, paths, peak = zip(*parts, strict=True)
         return Images(
             parts[-1].at,
             np.sum(events, axis=0),
+            np.sum(changes, axis=0),
             np.sum(time, axis=0),
             np.concatenate(paths, axis=1),
             np.max(peak, axis=0),
@@ -357,7 +360,7 @@ def _to_crossing(shared, row, rows: int, careful: bool = False, peaks: bool = Fa
 def _returned(shared: Flattened, rows: Flattened) -> Flattened:
     def one(shared, *row):
         section, end, path = _to_crossing(shared, row, KEPT)
-        return *section, end.at.events, end.at.time, path
+        return *section, end.at.events, end.at.changes, end.at.time, path
 
     return of_block(one, shared, rows)
 

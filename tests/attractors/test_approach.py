@@ -38,7 +38,8 @@ class Line:
             y[going, 0] = x + GROWTH * (x - self.unstable) * (STABLE - x)
             path[going] = np.concatenate([path[going, 1:], y[going, None]], axis=1)
         nothing = np.zeros(len(group))
-        return Images(at._replace(y=y), nothing.astype(np.int32), nothing, path, nothing)
+        none = nothing.astype(np.int32)
+        return Images(at._replace(y=y), none, none, nothing, path, nothing)
 
     def path(self, group, at, count):
         found = self.returns(group, at, count, count)

@@ -494,7 +494,11 @@ class Locked:
             path.append(np.where((count < crossings)[:, None], self.once(path[-1]), path[-1]))
         nothing = np.zeros(len(group))
         return Images(
-            at._replace(y=path[-1]), nothing.astype(int), 1.0 * crossings, np.stack(path[-kept:], axis=1), nothing
+            at._replace(y=path[-1]),
+            *np.zeros((2, len(group)), int),
+            1.0 * crossings,
+            np.stack(path[-kept:], axis=1),
+            nothing,
         )
 
     def path(self, group, at, count):

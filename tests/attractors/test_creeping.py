@@ -30,9 +30,8 @@ class Line(SimpleNamespace):
             y[moving] = np.stack(
                 [x + self.drift(x, group[moving]) + self.coupling * (z - 0.1 * x**2), 0.98 * z + 0.002 * x**2], axis=1
             )
-        return Images(
-            at._replace(y=y), np.zeros(len(y), int), 1.0 * crossings, np.zeros((len(y), 1, 2)), np.zeros(len(y))
-        )
+        none = np.zeros(len(y), int)
+        return Images(at._replace(y=y), none, none, 1.0 * crossings, np.zeros((len(y), 1, 2)), np.zeros(len(y)))
 
 
 def on_line(drift, starts, arrived, most=3.0, coupling=0.01):
@@ -122,7 +121,7 @@ def test_what_rounding_does_to_neighbours_of_a_tiny_motion_is_no_chaos():
     y[:, [2, 5]] = 0.0
     group = np.zeros(len(y), int)
     found = long_divergence(maps, Motions(group, maps.in_contact(group, y)))
-    assert np.all(found.events == 0) and not np.any(found.chaotic)
+    assert np.all(found.changes == 0) and not np.any(found.chaotic)
 
 
 def test_without_a_kick_what_grows_comes_to_what_kicks_come_to():

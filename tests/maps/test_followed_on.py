@@ -48,7 +48,7 @@ class Line:
             y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
             path[going] = np.concatenate([path[going, 1:], y[going, None]], axis=1)
         y = np.stack([x, *np.zeros((3, len(x)))], axis=1)
-        return Images(Section(y, at.status, at.direction), events, RETURN * crossings, path, x)
+        return Images(Section(y, at.status, at.direction), events, events, RETURN * crossings, path, x)
 
     def moves(self, group, y):
         return y[:, 0] != 0
@@ -98,7 +98,7 @@ def test_what_is_proved_after_the_time_is_over_has_its_own_time_and_events():
         nearest = returns - crept + int(np.argmin(np.abs(np.array(path[returns - crept :]) - there)))
         assert path[nearest] == pytest.approx(there, abs=1e-12 if row == 2 else 1e-9)
         events, x = int(np.sum(np.array(path[:nearest]) > 2)), path[nearest]
-        assert found.events[row] == pytest.approx(events, abs=crept)
+        assert found.changes[row] == pytest.approx(events, abs=crept)
         cycle = found.attractor[row]
         assert cycle.amplitude == pytest.approx(4.0) and abs(x - 4) <= cycle.neighbourhood.radius
     assert np.all(found.time[:2] > 300 * RETURN), "the others begin far from where they are captured"
