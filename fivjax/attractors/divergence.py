@@ -66,17 +66,20 @@ def long_divergence(
         growth, taken, more, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
         changes[running] += more
+        # One that has faded comes back no more in the end, and where it was is then lost.
+        lasts = maps.moves(group[running], at.y)
         # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades. What
         # rounding does to neighbours of a tiny motion is neither.
         with np.errstate(divide="ignore", invalid="ignore"):
             more = WINDOW_RETURNS * growth - np.log(np.linalg.norm(maps.weights * at.y, axis=1) / before)
             parted[running] += np.where(APART * before > 64 * maps.resolution[group[running]], more, 0.0)
         least, most = np.fmin(least, parted), np.fmax(most, parted)
-        last.put(running, at)
+        there = np.all(np.isfinite(at.y), axis=1)
+        last.put(running[there], at.rows(there))
         # Not a number is neither.
         with np.errstate(invalid="ignore"):
             furthest = np.fmax(furthest, parted - least)
-            left = ((parted - least < chaotic_from) & (most - parted < CLOSED_IN))[running]
+            left = ((parted - least < chaotic_from) & (most - parted < CLOSED_IN))[running] & lasts
         if arrived is not None and turn % arriving == arriving - 1:
             left &= ~arrived(Motions(group[running], at))
         running, at, beside = running[left], at.rows(left), beside[left]

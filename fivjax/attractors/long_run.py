@@ -146,8 +146,10 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     now, chaotic = followed.at, followed.chaotic
     run = _Underway(Motions(group, now), followed.time, followed.changes)
     attractor: dict[int, CapturingSet] = {}
-    left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
-    asks, further, without_events = left.copy(), *np.zeros((2, len(group)), bool)
+    finite = np.all(np.isfinite(now.y), axis=1)
+    without_events = finite & ~maps.moves(group, now.y)
+    left = ~chaotic & finite & ~without_events
+    asks, further = left.copy(), np.zeros(len(group), bool)
     for turn in range(TIMES + 1):
         new = catalogue.captures(run.motions, left)
         attractor |= new
@@ -202,9 +204,15 @@ def _drift(maps: ReturnMaps, run: _Underway, asked: Bool[np.ndarray, " m"]) -> B
         seen = maps.returns(*run.motions.rows(rows), AT_A_TIME, AT_A_TIME)
         own = np.array([is_drifting(maps.weights * one) for one in seen.path])
         rows = rows[own]
-        later = maps.returns(run.motions.group[rows], seen.at.rows(own), ONWARD)
-        run.move(rows, later.at, seen.time[own] + later.time, seen.changes[own] + later.changes)
+        run.move(rows, seen.at.rows(own), seen.time[own], seen.changes[own])
         drifting[rows] = True
+        for _ in range(0, ONWARD, AT_A_TIME):
+            # One that has faded is left where it was.
+            rows = rows[maps.moves(run.motions.group[rows], run.motions.at.y[rows])]
+            later = maps.returns(*run.motions.rows(rows), AT_A_TIME)
+            there = np.all(np.isfinite(later.at.y), axis=1)
+            rows, at = rows[there], later.at.rows(there)
+            run.move(rows, at, later.time[there], later.changes[there])
     return drifting
 
 

@@ -216,3 +216,16 @@ def test_what_comes_from_a_torus_nearby_to_a_known_cycle_is_not_asked_for_a_toru
     _continue_from_seeds(catalogue, {1: 0})
     assert [cycle.points[0, 0] for cycle in known[1].cycles] == pytest.approx([4.0])
     assert not asked
+
+
+def test_what_passes_by_where_a_cycle_was_slides_once_it_has_faded():
+    """Just past the fold of the paper's cycles at 1 m/s, which a branch has at μ = 0.1679666157: motions go about its ghost for
+    thousands of returns, and have faded to nothing thousands of returns later.
+    """
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, p=1.2))
+    m = fj.bistability_map(scene, mu=0.1679666157 + np.array([-1e-5, 1e-5]), p=[2.0, 2.4, 4.0], progress=False)
+    assert m["verdict"].values.tolist() == [[0, 0, 0], [0, 1, 1]]
+    assert np.all(np.isfinite(m["decided_at"]))
+    with pytest.raises(fj.NoLimitCycle) as error:
+        fj.limit_cycle(scene.replace(mu=0.16795))
+    assert "stayed in motion" not in str(error.value)
