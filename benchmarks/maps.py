@@ -1,6 +1,7 @@
 """Trajectories, maps and critical perturbations: errors against the oracle, seconds, memory, and maps of ten million cells.
 
-    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [falling] [start] [memory] [large] [steps]
+    python -m benchmarks.maps [errors] [table2] [map] [speed] [refined] [kernels] [axes] [falling] [start] [memory] [large] [sparse]
+        [steps]
 
 Each word picks one study; without any, all run (half an hour on two cores). `docs/measurements.md` states the figures. The reference
 is `tests/helpers/oracle.py`.
@@ -242,6 +243,24 @@ def large() -> None:
         )
 
 
+def sparse() -> None:
+    """A sparse map of 102,401 × 102,401 points at 1 m/s, 51 × 51 refined eleven times: time and memory of the whole, and of a
+    window on it.
+    """
+    axes = {name: np.linspace(low, high, 51) for name, (low, high) in MAP.items()}
+    begin, cores = time.perf_counter(), time.process_time()
+    with watched_memory() as highest:
+        m = fj.bistability_map(scene(belt_speed=1.0), **axes, refine=11, sparse=True, audit=1e-6, progress=False)
+    wall, cores = time.perf_counter() - begin, time.process_time() - cores
+    print(
+        f"{m.attrs['summary']}: {wall:.0f} s ({cores:.0f} s of cores), this process {highest[0] / 1e6:.0f} MB, result "
+        f"{m.nbytes / 1e6:.0f} MB; {m.attrs['audit_wrong']} of {m.attrs['audit_cells']} audited points wrong"
+    )
+    begin = time.perf_counter()
+    part = fj.window(m, mu=(0.2, 0.201), p=(1.3, 1.31))
+    print(f"a window of {' × '.join(map(str, part['verdict'].shape))} points: {time.perf_counter() - begin:.1f} s")
+
+
 @contextlib.contextmanager
 def watched_memory():
     """The largest memory (bytes) of this process so far, as the only element of a list."""
@@ -313,6 +332,7 @@ if __name__ == "__main__":
         "map": map_,
         "speed": speed,
         "refined": refined,
+        "sparse": sparse,
         "kernels": kernels,
         "axes": axes,
         "falling": falling,

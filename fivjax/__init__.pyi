@@ -36,6 +36,7 @@ from .kicks.tradeoff_study import tradeoff as tradeoff
 from .linear import cea as cea
 from .maps.basin_map import basins as basins
 from .maps.bistability import bistability_map as bistability_map
+from .maps.sparse import window as window
 from .model.belt import belt_oscillator as belt_oscillator
 from .model.contact_coordinates import in_contact_coordinates as in_contact_coordinates
 from .model.contact_point import ContactPoint as ContactPoint

@@ -35,8 +35,9 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     return checked
 
 
-def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
-    """Check how many trajectories axes ask for, before anything is made of their values; each interval is halved so often.
+def check_size(axes: Mapping, halvings: int = 0, energy: bool = False, sparse: bool = False) -> None:
+    """Check how many trajectories axes ask for, before anything is made of their values; each interval is halved so often. Of a
+    sparse map the coarse grid counts, and each axis.
 
     **Raises:** `ValueError`, with the number of bytes, for more than a map may have, or than this machine has memory for.
     """
@@ -48,6 +49,11 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
             f"most trajectories of a map. Give a smaller one."
         )
     counts = {name: (_count(values) - 1) * 2**halvings + 1 for name, values in axes.items()}
+    if sparse and math.prod(counts.values()) >= 2**62:
+        listed = " × ".join(f"{count:,} of `{name}`" for name, count in counts.items())
+        raise ValueError(f"The axes ask for {listed}, which is more than can be numbered. Give a smaller `refine`.")
+    if sparse:
+        counts = {name: _count(values) for name, values in axes.items()}
     total, each = math.prod(counts.values()), sum(part.nbytes for part in by_name(not_run(1, energy)).values())
     if total <= most_trajectories and total * each <= _memory():
         return
@@ -55,7 +61,7 @@ def check_size(axes: Mapping, halvings: int = 0, energy: bool = False) -> None:
     raise ValueError(
         f"The axes ask for {total:,} trajectories ({listed}), whose results alone take {total * each:,} bytes. The most is "
         f"{most_trajectories:,} trajectories, and what the memory of this machine holds. Give fewer values, or make several "
-        f"maps."
+        f"maps{' or one with `sparse=True`' if halvings and not sparse else ''}."
     )
 
 

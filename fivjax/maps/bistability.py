@@ -14,7 +14,7 @@ from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .axes import check_run, check_size, checked_axes, linear_limit
-from .datasets import map_dataset
+from .datasets import audit_note, map_dataset
 from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
 from .groups import Limits
@@ -22,6 +22,7 @@ from .plan import Grid
 from .refinement import finer_axis, refine_grid
 from .results import Verdicts
 from .resuming import keeper_at
+from .sparse import levels_note
 
 
 @in_own_coordinates
@@ -38,6 +39,7 @@ def bistability_map(
     resume: str | Path | None = None,
     energy: bool = False,
     refine: int = 0,
+    sparse: bool = False,
     audit: float = 0.01,
     executor=None,
     **axes,
@@ -78,9 +80,12 @@ def bistability_map(
       axis of n values becomes one of `(n - 1) * 2**refine + 1`. Points that are not computed take the result of the point
       before them on the coarser grid; the variable `computed` says which points were computed. A region between the points of
       the coarse grid, which contains none of them, is missed.
-    - `audit`: the share of points not computed that are computed in the end all the same, at random, to count how many results
-      are wrong: attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its 95 % interval, `audit_rate_low` and
-      `audit_rate_high`.
+    - `sparse`: whether the dataset of a refined map has the points alone that were computed, over the dimension `point`: memory
+      then grows with the length of the boundaries, so that an axis may have a hundred thousand values. `fj.window` makes any
+      part of the grid of it.
+    - `audit`: the share of points not computed that are computed in the end all the same, at random (a hundred thousand at
+      most), to count how many results are wrong: attributes `audit_cells`, `audit_wrong`, `audit_rate`, and its 95 % interval,
+      `audit_rate_low` and `audit_rate_high`.
 
     **Returns:** a dataset with the axes as dimensions and, over all of them, `verdict` (0 sliding, 1 limit cycle,
     -1 undecided, other negative numbers failures; the variable's attributes give each a sentence), `amplitude` (peak
@@ -112,12 +117,18 @@ def bistability_map(
         )
     arguments.whole_number("refine", refine, minimum=0)
     arguments.real_number("audit", audit, minimum=0, maximum=1)
-    check_size(axes, refine, bool(energy))
+    arguments.truth("sparse", sparse)
+    if sparse and not refine:
+        raise ValueError(
+            "Argument `sparse` is for maps that are refined: give `refine`, how often to halve the intervals."
+        )
+    check_size(axes, refine, bool(energy), bool(sparse))
     axes = {name: finer_axis(values, refine) for name, values in checked_axes(scene, axes).items()}
     grid = Grid(axes)
     limits = Limits(t_max, int(max_steps), bool(energy))
     refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
-    keeper = keeper_at(resume, scene, method, grid, limits._asdict() | refinement, limits.energy)
+    refinement |= {"sparse": True} if sparse else {}
+    keeper = keeper_at(resume, scene, method, grid, limits._asdict() | refinement, limits.energy, sparse)
     options = RunOptions("map", memory, progress, executor, keeper)
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):
         # Compiled and computed while trajectories are followed.
@@ -132,9 +143,11 @@ def bistability_map(
         def level(places: np.ndarray, what: str) -> Verdicts:
             return run_to_verdict(scene, grid, method, limits, options._replace(label=f"map, {what}"), places, found)
 
-        cells = refine_grid(grid.shape, refine, audit, level)
+        refined, verdicts, checked = refine_grid(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
-    return map_dataset(scene, method, t_max, grid, cells.verdicts, _known_by_now(limit, cells.verdicts), cells)
+    linear = _known_by_now(limit, verdicts)
+    dataset = map_dataset(scene, method, t_max, grid, verdicts, linear, refined, sparse)
+    return dataset.assign_attrs(audit_note(checked) | (levels_note(grid, refined) if sparse else {}))
 
 
 def _known_by_now(limit: Future, verdicts: Verdicts) -> dict[str, float]:

@@ -6,6 +6,7 @@ state of the run. It contains a job as a whole or not at all, so a resumed run g
 not interrupted. Jobs that are under way are kept beside it, in a folder that exists only while there are any (`job_files`).
 """
 
+import contextlib
 import json
 import shutil
 import time
@@ -28,8 +29,10 @@ from .plan import Indices
 from .results import Verdicts, by_name, not_run
 
 KIND = "fivjax checkpoint"
-# Time between writes, s: long enough to cost nothing, short enough to lose little.
-KEEP_EVERY = 2.0
+# Time between writes, s, and in times of what the latest took: long enough to cost nothing, short enough to lose little.
+KEEP_EVERY, SHARE_OF_TIME = 2.0, 20.0
+# The name of the trajectories' indices.
+PLACE = "place"
 # The last bytes of the file, after the length of the list.
 MARK, LENGTH = b"fivjax.2", 8
 # The number of values that share a checksum.
@@ -49,17 +52,23 @@ class Contents(NamedTuple):
 class Checkpoint:
     """The file of a run: reads the results of an earlier run, and writes new ones.
 
-    `run` describes the run of `total` trajectories in plain Python values (that `json` can hold).
+    `run` describes the run of `total` trajectories in plain Python values (that `json` can hold). Without a total the file has
+    the results of those alone that were run, and their indices.
 
     **Raises:** as `read_checkpoint`.
     """
 
-    def __init__(self, path: str | Path, run: dict, total: int, energy: bool):
+    def __init__(self, path: str | Path, run: dict, total: int | None, energy: bool):
         self.path, self.run = Path(path), run
-        self.verdicts, self.found = not_run(total, energy), {}
-        self._new, self._done = False, []
+        self.verdicts, self.found = not_run(total or 0, energy), {}
+        # The indices of the results, in rising order, unless there is one for each trajectory; and those of jobs since then.
+        self._places, self._more = np.zeros(0, np.int64) if total is None else None, []
+        self._new, self._done, self._took = False, [], 0.0
         kept = read_checkpoint(path, run)
         if kept is not None:
+            if self._places is not None:
+                self._places = kept.results[PLACE]
+                self.verdicts = not_run(len(self._places), energy)
             for name, values in by_name(self.verdicts).items():
                 values[:] = kept.results[name]
             self._new = self._leave_out_damage(kept)
@@ -76,14 +85,34 @@ class Checkpoint:
                     stacklevel=5,
                 )
                 self.verdicts.verdict[part] = Verdict.NOT_RUN
+        if self._places is not None:
+            whole = ~self.verdicts.pending()
+            self._places, self.verdicts = self._places[whole], jax.tree.map(lambda part: part[whole], self.verdicts)
         if kept.elsewhere:
             warnings.warn(f"Checkpoint `{self.path}` is damaged beside its results; it is written anew.", stacklevel=5)
         return bool(kept.damaged) or kept.elsewhere
 
     def recall(self, places: Indices | None) -> Verdicts:
         """The results kept of these trajectories (all, unless given)."""
-        chosen = slice(None) if places is None else places
-        return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
+        if self._places is None or places is None:
+            chosen = slice(None) if places is None else places
+            return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
+        self._merge()
+        found = not_run(len(places), bool(self.verdicts.energy))
+        at = np.searchsorted(self._places, places)
+        known = np.flatnonzero(np.isin(places, self._places))
+        for whole, kept in zip(jax.tree.leaves(found), jax.tree.leaves(self.verdicts), strict=True):
+            whole[known] = kept[at[known]]
+        return found
+
+    def _merge(self) -> None:
+        """Put the results of the latest jobs among the others. A job that was run again has the same ones."""
+        if self._places is None or not self._more:
+            return
+        places, verdicts = zip(*self._more, strict=True)
+        self._places, first = np.unique(np.concatenate([self._places, *places]), return_index=True)
+        self.verdicts = jax.tree.map(lambda *parts: np.concatenate(parts)[first], self.verdicts, *verdicts)
+        self._more = []
 
     def job_file(self, places: Indices) -> tuple[str, str]:
         """The path and the key of the file for the job with these trajectories."""
@@ -93,29 +122,39 @@ class Checkpoint:
         """Keep the results of a job; they are written if it is time."""
         if found is not None:
             self.found[int(places[0])] = found
-        for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(verdicts), strict=True):
-            whole[places] = own
+        if self._places is None:
+            for whole, own in zip(jax.tree.leaves(self.verdicts), jax.tree.leaves(verdicts), strict=True):
+                whole[places] = own
+        else:
+            self._more.append((places, verdicts))
         self._new = True
         self._done.append(places)
-        if time.monotonic() - self._written >= KEEP_EVERY:
+        if time.monotonic() - self._written >= max(KEEP_EVERY, SHARE_OF_TIME * self._took):
             self.flush()
 
     def close(self) -> None:
         """Remove the folder of jobs under way if there are none."""
-        if not self.verdicts.pending().any():
+        if self._places is not None:
+            with contextlib.suppress(OSError):
+                self._jobs.rmdir()
+        elif not self.verdicts.pending().any():
             shutil.rmtree(self._jobs, ignore_errors=True)
 
     def flush(self) -> None:
         """Write results that are not written yet."""
         if not self._new:
             return
+        begun = time.monotonic()
+        self._merge()
         found = {place: attractors_to_bytes(part) for place, part in self.found.items()}
-        self._written = time.monotonic()
-        if write_checkpoint(self.path, self.run, by_name(self.verdicts), found):
+        results = by_name(self.verdicts) | ({} if self._places is None else {PLACE: self._places})
+        if write_checkpoint(self.path, self.run, results, found):
             self._new = False
             for places in self._done:
                 Path(self.job_file(places)[0]).unlink(missing_ok=True)
             self._done = []
+        self._written = time.monotonic()
+        self._took = self._written - begun
 
     @property
     def _jobs(self) -> Path:

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Int
 
-from ..io.datasets import labelled
+from ..io.datasets import label, labelled
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
@@ -18,6 +18,9 @@ from .groups import kernels_by
 from .plan import Grid
 from .refinement import Audit, Refined
 from .results import APPROACHED, CHAOTIC, PERIODIC, TORUS, Verdicts
+
+# The dimension of sparse maps.
+POINT = "point"
 
 # Trajectories whose attractors are told apart at a time: that takes much memory.
 AT_A_TIME = 2**18
@@ -46,73 +49,94 @@ def map_dataset(
     grid: Grid,
     verdicts: Verdicts,
     linear: dict[str, float],
-    cells: Refined | None = None,
+    refined: Refined | None = None,
+    sparse: bool = False,
 ) -> xr.Dataset:
     """The labelled dataset of a grid of trajectories; `linear` is what linear theory says, see `axes.linear_limit`.
-    If not all trajectories were computed, `verdicts` are those of the `cells`.
+    Of a `refined` grid `verdicts` are those of its computed points: the dataset is over all points, or `sparse`, over these.
     """
-    axes, shape = grid.axes, grid.shape
     place, table = attractor_table(
-        grid.groups if cells is None else lambda rows: grid.groups(cells.places[rows]), verdicts
+        grid.groups if refined is None else lambda rows: grid.groups(refined.places[rows]), verdicts
     )
-
-    def over_axes(values: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
-        return tuple(axes), (values if cells is None else values[cells.row]).reshape(shape)
-
-    dataset = xr.Dataset(
-        {
-            "verdict": over_axes(verdicts.verdict),
-            "amplitude": over_axes(verdicts.amplitude),
-            "decided_at": over_axes(verdicts.decided_at),
-            "proof": over_axes(_proofs(verdicts)),
-            "bound": over_axes(verdicts.bound),
-            "contact_events": over_axes(verdicts.events),
-            "last_event": over_axes(verdicts.last_event),
-            "attractor": over_axes(place),
-            "chaotic": over_axes(verdicts.attractor_kind == CHAOTIC),
-            **{name: ("attractors", column) for name, column in table.items()},
-            **{name: over_axes(line) for name, line in verdicts.energy.items()},
-        },
-        coords=axes,
-    )
-    if cells is not None:
-        computed = np.zeros(grid.total, bool)
-        computed[cells.places] = ~verdicts.pending(slice(len(cells.places)))
-        described = {"long_name": "whether it was computed", "units": "1"}
-        dataset["computed"] = (tuple(axes), computed.reshape(shape), described)
-    if "p" in axes:
-        others = tuple(name for name in axes if name != "p")
-        rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(axes["p"]))
-        crossing, over = first_crossings(axes["p"], rows), [len(axes[name]) for name in others]
-        dataset["p_crit"] = (others, crossing.middle.reshape(over))
-        dataset["p_crit_low"] = (others, crossing.low.reshape(over))
-        dataset["p_crit_high"] = (others, crossing.high.reshape(over))
+    results = {
+        "verdict": verdicts.verdict,
+        "amplitude": verdicts.amplitude,
+        "decided_at": verdicts.decided_at,
+        "proof": _proofs(verdicts),
+        "bound": verdicts.bound,
+        "contact_events": verdicts.events,
+        "last_event": verdicts.last_event,
+        "attractor": place,
+        "chaotic": verdicts.attractor_kind == CHAOTIC,
+    }
+    results |= verdicts.energy
+    if refined is not None and not sparse:
+        rows = refined.every_row()
+        results = {name: from_rows(name, values, rows) for name, values in results.items()}
+        results["computed"] = np.zeros(grid.total, bool)
+        results["computed"][refined.places] = ~verdicts.pending()
+    dims, coords = tuple(grid.axes), grid.axes
+    if refined is not None and sparse:
+        results |= {"place": refined.places, "audited": refined.audited}
+        dims, coords = (POINT,), {name: (POINT, column) for name, column in grid.columns(refined.places).items()}
+    shape = (-1,) if sparse else grid.shape
+    dataset = xr.Dataset({name: (dims, values.reshape(shape)) for name, values in results.items()}, coords)
+    dataset = dataset.assign({name: ("attractors", column) for name, column in table.items()})
+    if not sparse:
+        dataset = with_critical_kicks(dataset)
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
     dataset.attrs.update(kernels_by(method, scene))
-    meaning, withheld = dict(MEANING), why_withheld(scene)
-    if withheld is not None:
-        dataset.attrs["withheld"] = withheld
-        meaning[Verdict.UNDECIDED] = f"{meaning[Verdict.UNDECIDED]}. {withheld}"
-    dataset["verdict"].attrs.update(
-        flag_values=np.array([verdict.value for verdict in MEANING], np.int8),
-        flag_meanings=" ".join(verdict.name.lower() for verdict in MEANING),
-        meaning=json.dumps({verdict.value: sentence for verdict, sentence in meaning.items()}),
-    )
-    dataset["proof"].attrs.update(
-        flag_values=np.array(list(RESTS_ON), np.int8),
-        flag_meanings=" ".join(proof.name.lower() for proof in RESTS_ON),
-        meaning=json.dumps({proof.value: sentence for proof, sentence in RESTS_ON.items()}),
-    )
+    _explain(dataset, why_withheld(scene))
     dataset.attrs.update(linear)
     every = dataset["verdict"].values
     first = Verdict(int(every.flat[0]))
     if first in FAILURES and np.all(every == first):
         dataset.attrs["failure"] = MEANING[first]
+    computed = f"{len(every):,} computed ones of " if sparse else ""
+    return summarised(dataset, f"{computed}{' × '.join(map(str, grid.shape))} trajectories over {', '.join(grid.axes)}")
+
+
+def from_rows(name: str, values: np.ndarray, rows: Int[np.ndarray, " r"]) -> np.ndarray:
+    """The values of a variable at these rows, of which -1 was not run."""
+    missing = {"verdict": Verdict.NOT_RUN, "proof": Proof.NONE, "attractor": -1}
+    nothing = missing.get(name, np.nan if values.dtype.kind == "f" else 0)
+    return np.append(values, np.array(nothing, values.dtype))[rows]
+
+
+def with_critical_kicks(dataset: xr.Dataset) -> xr.Dataset:
+    """The dataset of a grid, with the critical kicks over its other axes if there is one of kicks."""
+    if "p" not in dataset.dims:
+        return dataset
+    others, p = tuple(name for name in dataset["verdict"].dims if name != "p"), dataset["p"].values
+    rows = dataset["verdict"].transpose(*others, "p").values.reshape(-1, len(p))
+    crossing, over = first_crossings(p, rows), [dataset.sizes[name] for name in others]
+    found = {"p_crit": crossing.middle, "p_crit_low": crossing.low, "p_crit_high": crossing.high}
+    return dataset.assign(
+        {name: label(xr.DataArray(values.reshape(over), dims=others, name=name)) for name, values in found.items()}
+    )
+
+
+def _explain(dataset: xr.Dataset, withheld: str | None) -> None:
+    """Write what the numbers of verdicts and proofs mean into their attributes; and why some verdicts are withheld."""
+    meaning = dict(MEANING)
+    if withheld is not None:
+        dataset.attrs["withheld"] = withheld
+        meaning[Verdict.UNDECIDED] = f"{meaning[Verdict.UNDECIDED]}. {withheld}"
+    for name, sentences in {"verdict": meaning, "proof": RESTS_ON}.items():
+        dataset[name].attrs.update(
+            flag_values=np.array([int(one) for one in sentences], np.int8),
+            flag_meanings=" ".join(one.name.lower() for one in sentences),
+            meaning=json.dumps({int(one): sentence for one, sentence in sentences.items()}),
+        )
+
+
+def summarised(dataset: xr.Dataset, what: str) -> xr.Dataset:
+    """The dataset with how many of its trajectories have which verdict."""
+    every = dataset["verdict"].values
     counts = {verdict.name.lower(): int(np.sum(every == verdict)) for verdict in MEANING}
     found = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
-    summary = f"{' × '.join(map(str, shape))} trajectories over {', '.join(axes)}: {found}"
-    audited = {} if cells is None else audit_note(cells.audit)
-    dataset.attrs = {"summary": summary, **dataset.attrs, "counts": json.dumps(counts), **audited}
+    # What is read first comes first.
+    dataset.attrs = {"summary": f"{what}: {found}", **dataset.attrs, "counts": json.dumps(counts)}
     return dataset
 
 

@@ -219,9 +219,10 @@ def plan_of(
     each = bytes_per_trajectory(scene, per_group)
     count = trajectories.total if places is None else len(places)
     jobs = trajectories.jobs(places, largest_job_size(takes_long(scene, method, limits.energy), each, per_group, count))
-    counts, later = np.zeros(trajectories.group_count, np.int64), []
+    every = np.arange(trajectories.group_count) if places is None else np.unique(trajectories.groups(places))
+    counts, later = np.zeros(len(every), np.int64), []
     for number, own in enumerate(jobs):
-        groups, here = np.unique(trajectories.groups(own), return_counts=True)
+        groups, here = np.unique(np.searchsorted(every, trajectories.groups(own)), return_counts=True)
         if np.any(counts[groups]):
             later.append(number)
         counts[groups] += here

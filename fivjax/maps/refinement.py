@@ -1,8 +1,12 @@
-"""Adaptive maps: a coarse grid that is refined where neighbours differ, and checked at random elsewhere."""
+"""Adaptive maps: a coarse grid that is refined where neighbours differ, and checked at random elsewhere.
 
-import functools
+Memory and time grow with the length of the boundaries between verdicts, not with the grid: only points that are computed have
+results, and only cells near a boundary are looked at. A cell is named by its lowest corner.
+"""
+
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,6 +19,10 @@ from .results import Verdicts, not_run
 
 # A function that runs trajectories, given by their indices on the fine grid in rising order; it is told what they are for.
 Run = Callable[[Indices, str], Verdicts]
+# Points that are audited at most: enough to know a rate of one in ten thousand.
+MOST_AUDITED = 10**5
+# Points that are looked at together: what is made of them takes some hundred bytes each.
+AT_A_TIME = 2**20
 
 
 class Audit(NamedTuple):
@@ -24,13 +32,101 @@ class Audit(NamedTuple):
     wrong: int
 
 
-class Refined(NamedTuple):
-    """A grid of which some cells were computed: of a large one few, so that there is no result for each cell."""
+class Levels(NamedTuple):
+    """A grid whose intervals are halved again and again: points of finer levels that were not computed take the result of the
+    corner before them.
+    """
 
-    verdicts: Verdicts  # of the computed cells; behind these, a trajectory that was not run
-    places: Indices  # the computed cells
-    row: Int[np.ndarray, " cells"]  # the result that each cell takes
-    audit: Audit
+    shape: tuple[int, ...]  # of the finest grid
+    coarsest: int  # the step of the first level, in intervals of the finest grid
+    finest: int  # that of the last level by now
+
+    def rows(self, computed: Indices, places: Int[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
+        """Which of the `computed` points (in rising order) each of these points takes the result of; -1 for points of levels
+        that are not there yet.
+        """
+        rows, step = np.full(np.size(places), -1), self.finest
+        at = np.ravel(places)
+        left = np.flatnonzero(self.before(at, step) == at)
+        at = at[left]
+        while len(left):
+            there, found = placed(computed, at)
+            rows[left[there]] = found[there]
+            if step >= self.coarsest:
+                break
+            step *= 2
+            left, at = left[~there], self.before(at[~there], step)
+        return rows.reshape(np.shape(places))
+
+    def before(self, places: Indices, step: int) -> Indices:
+        """The corner before each point, or the point itself, on the grid of this step."""
+        if step == 1:
+            return places
+        index = np.unravel_index(places, self.shape)
+        return np.ravel_multi_index([one - one % step for one in index], self.shape)
+
+    def corners(self, cells: Indices) -> Int[np.ndarray, "corners cells"]:
+        """The corners of cells of the finest level."""
+        index = np.unravel_index(cells, self.shape)
+        ways = itertools.product(*((0, self.finest) if length > 1 else (0,) for length in self.shape))
+        moved = [[one + far for one, far in zip(index, way, strict=True)] for way in ways]
+        return np.stack([np.ravel_multi_index(at, self.shape) for at in moved])
+
+    def every(self, step: int) -> Indices:
+        """All points of the grid of this step."""
+        along = [np.arange(0, length, min(step, length)) for length in self.shape]
+        return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
+
+    def cells(self, step: int) -> Indices:
+        """All cells of the grid of this step. An axis of one value has no intervals."""
+        along = [np.arange(0, max(length - 1, 1), step if length > 1 else 1) for length in self.shape]
+        return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
+
+    def moved(self, places: Indices, step: int, by: Sequence[int], last: int = 0) -> Indices:
+        """All points that are so many steps, `by` each of these numbers along each axis, from any of the places: those on the
+        grid, but for its `last` intervals.
+        """
+        index, kept = np.unravel_index(places, self.shape), []
+        for way in itertools.product(*(by if length > 1 else (0,) for length in self.shape)):
+            at = [one + step * far for one, far in zip(index, way, strict=True)]
+            inside = [
+                (one >= 0) & (one <= (length - 1 - last if length > 1 else 0))
+                for one, length in zip(at, self.shape, strict=True)
+            ]
+            on_grid = np.logical_and.reduce(inside)
+            kept.append(np.ravel_multi_index([one[on_grid] for one in at], self.shape))
+        return np.unique(np.concatenate(kept))
+
+
+class Refined(NamedTuple):
+    """A grid of which some points were computed: of a large one few."""
+
+    places: Indices  # the computed points, in rising order
+    audited: Bool[np.ndarray, " computed"]  # which of them are of the audit
+    levels: Levels
+
+    def rows(self, places: Indices) -> Int[np.ndarray, " r"]:
+        """The row of the result that each of these points of the grid takes; -1 where it was not run. No other point takes that
+        of an audited one.
+        """
+        others = np.flatnonzero(~self.audited)
+        rows = self.levels.rows(self.places[others], places)
+        there, own = placed(self.places, places)
+        return np.where(there, own, np.where(rows < 0, -1, others[rows]))
+
+    def every_row(self) -> Int[np.ndarray, " grid"]:
+        """The same of all points."""
+        total = math.prod(self.levels.shape)
+        rows = np.empty(total, np.int32 if len(self.places) < 2**31 else np.int64)
+        for start in range(0, total, AT_A_TIME):
+            rows[start : start + AT_A_TIME] = self.rows(np.arange(start, min(start + AT_A_TIME, total)))
+        return rows
+
+
+def placed(computed: Indices, places: Indices) -> tuple[Bool[np.ndarray, " r"], Int[np.ndarray, " r"]]:
+    """Which of these points are among the `computed` ones (in rising order), and where there."""
+    found = np.minimum(np.searchsorted(computed, places), len(computed) - 1)
+    return computed[found] == places, found
 
 
 def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarray, " m"]:
@@ -41,115 +137,70 @@ def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarr
     return np.append(inside.ravel(), values[-1])
 
 
-def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> Refined:
-    """Compute some points of a grid of this shape.
+def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> tuple[Refined, Verdicts, Audit]:
+    """Compute some points of a grid of this shape: which, their results, and what an audit says of the others.
 
     The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
     cell, or next to one, with corners of different verdict or attractor. Other points take the result of the corner before
     them; a computed point takes its own. Of the points that were never computed, a share `audit` is computed in the end and
     compared. After an interrupt nothing more is computed, and the finer points are not run.
     """
-    # Arrays of a map of many millions of points take hundreds of megabytes each. No result is the last one.
-    row = np.full(math.prod(shape), -1, np.int32 if math.prod(shape) < 2**31 else np.int64)
-    places = _every(2**halvings, shape, row.dtype).ravel()
+    if max(shape) == 1:
+        halvings = 0
+    levels = Levels(shape, 2**halvings, 2**halvings)
+    places = levels.every(levels.coarsest)
     verdicts = run(places, "coarse grid")
-    row[places] = np.arange(len(places))
-
-    def compute(which: Indices, what: str) -> np.ndarray:
-        """Compute these points; the rows of their results."""
-        nonlocal places, verdicts
-        rows = np.arange(len(places), len(places) + len(which))
-        if which.size:
-            verdicts = jax.tree.map(lambda *parts: np.concatenate(parts), verdicts, run(which, what))
-            places = np.concatenate([places, which])
-        return rows
-
+    cells, nothing = levels.cells(levels.coarsest), not_run(0, bool(verdicts.energy))
     for level in range(1, halvings + 1):
         # An interrupt leaves trajectories that were not run.
-        if not np.any(verdicts.pending()):
-            wanted = _halve(shape, 2 ** (halvings - level), verdicts, row)
-            row[wanted] = compute(wanted, f"halving {level} of {halvings}")
-    chosen = _points_to_audit(np.sort(places), len(row), 0.0 if np.any(verdicts.pending()) else audit)
-    rows, assumed = compute(chosen, "audit"), row[chosen]
-    row[chosen] = rows
-    known = ~verdicts.pending(rows)
-    wrong = known & (verdicts.verdict[rows] != verdicts.verdict[assumed])
-    checked = Audit(int(known.sum()), int(wrong.sum()))
-    nothing = not_run(1, bool(verdicts.energy))
-    return Refined(jax.tree.map(lambda *parts: np.concatenate(parts), verdicts, nothing), places, row, checked)
+        if np.any(verdicts.pending()):
+            break
+        # A cell's own points differ, or those on the edge of a cell beside it that was computed: no other changes any more.
+        step, differing = 2 ** (halvings - level), cells[_differ(levels, verdicts, places, cells)]
+        ringed = levels.moved(differing, 2 * step, (-1, 0, 1), last=2 * step)
+        beside = levels.moved(ringed, 2 * step, (-1, 0, 1), last=2 * step)
+        cells = levels.moved(beside, step, (0, 1), last=step)
+        wanted = levels.moved(ringed, step, (0, 1, 2))
+        wanted = wanted[levels.before(wanted, 2 * step) != wanted]
+        levels = levels._replace(finest=step)
+        found = run(wanted, f"halving {level} of {halvings}") if len(wanted) else nothing
+        verdicts, places = _with_more(verdicts, places, wanted, found)
+    share = 0.0 if np.any(verdicts.pending()) else audit
+    chosen = _points_to_audit(places, math.prod(shape), share)
+    assumed = verdicts.verdict[levels.rows(places, chosen)]
+    found = run(chosen, "audit") if len(chosen) else nothing
+    known = ~found.pending()
+    checked = Audit(int(known.sum()), int(np.sum(known & (found.verdict != assumed))))
+    verdicts, places = _with_more(verdicts, places, chosen, found)
+    return Refined(places, np.isin(places, chosen), levels), verdicts, checked
 
 
-def _every(step: int, shape: tuple[int, ...], kind: np.dtype) -> Int[np.ndarray, "*grid"]:
-    """The indices of every so many-th point along each axis of a grid of this shape."""
-    along = (
-        math.prod(shape[axis + 1 :]) * np.arange(0, length, min(step, length), dtype=kind)
-        for axis, length in enumerate(shape)
-    )
-    return functools.reduce(np.add, np.ix_(*along))
-
-
-def _halve(shape: tuple[int, ...], step: int, verdicts: Verdicts, row: Int[np.ndarray, " cells"]) -> Indices:
-    """The points to be computed of a grid whose intervals are halved to this step; new points that need not be computed get
-    the `row` of the corner before them.
-    """
-    new, old = _every(step, shape, row.dtype), tuple(slice(None, None, 2) for _ in shape)
-    corners = new[old]
-    wanted = _near_differences(_differ(verdicts, row[corners]), new.shape)
-    rest = ~wanted
-    wanted[old] = rest[old] = False
-    before = corners[np.ix_(*(np.arange(length) // 2 for length in new.shape))]
-    row[new[rest]] = row[before[rest]]
-    return new[wanted]
+def _with_more(verdicts: Verdicts, places: Indices, new: Indices, found: Verdicts) -> tuple[Verdicts, Indices]:
+    """The results of some points, and of new ones, in rising order."""
+    every = np.concatenate([places, new])
+    order = np.argsort(every, kind="stable")
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[order], verdicts, found), every[order]
 
 
 def _points_to_audit(computed: Indices, total: int, share: float) -> Indices:
-    """A random share of the points that were not `computed`, without a list of them all."""
+    """A random share of the points that were not `computed`, without a list of them all: `MOST_AUDITED` at most."""
     left = total - len(computed)
-    count = min(left, math.ceil(share * left))
+    count = min(left, math.ceil(share * left), MOST_AUDITED)
     which = np.sort(np.random.default_rng(0).choice(left, count, replace=False))
     # So many points that were not computed come before each that was.
     return which + np.searchsorted(computed - np.arange(len(computed)), which, side="right")
 
 
-def _differ(verdicts: Verdicts, corners: Int[np.ndarray, "*grid"]) -> Bool[np.ndarray, "*cells"]:
-    """Which cells have corners that differ."""
-    verdict = verdicts.verdict[corners]
-    size = np.where(verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude[corners], np.nan)
-    low, high = _over_corners(np.fmin, size), _over_corners(np.fmax, size)
+def _differ(levels: Levels, verdicts: Verdicts, places: Indices, cells: Indices) -> Bool[np.ndarray, " cells"]:
+    """Which of these cells of the finest level have corners that differ, by the results of the computed `places`."""
     # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A
     # torus and the cycle that it locks to next door do not.
     jump = 1.1
-    return (_over_corners(np.minimum, verdict) != _over_corners(np.maximum, verdict)) | (high > jump * low)
-
-
-def _over_corners(combine, values: np.ndarray) -> np.ndarray:
-    """The values at the corners of each cell combined, along each axis that has more than one value."""
-    for axis, length in enumerate(values.shape):
-        if length > 1:
-            first, second = (np.take(values, np.arange(k, length - 1 + k), axis=axis) for k in (0, 1))
-            values = combine(first, second)
-    return values
-
-
-def _near_differences(differ: Bool[np.ndarray, "*cells"], shape: tuple[int, ...]) -> Bool[np.ndarray, "*grid"]:
-    """The points of the halved grid that lie in a cell with differing corners, or in a neighbouring cell."""
-    for axis, length in enumerate(shape):
-        if length == 1:
-            continue
-        # Neighbouring cells, too: a boundary between corners may leave the cell.
-        aside = np.zeros_like(np.take(differ, [0], axis=axis))
-        padded = np.concatenate([aside, aside, differ, aside, aside], axis=axis)
-        count = differ.shape[axis]
-        ringed = np.zeros_like(np.concatenate([differ, aside, aside], axis=axis))
-        for k in range(3):
-            ringed |= np.take(padded, np.arange(k, k + count + 2), axis=axis)
-        # Point 2i is the corner between cells i - 1 and i, point 2i + 1 the middle of cell i.
-        corner = np.take(ringed, np.arange(count + 1), axis=axis) | np.take(ringed, np.arange(1, count + 2), axis=axis)
-        middle = np.take(ringed, np.arange(1, count + 1), axis=axis)
-        halved = np.zeros((*differ.shape[:axis], length, *differ.shape[axis + 1 :]), bool)
-        cut = [slice(None)] * differ.ndim
-        for part, start in ((corner, 0), (middle, 1)):
-            cut[axis] = slice(start, None, 2)
-            halved[tuple(cut)] = part
-        differ = halved
-    return differ
+    size = np.where(verdicts.verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude, np.nan)
+    found = [np.zeros(0, bool)]
+    for start in range(0, len(cells), AT_A_TIME):
+        rows = levels.rows(places, levels.corners(cells[start : start + AT_A_TIME]))
+        verdict, of_cycle = verdicts.verdict[rows], size[rows]
+        unlike = np.min(verdict, axis=0) != np.max(verdict, axis=0)
+        found.append(unlike | (np.fmax.reduce(of_cycle) > jump * np.fmin.reduce(of_cycle)))
+    return np.concatenate(found)

@@ -21,12 +21,19 @@ from .store import Store, is_store
 
 
 def keeper_at(
-    path: str | Path | None, scene: Scene, method: AbstractStepper, grid: Grid, limits: dict, energy: bool = False
+    path: str | Path | None,
+    scene: Scene,
+    method: AbstractStepper,
+    grid: Grid,
+    limits: dict,
+    energy: bool = False,
+    sparse: bool = False,
 ) -> Checkpoint | Store | None:
     """The object that keeps the results of a map at this path; None without a path. `limits`: other arguments of the map that
-    affect its results.
+    affect its results. A `sparse` map has results for few of its points.
 
-    **Raises:** `TypeError` for an object that is no path; `ValueError` for a file or folder that belongs to another map.
+    **Raises:** `TypeError` for an object that is no path; `ValueError` for a file or folder that belongs to another map, and
+    for a folder if the map is sparse.
     """
     if path is None:
         return None
@@ -45,7 +52,11 @@ def keeper_at(
         "axes": {name: values.tolist() for name, values in grid.axes.items()},
     }
     if not is_store(path):
-        return Checkpoint(path, run, grid.total, energy)
+        return Checkpoint(path, run, None if sparse else grid.total, energy)
+    if sparse:
+        raise ValueError(
+            f"Argument `resume` must be a file for a sparse map, but is the folder `{path}`: give another name."
+        )
     per_group = grid.total / grid.group_count
     each = bytes_per_trajectory(scene, per_group)
     # The chunks are those of a short run: a store that is resumed with more points, or fewer, finds the same ones.

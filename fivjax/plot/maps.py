@@ -66,6 +66,11 @@ def bistability(
 
 
 def _check_axes(dataset: xr.Dataset, names: tuple[str, ...]) -> None:
+    if "place" in dataset:
+        raise ValueError(
+            "A map picture needs two axes, but this is a sparse map. Draw a part of its grid, or a coarse picture of all: "
+            "`fj.plot.bistability(fj.window(m))`."
+        )
     if len(names) < 2:
         raise ValueError(
             f"A map picture needs two axes, but this map has {len(names)}: {', '.join(names) or 'none'}. Give "

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import hypergeom
 
 import fivjax as fj
+from fivjax.maps.datasets import from_rows
 from fivjax.maps.refinement import finer_axis, refine_grid
 from fivjax.maps.results import not_run
 
@@ -29,10 +30,11 @@ def fill(truth, halvings, audit=0.01, interrupt=None):
         verdicts.amplitude[done] = truth.ravel()[places[done]]
         return verdicts
 
-    cells = refine_grid(truth.shape, halvings, audit, run)
+    refined, verdicts, checked = refine_grid(truth.shape, halvings, audit, run)
     computed = np.zeros(truth.size, bool)
-    computed[cells.places] = ~cells.verdicts.pending()[:-1]
-    return cells.verdicts.verdict[cells.row].reshape(truth.shape), computed.reshape(truth.shape), cells.audit, calls
+    computed[refined.places] = ~verdicts.pending()
+    found = from_rows("verdict", verdicts.verdict, refined.every_row())
+    return found.reshape(truth.shape), computed.reshape(truth.shape), checked, calls
 
 
 @pytest.mark.parametrize("count", [(17, 9), (9, 33)])
@@ -81,8 +83,8 @@ def test_after_an_interrupt_the_finer_places_are_not_run():
 
 def test_an_axis_of_one_value_is_never_too_fine():
     np.testing.assert_array_equal(finer_axis(np.array([0.2]), 100), [0.2])
-    cells = refine_grid((1, 1), 100, 0.0, lambda places, what: not_run(len(places), False))
-    assert cells.places.tolist() == [0]
+    refined, *_ = refine_grid((1, 1), 100, 0.0, lambda places, what: not_run(len(places), False))
+    assert refined.places.tolist() == [0]
 
 
 def test_a_refined_map_equals_the_full_one(tmp_path):
