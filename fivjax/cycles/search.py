@@ -254,6 +254,8 @@ def _state_of(scene: Scene, start, name: str = "start") -> np.ndarray:
             f"Argument `{name}` must hold {scene.structure.size} displacements and as many velocities, but has shape "
             f"{state.shape}."
         )
+    if not np.all(np.isfinite(state)):
+        raise ValueError(f"Argument `{name}` must be finite, but holds {state[~np.isfinite(state)][0]}.")
     return state
 
 
@@ -280,7 +282,13 @@ def _guess(maps: ReturnMaps, scene: Scene, start) -> tuple[Point, list[int]]:
     y = np.asarray(_state_of(scene, start) - np.asarray(sliding_state(scene, scene.load.final)))
     at = maps.in_contact(only, y[None])
     if status is not None:
-        known = np.array([int(Status(int(one))) for one in np.atleast_1d(status)], np.int32)
+        known = np.atleast_1d(arguments.numeric_array("start", status))
+        if known.size != at.status.size or not np.all(np.isin(known, list(Status))):
+            raise ValueError(
+                "Argument `start` must have a status for each contact, 0 (stick), 1 (slide) or 2 (detach), but has "
+                f"{known.tolist()} for {at.status.size}."
+            )
+        known = known.astype(np.int32)
         if direction is None:
             slip = scene.belt_speed - y[scene.structure.size + maps.tangential]
             direction = np.where((known == Status.SLIDE) & (slip != 0), np.sign(slip), 1.0)

@@ -65,7 +65,8 @@ def numeric_array(name: str, value) -> np.ndarray:
     except (ValueError, TypeError):
         raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}.") from None
     if array.dtype.kind not in "iuf":
-        raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}.")
+        holds = f" that holds {describe(array.flat[0].item())}" if array.ndim and array.size else ""
+        raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}{holds}.")
     return array
 
 

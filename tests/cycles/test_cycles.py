@@ -235,7 +235,13 @@ def test_below_the_fold_there_is_none(belt_speed):
 
 @pytest.mark.parametrize(
     ("start", "fragment"),
-    [(np.zeros(5), "shape"), ("here", "must")],
+    [
+        (np.zeros(5), "shape"),
+        ("here", "must"),
+        ((np.full(6, np.nan), 1), "`start` must be finite, but holds nan"),
+        ((np.zeros(6), 7), r"a status for each contact, 0 \(stick\), 1 \(slide\) or 2 \(detach\), but has \[7\] for 1"),
+        ((np.zeros(6), [1, 1]), r"a status for each contact.* but has \[1, 1\] for 1"),
+    ],
 )
 def test_starts_of_the_wrong_kind_are_refused(start, fragment):
     with pytest.raises((TypeError, ValueError), match=fragment):
