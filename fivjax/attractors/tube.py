@@ -96,7 +96,9 @@ def tree_of(states: Float[np.ndarray, "k 2n"]):
     """A tree of states, in which nearest ones are found fast."""
     from scipy.spatial import KDTree
 
-    return KDTree(states)
+    # Balanced, it would be split next to zero where half of the states are in contact: by the least number above it, which is
+    # zero to a process whose processor a library has told so, and the stack fills.
+    return KDTree(states, balanced_tree=False)
 
 
 def _in_contact(

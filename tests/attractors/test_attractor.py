@@ -1,5 +1,8 @@
 """Attractors of a map: what motions trace, what is computed and checked of it, and which trajectories it captures."""
 
+import platform
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -151,6 +154,33 @@ def circle(radius=0.5, count=STATES):
     angle = 2 * np.pi * GOLDEN * np.arange(count)
     zero = np.zeros(count)
     return np.stack([2 + radius * np.cos(angle), zero, radius * np.sin(angle), zero], axis=-1)
+
+
+# Has the processor take what is below the least normal number for zero, as libraries built for speed do when they are loaded.
+FLUSHED = """
+import ctypes, mmap
+code = bytes.fromhex("4883EC08 0FAE1C24 810C2440800000 0FAE1424 4883C408 C3")
+page = mmap.mmap(-1, len(code), prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+page.write(code)
+ctypes.CFUNCTYPE(None)(ctypes.addressof(ctypes.c_char.from_buffer(page)))()
+import numpy as np
+from fivjax.attractors.tube import tree_of
+assert np.float64(1e-308) / 10 == 0
+states = np.random.default_rng(0).normal(size=(512, 4))
+states[:300, 3] = 0.0
+states[300:, 3] = 1e3
+print(tree_of(states).query(states + 1e-9)[0].max())
+"""
+
+
+@pytest.mark.skipif(
+    platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux", reason="instructions of x86-64"
+)
+def test_states_in_contact_are_told_apart_where_tiny_numbers_are_zero():
+    """SciPy's balanced trees split half of them off for ever, until the stack is full."""
+    ran = subprocess.run([sys.executable, "-c", FLUSHED], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert float(ran.stdout) == pytest.approx(2e-9, rel=1e-3)
 
 
 def test_the_tube_is_entered_from_all_sides_on_its_edge():
