@@ -142,13 +142,16 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     for tens of thousands.
     """
     maps, group = catalogue.maps, motions.group
-    followed = long_divergence(maps, motions, arrived=catalogue.has_captured)
+    followed = long_divergence(maps, motions, arrived=lambda motions: _arrived(catalogue, motions, slides))
     now, chaotic = followed.at, followed.chaotic
     run = _Underway(Motions(group, now), followed.time, followed.changes)
     attractor: dict[int, CapturingSet] = {}
-    finite = np.all(np.isfinite(now.y), axis=1)
-    without_events = finite & ~maps.moves(group, now.y)
-    left = ~chaotic & finite & ~without_events
+    left = ~chaotic & np.all(np.isfinite(now.y), axis=1)
+    without_events = left & ~maps.moves(group, now.y)
+    rows = np.flatnonzero(left & ~without_events)
+    if slides is not None and len(rows):
+        without_events[rows] = slides(run.motions.rows(rows))
+    left &= ~without_events
     asks, further = left.copy(), np.zeros(len(group), bool)
     for turn in range(TIMES + 1):
         new = catalogue.captures(run.motions, left)
@@ -174,6 +177,13 @@ def _long_fates(catalogue: Catalogue, motions: Motions, onward: Bool[np.ndarray,
     return Fates(chaotic, attractor, without_events, now, run.time, run.changes)
 
 
+def _arrived(catalogue: Catalogue, motions: Motions, slides: Slides | None) -> Bool[np.ndarray, " m"]:
+    """Which of these motions an attractor has captured, or are certain to slide for ever."""
+    done = np.zeros(len(motions.group), bool) if slides is None else slides(motions)
+    done[list(catalogue.captures(motions, ~done))] = True
+    return done
+
+
 def _creep(
     catalogue: Catalogue, run: _Underway, asked: Bool[np.ndarray, " m"], slides: Slides | None
 ) -> Bool[np.ndarray, " m"]:
@@ -183,10 +193,7 @@ def _creep(
     asked_rows = np.flatnonzero(asked)
 
     def arrived(rows, at: Section) -> Bool[np.ndarray, " r"]:
-        motions = Motions(run.motions.group[asked_rows[rows]], at)
-        done = np.zeros(len(rows), bool) if slides is None else slides(motions)
-        done[list(catalogue.captures(motions, ~done))] = True
-        return done
+        return _arrived(catalogue, Motions(run.motions.group[asked_rows[rows]], at), slides)
 
     creeping = np.zeros(len(asked), bool)
     if len(asked_rows):
