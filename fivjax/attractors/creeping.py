@@ -5,8 +5,9 @@ that is left changes by a millionth in each return. What the motion does is then
 a small share of its size, is left to settle on the line again, and its drift is measured there.
 
 **Why no cycle is leapt over.** With the drift $g(x)$ as a function of the place on the line, a cycle is a zero of $g$. At a
-distance $a$ from the nearest one $|g'/g|$ is about $1/a$, or $2/a$ from the pair that is born in a fold. A leap is no longer
-than `TRUSTED` times $|g/g'|$, by the drifts at the two latest places, so it covers a part of that distance; and it counts only
+distance $a$ from the nearest one $|g'/g|$ is about $1/a$, or $2/a$ from the pair that is born in a fold. No leap, the first
+one included, is longer than `TRUSTED` times $|g/g'|$, by the drifts at the two latest places (of the first, at both ends of the
+drift itself), so it covers a part of that distance; and it counts only
 if the drift at its end has the same direction, nearly the same speed, and the same contact events.
 
 **Growth and decay about the equilibrium.** A motion without events that does nothing but grow, or decay, leaps in proportion to
@@ -45,6 +46,7 @@ class _Drift(NamedTuple):
     passed: Float[np.ndarray, " m"]  # the time of these and of as many returns before, s
     changes: Int[np.ndarray, " m"]  # and how often a contact's status changed on them
     steady: Bool[np.ndarray, " m"]  # whether the drift was the same before
+    change: Float[np.ndarray, " m"]  # of its logarithm since then, or of that of the growth below
     growth: Float[np.ndarray, " m"]  # the logarithm of that of the motions' size
     grows: Bool[np.ndarray, " m"]  # which are without events and do nothing but grow, or decay
 
@@ -90,8 +92,9 @@ def creep(
             break
         grows = here.grows
         longest = np.where(grows, np.where(here.growth > 0, LONGEST_GROWTH, LONGEST_DECAY), longest_leap)
-        # The first leap is a short one, but worthwhile.
+        # The first leap is a short one, but worthwhile, and trusted by how the drift has changed on its own way.
         first = np.clip(1.5 * least_drifts * length / size, 0.004, longest_leap)
+        first = np.minimum(first, _trusted(length / size, here.change, grows))
         share[rows] = np.where(np.isnan(share[rows]), first, np.minimum(share[rows], longest))
         times = share[rows] * size / length
         plain = times < least_drifts
@@ -142,13 +145,20 @@ def _measure_drift(maps: ReturnMaps, motions: Motions) -> _Drift:
     steady = _alike(before, way) & (middle.events == end.events)
     passed, changes = middle.time + end.time, middle.changes + end.changes
     growth, straight = _growth(maps.weights * end.at.y, way)
-    return _Drift(end.at, way, end.time, end.events, passed, changes, steady, growth, straight & (end.events == 0))
+    grows = straight & (end.events == 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        earlier, _ = _growth(maps.weights * middle.at.y, before)
+        faster = np.where(grows, growth / earlier, np.linalg.norm(way, axis=1) / np.linalg.norm(before, axis=1))
+        # What is no number is not to be trusted at all.
+        change = np.nan_to_num(np.abs(np.log(faster)), nan=np.inf)
+    return _Drift(end.at, way, end.time, end.events, passed, changes, steady, change, growth, grows)
 
 
 def _trusted(share: Float[np.ndarray, " m"], change: Float[np.ndarray, " m"], grows: Bool[np.ndarray, " m"]):
     """How long the next leaps may be, if the logarithm of the drift, or of the growth, changed so much over the latest ones."""
-    by_distance = TRUSTED * share / change
-    by_power = np.log1p(-TRUSTED * np.expm1(-POWER * share) / change) / POWER
+    with np.errstate(divide="ignore"):
+        by_distance = TRUSTED * share / change
+        by_power = np.log1p(-TRUSTED * np.expm1(-POWER * share) / change) / POWER
     return np.where(grows, np.minimum(by_distance, by_power), by_distance)
 
 

@@ -60,6 +60,18 @@ def test_pairs_of_cycles_are_not_leapt_over():
     assert np.all(at - apart - x < 0.5 * (at - starts))
 
 
+def test_a_pair_next_to_where_a_motion_begins_to_creep_is_not_leapt_over():
+    """Beyond the pair, as far from its middle, the drift is the same again."""
+    distances, parts = np.meshgrid(np.geomspace(2e-4, 5e-3, 15), [0.2, 0.5, 0.8])
+    distance, apart = distances.ravel(), (distances * parts).ravel()
+
+    def drift(x, k):
+        return 0.2 * ((x - 1.0) ** 2 - apart[k] ** 2)
+
+    _, x, _ = on_line(drift, 1.0 - distance, lambda x: np.zeros(len(x), bool), coupling=0.0)
+    assert np.all(x < 1.0)
+
+
 def test_what_the_fold_has_left_behind_is_passed():
     """Just past the fold the motion is slow, and goes on."""
     creeps, x, _ = on_line(lambda x, k: 1e-5 * ((x - 1.0) ** 2 + 0.05**2), np.array([0.5, 0.8]), lambda x: x > 1.5)

@@ -218,6 +218,18 @@ def test_what_comes_from_a_torus_nearby_to_a_known_cycle_is_not_asked_for_a_toru
     assert not asked
 
 
+def test_a_stable_cycle_next_to_its_fold_is_not_leapt_over():
+    """Its saddle is a thousandth of its size away, and beyond that everything comes to slide. By another integrator the amplitude
+    at 1 + 1e-5 times the fold's friction is 0.8145719154 m/s, after 500 s.
+    """
+    parts = dict(m1=0.5819, m2=0.05487, c1=2.4129, c2=1.06628, k1=99608.33811, k2=98503.67916, theta=0.0155)
+    scene = fj.Scene(fj.belt_oscillator(**parts), fj.Coulomb(0.06), 0.8, fj.Pulse(100.0, p=2.2))
+    fold = 0.057433905559
+    m = fj.bistability_map(scene, mu=fold * (1 + np.array([-1e-5, 1e-6, 1e-5])), p=[2.2], progress=False)
+    assert m["verdict"].values.ravel().tolist() == [0, 1, 1]
+    assert m["amplitude"].values[2, 0] == pytest.approx(0.8145719154, rel=1e-6)
+
+
 def test_what_passes_by_where_a_cycle_was_slides_once_it_has_faded():
     """Just past the fold of the paper's cycles at 1 m/s, which a branch has at μ = 0.1679666157: motions go about its ghost for
     thousands of returns, and have faded to nothing thousands of returns later.
