@@ -10,17 +10,18 @@ import xarray as xr
 from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
+from ..foundation.stopping import stop_requests
 from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.event_exact import EventExact
 from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import audit_note, map_dataset
-from .engine import RunOptions, run_to_verdict
+from .engine import RunOptions, interrupted, run_to_verdict
 from .executors import with_workers
 from .groups import Limits
 from .plan import Grid
 from .refinement import finer_axis, refine_grid
-from .results import Verdicts
+from .results import Verdicts, not_run
 from .resuming import keeper_at
 from .sparse import levels_note
 
@@ -141,9 +142,13 @@ def bistability_map(
         found: dict = {}  # attractors, which finer levels need not find again
 
         def level(places: np.ndarray, what: str) -> Verdicts:
+            if requested:
+                # Since the last trajectory of the level before had ended.
+                return interrupted(not_run(len(places), limits.energy))
             return run_to_verdict(scene, grid, method, limits, options._replace(label=f"map, {what}"), places, found)
 
-        refined, verdicts, checked = refine_grid(grid.shape, refine, audit, level)
+        with stop_requests() as requested:
+            refined, verdicts, checked = refine_grid(grid.shape, refine, audit, level)
         found.clear()  # of a large map they take as much memory as its results
     linear = _known_by_now(limit, verdicts)
     dataset = map_dataset(scene, method, t_max, grid, verdicts, linear, refined, sparse)

@@ -93,15 +93,20 @@ def run_to_verdict(
             for part in plan.parts:
                 run.follow(part)
         except KeyboardInterrupt:
-            left = int(verdicts.pending().sum())
-            warnings.warn(
-                f"Interrupted: of {count_of(total, 'trajectory')}, {left} without a verdict, "
-                f"labelled {Verdict.NOT_RUN.value}.",
-                stacklevel=2,
-            )
+            interrupted(verdicts)
         finally:
             if keeper is not None:
                 keeper.flush()
+    return verdicts
+
+
+def interrupted(verdicts: Verdicts) -> Verdicts:
+    """What is known by now of trajectories, after a warning that says of how many nothing is."""
+    total, left = len(verdicts.verdict), int(verdicts.pending().sum())
+    warnings.warn(
+        f"Interrupted: of {count_of(total, 'trajectory')}, {left} without a verdict, labelled {Verdict.NOT_RUN.value}.",
+        stacklevel=3,
+    )
     return verdicts
 
 
@@ -186,7 +191,7 @@ class _Run(NamedTuple):
             if self.requested or failed:
                 raise KeyboardInterrupt
 
-        def interrupted(number: int, results: Verdicts) -> None:
+        def stopped(number: int, results: Verdicts) -> None:
             # Results of an interrupted job are returned but not kept with the others, which are of whole jobs.
             if not over:
                 self.write(number, results)
@@ -197,7 +202,7 @@ class _Run(NamedTuple):
                 mine = Workers(threads)
 
                 def here(number: int):
-                    then = functools.partial(interrupted, number)
+                    then = functools.partial(stopped, number)
                     return mine.submit(contextvars.copy_context().run, run_job, self.job(number), blocks, report, then)
 
                 try:

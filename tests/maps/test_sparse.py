@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -178,6 +179,26 @@ def test_an_interrupted_sparse_map_goes_on_from_its_file(scene, tmp_path, monkey
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.part"]
     with pytest.raises(ValueError, match="is of another run: its `sparse` is true"):
         fj.bistability_map(scene, **options | {"sparse": False}, resume=path)
+
+
+def test_a_signal_while_a_level_is_written_ends_the_map(scene, tmp_path, monkeypatch):
+    """All of the coarse grid is run by then; the halvings are not."""
+    real, written = Checkpoint.flush, []
+
+    def flush(self):
+        if not written:
+            signal.raise_signal(signal.SIGINT)
+        written.append(1)
+        return real(self)
+
+    monkeypatch.setattr(Checkpoint, "flush", flush)
+    options = {"mu": MU, "p": P, "refine": 2, "sparse": True, "progress": False, "resume": tmp_path / "map.part"}
+    with pytest.warns(UserWarning, match="Interrupted: of .* trajectories, .* without a verdict"):
+        part = fj.bistability_map(scene, **options)
+    coarse = np.isin(part["mu"], MU) & np.isin(part["p"], P)
+    np.testing.assert_array_equal(part["verdict"] != fj.Verdict.NOT_RUN, coarse)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert not np.any(fj.bistability_map(scene, **options)["verdict"] == fj.Verdict.NOT_RUN)
 
 
 def test_damaged_results_of_a_sparse_map_count_as_not_run(tmp_path):
