@@ -40,7 +40,7 @@ QUANTITIES = {
     "proof": ("what the verdict rests on", "1"),
     "bound": ("bound on the share of the margins of sliding that can be used up", "1"),
     "place": ("index of the trajectory on the whole grid", "1"),
-    "audited": ("whether it was computed for the audit", "1"),
+    "step": ("step of the level for which it was computed, in intervals of the whole grid; 0 for the audit", "1"),
     "computed": ("whether it was computed", "1"),
     "decided_at": ("time at which the verdict was proved", "s"),
     "contact_events": ("number of status changes up to the verdict", "1"),

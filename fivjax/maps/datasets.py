@@ -77,7 +77,7 @@ def map_dataset(
         results["computed"][refined.places] = ~verdicts.pending()
     dims, coords = tuple(grid.axes), grid.axes
     if refined is not None and sparse:
-        results |= {"place": refined.places, "audited": refined.audited}
+        results |= {"place": refined.places, "step": refined.steps}
         dims, coords = (POINT,), {name: (POINT, column) for name, column in grid.columns(refined.places).items()}
     shape = (-1,) if sparse else grid.shape
     dataset = xr.Dataset({name: (dims, values.reshape(shape)) for name, values in results.items()}, coords)

@@ -33,30 +33,11 @@ class Audit(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """A grid whose intervals are halved again and again: points of finer levels that were not computed take the result of the
-    corner before them.
-    """
+    """A grid whose intervals are halved again and again."""
 
     shape: tuple[int, ...]  # of the finest grid
     coarsest: int  # the step of the first level, in intervals of the finest grid
     finest: int  # that of the last level by now
-
-    def rows(self, computed: Indices, places: Int[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
-        """Which of the `computed` points (in rising order) each of these points takes the result of; -1 for points of levels
-        that are not there yet.
-        """
-        rows, step = np.full(np.size(places), -1), self.finest
-        at = np.ravel(places)
-        left = np.flatnonzero(self.before(at, step) == at)
-        at = at[left]
-        while len(left):
-            there, found = placed(computed, at)
-            rows[left[there]] = found[there]
-            if step >= self.coarsest:
-                break
-            step *= 2
-            left, at = left[~there], self.before(at[~there], step)
-        return rows.reshape(np.shape(places))
 
     def before(self, places: Indices, step: int) -> Indices:
         """The corner before each point, or the point itself, on the grid of this step."""
@@ -102,17 +83,28 @@ class Refined(NamedTuple):
     """A grid of which some points were computed: of a large one few."""
 
     places: Indices  # the computed points, in rising order
-    audited: Bool[np.ndarray, " computed"]  # which of them are of the audit
+    steps: Int[np.ndarray, " computed"]  # the step of the level for which each was computed; 0 for the audit
     levels: Levels
 
-    def rows(self, places: Indices) -> Int[np.ndarray, " r"]:
-        """The row of the result that each of these points of the grid takes; -1 where it was not run. No other point takes that
-        of an audited one.
+    def rows(self, places: Int[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
+        """The row of the result that each of these points of the grid takes: its own, if it was computed, or that of the corner
+        before it which was when its level was filled; -1 for levels that are not there yet.
         """
-        others = np.flatnonzero(~self.audited)
-        rows = self.levels.rows(self.places[others], places)
-        there, own = placed(self.places, places)
-        return np.where(there, own, np.where(rows < 0, -1, others[rows]))
+        levels, rows, at = self.levels, np.full(np.size(places), -1), np.ravel(places)
+        there, found = placed(self.places, at)
+        rows[there] = found[there]
+        left = np.flatnonzero(~there & (levels.before(at, levels.finest) == at))
+        # The step of the level to which each belongs, once it is known.
+        at, own, step = at[left], np.zeros(len(left), int), levels.finest
+        while len(left) and step < levels.coarsest:
+            corner = levels.before(at, 2 * step)
+            own[(own == 0) & (corner != at)] = step
+            step *= 2
+            there, found = placed(self.places, corner)
+            there &= self.steps[found] > own
+            rows[left[there]] = found[there]
+            left, at, own = left[~there], corner[~there], own[~there]
+        return rows.reshape(np.shape(places))
 
     def every_row(self) -> Int[np.ndarray, " grid"]:
         """The same of all points."""
@@ -140,46 +132,50 @@ def finer_axis(values: Float[np.ndarray, " n"], halvings: int) -> Float[np.ndarr
 def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -> tuple[Refined, Verdicts, Audit]:
     """Compute some points of a grid of this shape: which, their results, and what an audit says of the others.
 
-    The coarse grid is every `2**halvings`-th value of each axis. In each halving, those new points are computed that lie in a
-    cell, or next to one, with corners of different verdict or attractor. Other points take the result of the corner before
-    them; a computed point takes its own. Of the points that were never computed, a share `audit` is computed in the end and
-    compared. After an interrupt nothing more is computed, and the finer points are not run.
+    The coarse grid is every `2**halvings`-th value of each axis. In each halving, all points are computed that lie in a cell,
+    or next to one, with corners of different verdict or attractor. Other new points take the result of the corner before them.
+    Of the points that were never computed, a share `audit` is computed in the end and compared. After an interrupt nothing more
+    is computed, and the finer points are not run.
     """
     if max(shape) == 1:
         halvings = 0
     levels = Levels(shape, 2**halvings, 2**halvings)
     places = levels.every(levels.coarsest)
+    refined = Refined(places, np.full(len(places), levels.coarsest), levels)
     verdicts = run(places, "coarse grid")
     cells, nothing = levels.cells(levels.coarsest), not_run(0, bool(verdicts.energy))
     for level in range(1, halvings + 1):
         # An interrupt leaves trajectories that were not run.
         if np.any(verdicts.pending()):
             break
-        # A cell's own points differ, or those on the edge of a cell beside it that was computed: no other changes any more.
-        step, differing = 2 ** (halvings - level), cells[_differ(levels, verdicts, places, cells)]
+        step, differing = 2 ** (halvings - level), cells[_differ(refined, verdicts, cells)]
         ringed = levels.moved(differing, 2 * step, (-1, 0, 1), last=2 * step)
+        # Corners of the next cells differ only in these, or on their edges.
         beside = levels.moved(ringed, 2 * step, (-1, 0, 1), last=2 * step)
         cells = levels.moved(beside, step, (0, 1), last=step)
         wanted = levels.moved(ringed, step, (0, 1, 2))
-        wanted = wanted[levels.before(wanted, 2 * step) != wanted]
-        levels = levels._replace(finest=step)
+        wanted = wanted[~placed(refined.places, wanted)[0]]
         found = run(wanted, f"halving {level} of {halvings}") if len(wanted) else nothing
-        verdicts, places = _with_more(verdicts, places, wanted, found)
+        refined = refined._replace(levels=levels._replace(finest=step))
+        refined, verdicts = _with_more(refined, verdicts, wanted, step, found)
     share = 0.0 if np.any(verdicts.pending()) else audit
-    chosen = _points_to_audit(places, math.prod(shape), share)
-    assumed = verdicts.verdict[levels.rows(places, chosen)]
+    chosen = _points_to_audit(refined.places, math.prod(shape), share)
+    assumed = verdicts.verdict[refined.rows(chosen)]
     found = run(chosen, "audit") if len(chosen) else nothing
     known = ~found.pending()
     checked = Audit(int(known.sum()), int(np.sum(known & (found.verdict != assumed))))
-    verdicts, places = _with_more(verdicts, places, chosen, found)
-    return Refined(places, np.isin(places, chosen), levels), verdicts, checked
+    return *_with_more(refined, verdicts, chosen, 0, found), checked
 
 
-def _with_more(verdicts: Verdicts, places: Indices, new: Indices, found: Verdicts) -> tuple[Verdicts, Indices]:
-    """The results of some points, and of new ones, in rising order."""
-    every = np.concatenate([places, new])
-    order = np.argsort(every, kind="stable")
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[order], verdicts, found), every[order]
+def _with_more(
+    refined: Refined, verdicts: Verdicts, new: Indices, step: int, found: Verdicts
+) -> tuple[Refined, Verdicts]:
+    """The grid and the results of its points, with new ones that were computed for the level of this step."""
+    places = np.concatenate([refined.places, new])
+    order = np.argsort(places, kind="stable")
+    steps = np.concatenate([refined.steps, np.full(len(new), step)])[order]
+    verdicts = jax.tree.map(lambda *parts: np.concatenate(parts)[order], verdicts, found)
+    return Refined(places[order], steps, refined.levels), verdicts
 
 
 def _points_to_audit(computed: Indices, total: int, share: float) -> Indices:
@@ -191,15 +187,15 @@ def _points_to_audit(computed: Indices, total: int, share: float) -> Indices:
     return which + np.searchsorted(computed - np.arange(len(computed)), which, side="right")
 
 
-def _differ(levels: Levels, verdicts: Verdicts, places: Indices, cells: Indices) -> Bool[np.ndarray, " cells"]:
-    """Which of these cells of the finest level have corners that differ, by the results of the computed `places`."""
+def _differ(refined: Refined, verdicts: Verdicts, cells: Indices) -> Bool[np.ndarray, " cells"]:
+    """Which of these cells of the finest level have corners that differ."""
     # If the amplitudes of neighbours on limit cycles differ by more than this factor, they count as different attractors. A
     # torus and the cycle that it locks to next door do not.
     jump = 1.1
     size = np.where(verdicts.verdict == Verdict.LIMIT_CYCLE, verdicts.amplitude, np.nan)
     found = [np.zeros(0, bool)]
     for start in range(0, len(cells), AT_A_TIME):
-        rows = levels.rows(places, levels.corners(cells[start : start + AT_A_TIME]))
+        rows = refined.rows(refined.levels.corners(cells[start : start + AT_A_TIME]))
         verdict, of_cycle = verdicts.verdict[rows], size[rows]
         unlike = np.min(verdict, axis=0) != np.max(verdict, axis=0)
         found.append(unlike | (np.fmax.reduce(of_cycle) > jump * np.fmin.reduce(of_cycle)))

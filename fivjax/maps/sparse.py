@@ -13,10 +13,44 @@ from .refinement import Levels, Refined, finer_axis
 
 
 def levels_note(grid: Grid, refined: Refined) -> dict[str, str | int]:
-    """The grid of a sparse map as attributes of its dataset: the axes before they were halved, and the levels."""
+    """The grid of a sparse map as attributes of its dataset: the axes before they were halved, the levels, and how many points
+    were computed.
+    """
     levels = refined.levels
     coarse = {name: values[:: levels.coarsest].tolist() for name, values in grid.axes.items()}
-    return {"axes": json.dumps(coarse), "coarsest": levels.coarsest, "finest": levels.finest}
+    return {
+        "axes": json.dumps(coarse),
+        "coarsest": levels.coarsest,
+        "finest": levels.finest,
+        "computed": len(refined.places),
+    }
+
+
+def _grid_of(points: xr.Dataset) -> tuple[dict[str, np.ndarray], Refined, xr.Dataset]:
+    """The axes of a sparse map, its grid, and the dataset with its points in their order on it.
+
+    **Raises:** `TypeError` or `ValueError` for what is none, or has lost some of its points.
+    """
+    arguments.instance("points", points, xr.Dataset, "the dataset of a sparse map")
+    if POINT not in points.dims or not {"axes", "coarsest", "finest", "computed"} <= set(points.attrs):
+        raise ValueError(
+            "Argument `points` must be a sparse map, but has the dimensions "
+            f"{', '.join(map(str, points.dims))}. Make one by `fj.bistability_map(..., refine=…, sparse=True)`."
+        )
+    places, computed = points["place"].values, int(points.attrs["computed"])
+    if places.dtype.kind != "i" or len(np.unique(places)) != computed or len(places) != computed:
+        raise ValueError(
+            f"Argument `points` must have all {computed:,} points that were computed, each once, but has others: "
+            f"{len(places):,}. Take the window first, and select from that."
+        )
+    points = points.isel({POINT: np.argsort(places)})
+    coarsest = int(points.attrs["coarsest"])
+    axes = {
+        name: finer_axis(np.array(values), coarsest.bit_length() - 1)
+        for name, values in json.loads(points.attrs["axes"]).items()
+    }
+    levels = Levels(tuple(map(len, axes.values())), coarsest, int(points.attrs["finest"]))
+    return axes, Refined(points["place"].values, points["step"].values, levels), points
 
 
 def window(points: xr.Dataset, *, most: int = 1000, **bounds: tuple[float, float]) -> xr.Dataset:
@@ -45,46 +79,28 @@ def window(points: xr.Dataset, *, most: int = 1000, **bounds: tuple[float, float
         >>> part["verdict"].shape  # doctest: +SLOW
         (9, 9)
     """
-    arguments.instance("points", points, xr.Dataset, "the dataset of a sparse map")
-    if POINT not in points.dims or "coarsest" not in points.attrs:
-        raise ValueError(
-            "Argument `points` must be a sparse map, but has the dimensions "
-            f"{', '.join(map(str, points.dims))}. Make one by `fj.bistability_map(..., refine=…, sparse=True)`."
-        )
     arguments.whole_number("most", most, minimum=1)
-    coarsest = int(points.attrs["coarsest"])
-    coarse = {name: np.array(values) for name, values in json.loads(points.attrs["axes"]).items()}
-    axes = {name: finer_axis(values, coarsest.bit_length() - 1) for name, values in coarse.items()}
+    axes, refined, points = _grid_of(points)
     unknown = [name for name in bounds if name not in axes]
     if unknown:
         hint = arguments.did_you_mean(unknown[0], axes)
         raise ValueError(f"Unknown axis `{unknown[0]}`; this map has: {', '.join(axes)}.{hint}")
-    shape = tuple(map(len, axes.values()))
-    for name, pair in bounds.items():
-        if arguments.numeric_array(name, pair).shape != (2,):
-            raise ValueError(
-                f"Argument `{name}` must be a least and a greatest value, but is {arguments.describe(pair)}."
-            )
     along = [_within(name, values, bounds.get(name), most) for name, values in axes.items()]
-    refined = Refined(
-        points["place"].values, points["audited"].values, Levels(shape, coarsest, int(points.attrs["finest"]))
-    )
+    shape, part = refined.levels.shape, [len(index) for index in along]
     places = np.ravel_multi_index(np.ix_(*along), shape).ravel()
-    rows, part = refined.rows(places), [len(index) for index in along]
+    rows = refined.rows(places)
     results = {
         name: (tuple(axes), from_rows(str(name), variable.values, rows).reshape(part), variable.attrs)
         for name, variable in points.data_vars.items()
-        if variable.dims == (POINT,) and name not in ("place", "audited")
+        if variable.dims == (POINT,) and name not in ("place", "step")
     }
-    of_attractors = {name: variable for name, variable in points.data_vars.items() if variable.dims == ("attractors",)}
+    results |= {name: variable for name, variable in points.data_vars.items() if variable.dims == ("attractors",)}
     coords = {
         name: (name, values[index], points[name].attrs)
         for (name, values), index in zip(axes.items(), along, strict=True)
     }
-    attrs = {
-        name: value for name, value in points.attrs.items() if name not in ("summary", "axes", "coarsest", "finest")
-    }
-    dataset = xr.Dataset(results | of_attractors, coords, attrs)
+    of_grid = ("summary", "axes", "coarsest", "finest", "computed")
+    dataset = xr.Dataset(results, coords, {name: value for name, value in points.attrs.items() if name not in of_grid})
     computed = np.isin(places, refined.places).reshape(part) & (dataset["verdict"].values != Verdict.NOT_RUN)
     dataset["computed"] = (tuple(axes), computed, {"long_name": "whether it was computed", "units": "1"})
     listed = f"{' × '.join(map(str, part))} of {' × '.join(map(str, shape))} trajectories over {', '.join(axes)}"
@@ -93,7 +109,10 @@ def window(points: xr.Dataset, *, most: int = 1000, **bounds: tuple[float, float
 
 def _within(name: str, values: np.ndarray, bounds: tuple[float, float] | None, most: int) -> np.ndarray:
     """The indices of values on an axis within bounds: in steps of the least power of two with which there are few enough."""
-    low, high = arguments.numeric_array(name, values[[0, -1]] if bounds is None else bounds).astype(float)
+    pair = arguments.numeric_array(name, values[[0, -1]] if bounds is None else bounds).astype(float)
+    if pair.shape != (2,) or not pair[0] <= pair[1]:
+        raise ValueError(f"Argument `{name}` must be a least and a greatest value, in this order, but is {bounds!r}.")
+    low, high = pair
     first, last = np.searchsorted(values, low, side="left"), np.searchsorted(values, high, side="right")
     if first == last:
         raise ValueError(

@@ -40,10 +40,11 @@ def refined_whole(truth, halvings):
         for at in np.argwhere(ringed):
             wanted[tuple(slice(2 * k, 2 * k + 3) for k in at)] = True
         old = tuple(slice(None, None, 2) for _ in finer.shape)
-        wanted[old] = False
-        whole = wanted.copy()
-        whole[old] = computed
-        values, computed = np.where(wanted, finer, before), whole
+        wanted[old] &= ~computed
+        before[old] = values
+        computed, earlier = wanted.copy(), computed
+        computed[old] |= earlier
+        values = np.where(wanted, finer, before)
     return values, computed
 
 
@@ -101,7 +102,7 @@ def test_a_window_of_all_is_the_refined_map(scene):
         name: value for name, value in whole.attrs.items() if name not in ("summary", "created")
     }
     assert sparse.sizes["point"] == int(whole["computed"].sum())
-    assert int(sparse["audited"].sum()) == whole.attrs["audit_cells"]
+    assert int((sparse["step"] == 0).sum()) == whole.attrs["audit_cells"]
 
 
 def test_windows_have_bounds_and_as_many_points_as_are_asked_for(scene, tmp_path):
@@ -111,6 +112,8 @@ def test_windows_have_bounds_and_as_many_points_as_are_asked_for(scene, tmp_path
     inside = whole.sel(mu=slice(0.18, 0.21), p=[2.0])
     for name in ("verdict", "amplitude", "attractor", "computed"):
         assert part[name].equals(inside[name]), name
+    # In whatever order somebody has put the points.
+    assert fj.window(sparse.sortby("p")).equals(whole) and fj.window(sparse.sortby("amplitude")).equals(whole)
     few = fj.window(sparse, most=5)
     assert dict(few["verdict"].sizes) == {"mu": 4, "p": 5}
     assert few["verdict"].equals(whole["verdict"][::4, ::4])
@@ -123,11 +126,16 @@ def test_what_is_no_sparse_map_or_not_on_its_axes_is_refused(scene):
     sparse = fj.bistability_map(scene, mu=[0.1, 0.2], p=[1.0, 2.0], refine=1, sparse=True, progress=False)
     for bounds, sentence in (
         ({"mu": (1.0, 2.0)}, "Argument `mu` must hold values of the axis, which goes from 0.1 to 0.2 in 2 steps"),
-        ({"mu": 0.1}, "Argument `mu` must be a least and a greatest value, but is 0.1"),
+        ({"mu": 0.1}, "Argument `mu` must be a least and a greatest value, in this order, but is 0.1"),
+        ({"mu": (0.2, 0.1)}, r"a least and a greatest value, in this order, but is \(0.2, 0.1\)"),
+        ({"mu": (0.1, np.nan)}, r"a least and a greatest value, in this order, but is \(0.1, nan\)"),
         ({"m": (0.1, 0.2)}, "Unknown axis `m`; this map has: mu, p."),
     ):
         with pytest.raises(ValueError, match=sentence):
             fj.window(sparse, **bounds)
+    for part in (sparse.isel(point=slice(1, None)), sparse.where(sparse["verdict"] == 1), sparse.isel(point=[])):
+        with pytest.raises(ValueError, match=r"must have all 9 points that were computed.* Take the window first"):
+            fj.window(part)
     with pytest.raises(
         ValueError, match=r"must be a sparse map, but has the dimensions mu, p, attractors. Make one by"
     ):
