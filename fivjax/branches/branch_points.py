@@ -15,7 +15,7 @@ from .special_points import Special
 from .verification import RealMotion, crossings_of, on_section, real_motion
 
 # Distances at which a branch goes on beyond what cannot be followed, as shares of the parameter's scale. A cycle that differs
-# in period or size by a larger share is of another branch.
+# much more in period or size is of another branch.
 BEYOND = (1e-3, 3e-3, 1e-2)
 
 
@@ -75,7 +75,9 @@ def cycle_beyond(family: Family, last: BranchPoint, sense: float) -> BranchPoint
         parameter = at + sense * share * family.scale
         closed = close_near(ReturnMaps.of(family.at(parameter)), start, crossings)
         found = None if closed is None else point_through(family, parameter, closed.point, closed.period)
-        if found is not None and found.is_real and _are_alike(last, found, share):
+        # Period and size may change as the parameter does, relative to itself, and somewhat more: not with its bounds.
+        most = share * max(1.0, 2 * family.scale / max(abs(at), 0.2 * family.scale))
+        if found is not None and found.is_real and _are_alike(last, found, most):
             return found
     return None
 

@@ -44,7 +44,7 @@ def tori_along(branch: "xr.Dataset", points: int = 12, *, progress: bool | None 
 
     **Example:**
 
-        >>> branch = fj.continue_cycle(scene.replace(mu=0.227), "belt_speed", (1.7, 3.0))  # doctest: +SLOW
+        >>> branch = fj.continue_cycle(scene.replace(mu=0.227, belt_speed=1.8), "belt_speed", (1.7, 3.0))  # doctest: +SLOW
         >>> bool(np.any(fj.tori_along(branch, points=2)["kind"] == "torus"))  # doctest: +SLOW
         True
     """

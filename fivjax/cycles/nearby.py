@@ -87,7 +87,7 @@ def nearby_cycle(scene: Scene, cycle: LimitCycle, *, stages: int = 1, multiplier
 
         >>> cycle = fj.limit_cycle(scene.replace(belt_speed=1.0))  # doctest: +SLOW
         >>> nearby = fj.nearby_cycle(scene.replace(belt_speed=1.0, mu=0.22), cycle)
-        >>> bool(nearby.found), nearby.amplitude < cycle.amplitude
+        >>> bool(nearby.found), bool(nearby.amplitude < cycle.amplitude)
         (True, True)
     """
     arguments.instance("scene", scene, Scene, "a Scene")

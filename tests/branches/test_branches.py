@@ -129,6 +129,15 @@ def test_a_branch_goes_on_where_the_number_of_rebounds_before_rest_changes():
         np.testing.assert_allclose(run.q[-1], q, atol=1e-6 * np.max(np.abs(q)))
 
 
+def test_what_a_branch_goes_on_over_does_not_depend_on_where_it_ends():
+    """At 1.314 m/s N grazes zero, and an impact comes in: with bounds that are far apart, too, the branch goes on beyond."""
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.35, fj.ConstantLoad(100.0))
+    branch = fj.continue_cycle(scene, "belt_speed", (1.29, 3.0))
+    assert branch.begins == "The bound belt_speed = 1.29 is reached."
+    grazing = branch.parameter[branch.special == "grazing of N"].item()
+    assert grazing == pytest.approx(1.3140882, abs=1e-7)
+
+
 def test_a_branch_goes_on_over_a_gap_where_a_rebound_grazes():
     """With one rebound fewer the cycle is stable again: the parameter turns back at a fold, and again where the gap grazes zero."""
     mass, load = np.diag([0.61, 0.1166, 0.1462, 0.8851]), [0.0, -0.5, 0.0, -1.0]
