@@ -442,9 +442,14 @@ def test_chaos_with_rare_events_is_named_and_a_fade_of_thousands_of_periods_is_n
     chaos = fj.bistability_map(paper(0.6393391935903446, 9.602345607398314, **RARE), p=[0.5, 1.5], progress=False)
     # By so little that it shows in one of the two only, in thousands of returns.
     assert np.all(chaos["verdict"] == fj.Verdict.UNDECIDED) and np.any(chaos["chaotic"])
-    # Chaotic for thousands of periods, then on one of two cycles: which one is a matter of rounding.
-    passing = fj.bistability_map(paper(0.7962659284901421, 41.42511253421955, **PASSING), p=[2.2, 4.8], progress=False)
-    assert np.all(passing["verdict"] == fj.Verdict.UNDECIDED) and np.all(passing["chaotic"])
+    # Chaotic for thousands of periods, then on one of two cycles: which one is a matter of rounding. Those that are captured in the
+    # end are where the reference comes to as well.
+    scene, kicks = paper(0.7962659284901421, 41.42511253421955, **PASSING), [2.2, 4.8]
+    passing = fj.bistability_map(scene, p=kicks, progress=False)
+    undecided = (passing["verdict"] == fj.Verdict.UNDECIDED).values
+    assert np.any(undecided) and np.all(passing["chaotic"] == undecided)
+    theirs = by_reference(scene, kicks, periods=1e4)
+    np.testing.assert_allclose(passing["amplitude"][~undecided], theirs.amplitudes[~undecided, -1], rtol=1e-6)
     fading = dict(m1=0.9855383061050841, m2=0.030357371740907798, k1=158293.2646841661, k2=103339.15007802399)
     fading |= dict(theta=0.06138792475277073, c1=6.516258313521397, c2=0.351555082727242)
     scene = paper(0.2624679100513595, 0.13967129502237938, **fading)
