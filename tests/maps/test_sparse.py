@@ -10,7 +10,7 @@ import xarray as xr
 from scipy.ndimage import binary_dilation
 
 import fivjax as fj
-from fivjax.maps import jobs, plan
+from fivjax.maps import engine, jobs, plan
 from fivjax.maps.checkpoint import Checkpoint
 from fivjax.maps.refinement import refine_grid
 from fivjax.maps.results import by_name, not_run
@@ -157,6 +157,8 @@ def test_an_interrupted_sparse_map_goes_on_from_its_file(scene, tmp_path, monkey
     """In the coarse grid, and in a halving: what is finished is on the disk, and only that; the end is the same, bit for bit."""
     monkeypatch.setattr(plan, "IN_A_JOB", 8)
     monkeypatch.setattr("fivjax.maps.checkpoint.KEEP_EVERY", 0.0)
+    # One job after the other, so that those before the interrupt are done.
+    monkeypatch.setattr(engine, "cores", lambda: 1)
     options = {"mu": MU, "p": P, "refine": 2, "sparse": True, "audit": 0.1, "progress": False}
     whole, path = fj.bistability_map(scene, **options), tmp_path / "map.part"
     real, left = jobs.follow_all, []
