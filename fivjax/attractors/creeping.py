@@ -7,8 +7,8 @@ a small share of its size, is left to settle on the line again, and its drift is
 **Why no cycle is leapt over.** With the drift $g(x)$ as a function of the place on the line, a cycle is a zero of $g$. At a
 distance $a$ from the nearest one $|g'/g|$ is about $1/a$, or $2/a$ from the pair that is born in a fold. No leap, the first
 one included, is longer than `TRUSTED` times $|g/g'|$, by the drifts at the two latest places (of the first, at both ends of the
-drift itself), so it covers a part of that distance; and it counts only
-if the drift at its end has the same direction, nearly the same speed, and the same contact events.
+drift itself), so it covers a part of that distance; and it counts only if the drift at its end has the same direction, nearly
+the same speed, and the same contact events.
 
 **Growth and decay about the equilibrium.** A motion without events that does nothing but grow, or decay, leaps in proportion to
 its size: from rounding to its first event there are thirty e-folds. What is said above then holds of $\ln x$ and of the rate

@@ -63,9 +63,9 @@ def long_divergence(
     parted, least, most, furthest = np.zeros((4, len(group)))
     for turn in range(MOST_WINDOWS):
         before = np.linalg.norm(maps.weights * at.y, axis=1)
-        growth, taken, more, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
+        growth, taken, changed, at, beside, _ = _growth(maps, Motions(group[running], at), beside)
         time[running] += taken
-        changes[running] += more
+        changes[running] += changed
         # One that has faded comes back no more in the end, and where it was is then lost.
         lasts = maps.moves(group[running], at.y)
         # Relative to their size: about the equilibrium neighbours part, or close in, as the motion grows, or fades. What

@@ -99,10 +99,10 @@ class Checkpoint:
             return jax.tree.map(lambda leaf: leaf[chosen].copy(), self.verdicts)
         self._merge()
         found = not_run(len(places), bool(self.verdicts.energy))
-        at = np.searchsorted(self._places, places)
-        known = np.flatnonzero(np.isin(places, self._places))
+        known = np.isin(places, self._places)
+        rows = np.searchsorted(self._places, places[known])
         for whole, kept in zip(jax.tree.leaves(found), jax.tree.leaves(self.verdicts), strict=True):
-            whole[known] = kept[at[known]]
+            whole[known] = kept[rows]
         return found
 
     def _merge(self) -> None:

@@ -53,14 +53,9 @@ class Levels(NamedTuple):
         moved = [[one + far for one, far in zip(index, way, strict=True)] for way in ways]
         return np.stack([np.ravel_multi_index(at, self.shape) for at in moved])
 
-    def every(self, step: int) -> Indices:
-        """All points of the grid of this step."""
-        along = [np.arange(0, length, min(step, length)) for length in self.shape]
-        return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
-
-    def cells(self, step: int) -> Indices:
-        """All cells of the grid of this step. An axis of one value has no intervals."""
-        along = [np.arange(0, max(length - 1, 1), step if length > 1 else 1) for length in self.shape]
+    def every(self, step: int, last: int = 0) -> Indices:
+        """All points of the grid of this step, but for its `last` intervals; axes of one value have none."""
+        along = [np.arange(0, max(length - last, 1), step) for length in self.shape]
         return np.ravel_multi_index(np.ix_(*along), self.shape).ravel()
 
     def moved(self, places: Indices, step: int, by: Sequence[int], last: int = 0) -> Indices:
@@ -143,7 +138,7 @@ def refine_grid(shape: tuple[int, ...], halvings: int, audit: float, run: Run) -
     places = levels.every(levels.coarsest)
     refined = Refined(places, np.full(len(places), levels.coarsest), levels)
     verdicts = run(places, "coarse grid")
-    cells, nothing = levels.cells(levels.coarsest), not_run(0, bool(verdicts.energy))
+    cells, nothing = levels.every(levels.coarsest, last=1), not_run(0, bool(verdicts.energy))
     for level in range(1, halvings + 1):
         # An interrupt leaves trajectories that were not run.
         if np.any(verdicts.pending()):

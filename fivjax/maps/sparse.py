@@ -6,10 +6,11 @@ import numpy as np
 import xarray as xr
 
 from ..foundation import arguments
+from ..io.datasets import label
 from ..verdicts.verdict import Verdict
 from .datasets import POINT, from_rows, summarised, with_critical_kicks
 from .plan import Grid
-from .refinement import Levels, Refined, finer_axis
+from .refinement import Levels, Refined, finer_axis, placed
 
 
 def levels_note(grid: Grid, refined: Refined) -> dict[str, str | int]:
@@ -101,8 +102,8 @@ def window(points: xr.Dataset, *, most: int = 1000, **bounds: tuple[float, float
     }
     of_grid = ("summary", "axes", "coarsest", "finest", "computed")
     dataset = xr.Dataset(results, coords, {name: value for name, value in points.attrs.items() if name not in of_grid})
-    computed = np.isin(places, refined.places).reshape(part) & (dataset["verdict"].values != Verdict.NOT_RUN)
-    dataset["computed"] = (tuple(axes), computed, {"long_name": "whether it was computed", "units": "1"})
+    computed = placed(refined.places, places)[0].reshape(part) & (dataset["verdict"].values != Verdict.NOT_RUN)
+    dataset["computed"] = label(xr.DataArray(computed, dims=tuple(axes), name="computed"))
     listed = f"{' × '.join(map(str, part))} of {' × '.join(map(str, shape))} trajectories over {', '.join(axes)}"
     return summarised(with_critical_kicks(dataset), listed)
 
