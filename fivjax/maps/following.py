@@ -92,7 +92,6 @@ def _follow_by_kernel(
     now = trajectories.tree[1]
     began, events = now.t.copy(), now.events
     kernels.follow(group, trajectories, steps)
-    # While its mode changes again and again, nothing can be proved of a trajectory.
     asks = np.flatnonzero(_may_be_concluded(batch.shared.tree, group, began, events, trajectories.tree[1]))
     if len(asks):
         kernels.conclude(group, trajectories, asks, began)
@@ -102,15 +101,15 @@ def _may_be_concluded(
     shared: GroupConstants, group: Int[np.ndarray, " m"], began: Float[np.ndarray, " m"], events, now: Progress
 ) -> np.ndarray:
     """Which trajectories (leading axis) may have a verdict by `conclude`, or may be taken to their next event, after a round of
-    steps: those whose mode has not changed in it, after the last jump of the load, and those that have not moved, are too large
-    or are not finite. Cheap. `began` and `events` are the time (s) and the number of events before the round.
+    steps: those whose mode has not changed in it, or not for half a period, after the last jump of the load, and those that
+    have not moved, are too large or are not finite. Cheap. `began` and `events` are the time (s) and the number of events
+    before the round.
     """
     largest = np.max(np.abs(shared.weights[group] * now.y), axis=1)
-    return (
-        ((now.last_jump <= now.t) & (now.events == events))
-        | (now.t <= began)
-        | ~(largest <= UNBOUNDED_FROM * now.yardstick)
-    )
+    # While its mode changes again and again, nothing can be proved of a trajectory.
+    since = now.t - np.maximum(now.last_event, now.last_jump)
+    calm = (now.events == events) | (since >= 0.5 * np.asarray(shared.modes.slowest_period)[group])
+    return ((now.last_jump <= now.t) & calm) | (now.t <= began) | ~(largest <= UNBOUNDED_FROM * now.yardstick)
 
 
 def bounds(batch: Batch, group: Int[np.ndarray, " m"], at: Section) -> Float[np.ndarray, " m"]:

@@ -156,7 +156,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
             capture.search_alone(pending, trajectories.tree[1], crossings)
             own_from = 2 * done
         # Trajectories that have taken long may take longer: looks at their verdicts grow rarer, in proportion.
-        steps = min(max(task.method.round, done // 5), max(task.limits.max_steps - done, 1))
+        steps = min(max(task.method.round, done // 8), max(task.limits.max_steps - done, 1))
         file.moving()
         advance_all(batch, group[pending], trajectories, steps)
         done += steps
