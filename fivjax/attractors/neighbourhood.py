@@ -172,26 +172,35 @@ def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighb
     every = side_by_side(trials)
     events = returned(np.arange(len(trials)), every.centre[:, None]).events
     # An ellipsoid's shells but the last are the outer ones of the next smaller one, so each is checked once.
-    shell, passed, open_ = np.array(every.largest), np.zeros(len(trials), int), np.arange(len(trials))
-    contraction = np.zeros((len(trials), SHELLS))
-    while len(open_):
-        going = open_
-        # A few of the points are tried first.
-        for one_in in (32, 8, 1):
-            ratios = _contraction(every, going, one_in, shell[going], events[going], returned)
-            # NaN is not below anything, so it fails.
-            going, ratios = (part[ratios <= every.allowed[going]] for part in (going, ratios))
-        contraction[going, passed[going]] = ratios
-        passed[open_] = np.where(np.isin(open_, going), passed[open_] + 1, 0)
-        for k in open_[passed[open_] == SHELLS].tolist():
-            one, outermost = trials[k], float(shell[k]) * 2 ** (SHELLS - 1)
-            largest, points = float(np.max(contraction[k])), SHELLS * len(one.sizes)
-            found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, outermost, largest, points)
-        open_ = open_[passed[open_] < SHELLS]
-        shell[open_] *= 0.5
-        outermost = shell[open_] * 2.0 ** passed[open_]
-        open_ = open_[outermost >= every.smallest[open_]]
-    return found
+    count = np.floor(np.log2(every.largest / every.smallest)).astype(int) + SHELLS
+    passed = np.arange(np.max(count)) < count[:, None]  # [cycle, shell], from outside
+    contraction = np.full(passed.shape, np.nan)
+
+    def check(rows: Int[np.ndarray, " m"], shell: Int[np.ndarray, " m"], one_in: int):
+        """Tries one in so many points of these shells; which shells pass, and their ratios."""
+        ratios = _contraction(every, rows, one_in, every.largest[rows] * 0.5**shell, events[rows], returned)
+        # NaN is not below anything, so it fails.
+        passed[rows, shell] = good = ratios <= every.allowed[rows]
+        return rows[good], shell[good], ratios[good]
+
+    # A few points of all shells are tried first, at once.
+    check(*np.nonzero(passed), 32)
+    while True:
+        runs = np.all(np.lib.stride_tricks.sliding_window_view(passed, SHELLS, axis=1), axis=2)
+        left = np.flatnonzero(np.any(runs, axis=1) & np.array([one is None for one in found]))
+        if not len(left):
+            return found
+        outermost = np.argmax(runs[left], axis=1)
+        rows, shell = np.repeat(left, SHELLS), (outermost[:, None] + np.arange(SHELLS)).ravel()
+        fresh = np.isnan(contraction[rows, shell])
+        rows, shell, _ = check(rows[fresh], shell[fresh], 8)
+        rows, shell, ratios = check(rows, shell, 1)
+        contraction[rows, shell] = ratios
+        for k, j in zip(left.tolist(), outermost.tolist(), strict=True):
+            if np.all(passed[k, j : j + SHELLS]):
+                one, radius = trials[k], float(every.largest[k] * 0.5**j)
+                largest, points = float(np.max(contraction[k, j : j + SHELLS])), SHELLS * len(one.sizes)
+                found[k] = Neighbourhood(one.centre, one.status, one.direction, one.norm, radius, largest, points)
 
 
 def _contraction(

@@ -19,11 +19,11 @@ def mapped(law, events=lambda x: 0 * x[:, 0], status=Status.SLIDE):
     """A return map that does this to the weighted deviations (points, free) from the centre."""
 
     def returned(_, y):
-        x = WEIGHTS[FREE] * (y[0] - CENTRE)[:, FREE]
+        x = WEIGHTS[FREE] * (y - CENTRE).reshape(-1, 6)[:, FREE]
         after = np.repeat(CENTRE[None], len(x), axis=0)
         after[:, FREE] += law(x) / WEIGHTS[FREE]
         images = after, np.full(len(x), status), np.ones(len(x)), events(x).astype(int)
-        return ReturnImages(*(part[None] for part in images))
+        return ReturnImages(*(part.reshape(*y.shape[:2], *part.shape[1:]) for part in images))
 
     return returned
 
