@@ -23,7 +23,7 @@ from ..section.by_kernel import SectionKernels, section_kernels
 from ..section.return_maps import BLOCK, Section, of_block
 from ..simulation.ending import UNBOUNDED_FROM
 from ..verdicts.sliding_proof import SlidingModes, margin_share_bound
-from .groups import GroupConstants, Task, constants_of
+from .groups import GroupConstants, Task, constants_of, kick_of
 from .one_trajectory import (
     Progress,
     TaskConstants,
@@ -58,10 +58,13 @@ class Batch:
 
 
 def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
-    """Trajectories at their beginning, each with its kick and initial values in `columns`."""
+    """Trajectories at their beginning, each with the values in `columns` of the parameters of the kick and initial values that
+    differ between them.
+    """
     task = batch.task
+    kick, initial = _starts(task, columns)
     if batch.kernels is not None:
-        begun = batch.kernels.begin(group, columns)
+        begun = batch.kernels.begin(group, kick, initial)
         if task.from_afar and batch.section_kernels is not None:
             batch.section_kernels.begin_building()
         return begun
@@ -69,7 +72,21 @@ def begin_all(batch: Batch, group: Int[np.ndarray, " m"], columns: Float[np.ndar
     def function(*block):
         return _begin_block(TaskConstants.of(task), *block)
 
-    return in_blocks(function, batch.shared, group, flatten(columns), task.width, batch.pool, size=batch.block)
+    return in_blocks(function, batch.shared, group, flatten((kick, initial)), task.width, batch.pool, size=batch.block)
+
+
+def _starts(
+    task: Task, columns: Float[np.ndarray, "m h"]
+) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m state"]]:
+    """All parameters of the kick of each trajectory, and its initial state: NaN where that is the equilibrium's; no numbers if
+    it is that in all.
+    """
+    kick_of_scene, own = kick_of(task.scene), dict(zip((*task.of_kick, *task.states), columns.T, strict=True))
+    kick = [own.get(name, np.full(len(columns), value)) for name, value in kick_of_scene.items()]
+    initial = np.full((len(columns), 2 * task.scene.structure.size if task.states else 0), np.nan)
+    for name, place in task.states.items():
+        initial[:, place] = own[name]
+    return np.array(kick).reshape(len(kick), len(columns)).T.copy(), initial
 
 
 def advance_all(batch: Batch, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
@@ -133,34 +150,33 @@ def _bounds(shared: Flattened, rows: Flattened) -> Flattened:
 
 @kept
 def _begin_block(of_task: TaskConstants, shared: Flattened, trajectories: Flattened) -> Flattened:
-    def group(shared, columns):
-        def one(row):
-            own = row[len(of_task.of_kick) :]
-            return begin_one(of_task.setting(shared, row).scene, shared, of_task.states, own, energy=of_task.energy)
+    def group(shared, kick, initial):
+        def one(kick, initial):
+            return begin_one(of_task.setting(shared, kick).scene, shared, initial, energy=of_task.energy)
 
-        return jax.vmap(one)(columns)
+        return jax.vmap(one)(kick, initial)
 
-    columns = trajectories.tree
-    return flatten((columns, jax.vmap(group)(shared.tree, columns)), row_axes=2)
+    kick, initial = trajectories.tree
+    return flatten((kick, jax.vmap(group)(shared.tree, kick, initial)), row_axes=2)
 
 
 def _follow_rows(of_task: TaskConstants, steps, shared: Flattened, trajectories: Flattened) -> Flattened:
-    columns, begun = trajectories.tree
-    of_all = functools.partial(_of_all, of_task, shared.tree, columns)
+    kick, begun = trajectories.tree
+    of_all = functools.partial(_of_all, of_task, shared.tree, kick)
     # Loops about trajectories side by side, not trajectories side by side in loops: JAX traces the body of a loop that it
     # has to vectorise several times.
     a_step, concluded = map(of_all, (with_step, conclude))
     after = jax.lax.fori_loop(0, steps, lambda _, now: a_step(now), begun)
-    return flatten((columns, concluded(begun.t, after)), row_axes=2)
+    return flatten((kick, concluded(begun.t, after)), row_axes=2)
 
 
 _follow_block, _follow_block_of_many = kept(_follow_rows), kept(_follow_rows, quickly_compiled=False)
 
 
-def _of_all(of_task: TaskConstants, everything: GroupConstants, columns, function):
+def _of_all(of_task: TaskConstants, everything: GroupConstants, kick, function):
     """A function of a setting and of what is one trajectory's, for all trajectories of a block."""
 
-    def of_group(shared, columns, *own):
-        return jax.vmap(lambda row, *own: function(of_task.setting(shared, row), *own))(columns, *own)
+    def of_group(shared, kick, *own):
+        return jax.vmap(lambda row, *own: function(of_task.setting(shared, row), *own))(kick, *own)
 
-    return lambda *own: jax.vmap(of_group)(everything, columns, *own)
+    return lambda *own: jax.vmap(of_group)(everything, kick, *own)

@@ -32,7 +32,7 @@ OF_KICK = ("p", "duration", "start")
 class GroupConstants(eqx.Module):
     """The data that the trajectories of a group have in common."""
 
-    values: Float[Array, " k"]  # the parameters that are not those of the kick
+    scene: Scene  # with the group's parameters, and its structure given by matrices
     mechanics: Mechanics
     modes: SlidingModes
     drift: StickingDrift | None  # None with several contacts
@@ -82,7 +82,7 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     n = scene.structure.size
     m = 2 * (n - 1)
     own = 8 * (3 * 2 * n + 60)
-    modes = 8 * (m * m + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
+    modes = 8 * (m * m + 3 * n * n + 3 * m + 2 * n + 8) + 16 * (m * m + 4 * m)
     attractor = 8 * 512 * 2 * n  # mostly so many states are kept of a torus
     return int(own + 3 * (modes + attractor) / sharing)
 
@@ -104,34 +104,49 @@ def constants_of(task: Task, distinct: np.ndarray) -> Flattened:
     for start in range(0, len(distinct), size):
         # Padded with copies, so that there is one size.
         rows = np.minimum(np.arange(start, start + size), len(distinct) - 1)
-        part = _prepare(task.scene, task.names, distinct[rows])
+        scenes = _scenes(task.scene, task.names, distinct[rows])
+        part = scenes, *_prepare(scenes)
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: len(distinct) - start], part))
-    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, linear, *_ in parts)))
+    modes = sliding_modes(jax.tree.map(lambda *leaves: np.concatenate(leaves), *(linear for _, _, linear, *_ in parts)))
     numbers = form = None
     for start in range(0, len(distinct), size):
         # Written into the result one by one, because they are large and should not be in memory twice.
-        mechanics, _, drifts, weights, longest = parts.pop(0)
+        scene, mechanics, _, *others = parts.pop(0)
         rows = slice(start, min(start + size, len(distinct)))
         own_modes = jax.tree.map(lambda leaf, rows=rows: leaf[rows], modes)
-        part = flatten(GroupConstants(distinct[rows], mechanics, own_modes, drifts, weights, longest))
+        part = flatten(GroupConstants(scene, mechanics, own_modes, *others))
         numbers = np.empty((len(distinct), part.numbers.shape[-1])) if numbers is None else numbers
         numbers[rows], form = part.numbers, part.form
     return Flattened(numbers, form)
 
 
-# By NumPy, because XLA would compile it for longer than a map takes; and always so, because all maps are rounded alike.
+# Both by NumPy, because XLA would compile them for longer than a map takes; and always so, because all maps are rounded alike.
 @functools.partial(by_numpy, always=True)
-def _prepare(scene: Scene, names: tuple[str, ...], values):
+def _scenes(scene: Scene, names: tuple[str, ...], values):
+    """Those of groups with these values. Their structures are given by matrices: worked out once, not where they are used, and
+    of the same form whichever parameters differ.
+    """
+
     def one(row):
         own = with_values(scene, names, row)
-        # Worked out from the structure's parameters once, not wherever they are used.
-        own = eqx.tree_at(lambda own: own.structure.source, own, own.structure.matrices)
-        mechanics = mechanics_about_sliding(own)
-        drift = None if mechanics.several else sticking_drift(own)
-        weights = own.structure.weights
-        return mechanics, linear_sliding(own), drift, weights, longest_return(own)
+        return eqx.tree_at(lambda own: own.structure.source, own, own.structure.matrices)
 
     return jax.vmap(one)(values)
+
+
+@functools.partial(by_numpy, always=True)
+def _prepare(scenes):
+    def one(own):
+        mechanics = mechanics_about_sliding(own)
+        drift = None if mechanics.several else sticking_drift(own)
+        return mechanics, linear_sliding(own), drift, own.structure.weights, longest_return(own)
+
+    return jax.vmap(one)(scenes)
+
+
+def kick_of(scene: Scene) -> dict[str, float]:
+    """The parameters of a scene's kick, with its values."""
+    return {name: float(scene.parameters[name]) for name in OF_KICK if name in scene.parameters}
 
 
 def with_values(scene: Scene, names: tuple[str, ...], row) -> Scene:

@@ -23,7 +23,7 @@ from ..verdicts.sliding_proof import margin_share_bound
 from ..verdicts.slow_growth import slide_while_certain
 from ..verdicts.sticking_proof import sticks_forever
 from ..verdicts.verdict import Verdict
-from .groups import GroupConstants, Task, with_values
+from .groups import GroupConstants, Task, kick_of, with_values
 
 
 class Progress(eqx.Module):
@@ -54,24 +54,21 @@ class Setting(eqx.Module):
 
 
 class TaskConstants(eqx.Module):
-    """What is the same for all trajectories of a run."""
+    """What is the same for all trajectories of a run. It does not say which parameters are axes: maps over others need no other
+    code.
+    """
 
-    scene: Scene
-    names: tuple[str, ...] = eqx.field(static=True)
-    of_kick: tuple[str, ...] = eqx.field(static=True)
-    states: tuple[int, ...] = eqx.field(static=True)  # initial values, by their places in the state
+    of_kick: tuple[str, ...] = eqx.field(static=True)  # all parameters of the kick
     method: AbstractStepper = eqx.field(static=True)
     energy: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, task: Task) -> "TaskConstants":
-        states = tuple(task.states.values())
-        return cls(task.scene, task.names, task.of_kick, states, task.method, task.limits.energy)
+        return cls(tuple(kick_of(task.scene)), task.method, task.limits.energy)
 
-    def setting(self, shared: GroupConstants, row) -> Setting:
+    def setting(self, shared: GroupConstants, kick) -> Setting:
         """That of a trajectory with these values of the parameters of the kick."""
-        scene = with_values(with_values(self.scene, self.names, shared.values), self.of_kick, row)
-        return Setting(scene, self.method, shared)
+        return Setting(with_values(shared.scene, self.of_kick, kick), self.method, shared)
 
 
 class EnergyRecord(eqx.Module):
@@ -89,9 +86,9 @@ def _load_steps(load: AbstractLoad) -> Float[Array, " k+1"]:
     return jax.vmap(load)(between) - load.final
 
 
-def begin(scene: Scene, shared: GroupConstants, places: tuple[int, ...], values, *, energy: bool = False) -> Progress:
-    """A trajectory at the sliding equilibrium of its scene, before the kick. At these places of its state it has `values`
-    (totals, not deviations) instead, where they are not NaN.
+def begin(scene: Scene, shared: GroupConstants, initial, *, energy: bool = False) -> Progress:
+    """A trajectory at the sliding equilibrium of its scene, before the kick; with an `initial` state (totals, not deviations)
+    instead, where that is given and not NaN.
     """
     modes = shared.modes
     q, _ = steady_sliding(scene, scene.load.force)
@@ -100,10 +97,8 @@ def begin(scene: Scene, shared: GroupConstants, places: tuple[int, ...], values,
     # With a rounding error added, as in a computed equilibrium: else an unstable one would never be left without a kick.
     y = equilibrium - modes.linear.equilibrium + _started_by(scene, loads) * jnp.abs(equilibrium)
     own = jnp.zeros_like(y)
-    if places:
-        at = np.array(places)
-        y = y.at[at].set(jnp.where(jnp.isnan(values), y[at], values - modes.linear.equilibrium[at]))
-        own = y
+    if initial.shape[0]:
+        own = y = jnp.where(jnp.isnan(initial), y, initial - modes.linear.equilibrium)
     verdict = jnp.where(
         ~modes.linear.solvable,
         Verdict.PAINLEVE,

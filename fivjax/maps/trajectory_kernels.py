@@ -19,22 +19,21 @@ from .one_trajectory import Progress, TaskConstants, begin, conclude, with_step
 
 
 def _begin_one(args, instants):
-    of_task, shared, row = args
-    scene, own = of_task.setting(shared, row).scene, row[len(of_task.of_kick) :]
-    return begin(scene, shared, of_task.states, own, energy=of_task.energy), ()
+    of_task, shared, kick, initial = args
+    return begin(of_task.setting(shared, kick).scene, shared, initial, energy=of_task.energy), ()
 
 
 def _follow_one(args, instants):
     """So many steps further."""
-    of_task, shared, row, now, steps = args
-    setting = of_task.setting(shared, row)
+    of_task, shared, kick, now, steps = args
+    setting = of_task.setting(shared, kick)
     begin = depending_on((setting.scene, shared.mechanics), now)
     return jax.lax.fori_loop(0, steps, lambda _, now: with_step(setting, now), begin), ()
 
 
 def _conclude_one(args, instants):
-    of_task, shared, row, now, began = args
-    after = conclude(of_task.setting(shared, row), began, now)
+    of_task, shared, kick, now, began = args
+    after = conclude(of_task.setting(shared, kick), began, now)
     return (after.t, after.skipped, after.y, after.verdict, after.bound), ()
 
 
@@ -48,16 +47,14 @@ class TrajectoryKernels:
         self.of_task, self.side_by_side = TaskConstants.of(task), goes_side_by_side(task.scene)
         of_groups = in_pairs(jax.tree.map(np.asarray, shared.tree))
         self.first = jax.tree.map(lambda leaf: leaf[0], of_groups)
-        rows = numbers_in_rows(of_groups)
-        of_all = numbers_in_rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.of_task))
-        self.table = np.concatenate([np.broadcast_to(of_all, (len(rows), of_all.shape[1])), rows], axis=1)
-        self.shared, self.pool = len(jax.tree.leaves((self.of_task, self.first))), pool
+        self.table = numbers_in_rows(of_groups)
+        self.shared, self.pool = len(jax.tree.leaves(self.first)), pool
 
-    def begin(self, group: Int[np.ndarray, " m"], columns: Float[np.ndarray, "m h"]) -> Flattened:
-        """Trajectories at their beginning, each with its kick and initial values."""
-        progress: Progress = self._of_each(_begin, group, (columns,))
-        to_follow = self._form((columns, progress, np.zeros(len(columns), np.int32)))
-        to_conclude = self._form((columns, progress, progress.t))
+    def begin(self, group: Int[np.ndarray, " m"], kick: Float[np.ndarray, "m k"], initial) -> Flattened:
+        """Trajectories at their beginning, each with its kick and initial state."""
+        progress: Progress = self._of_each(_begin, group, (kick, initial))
+        to_follow = self._form((kick, progress, np.zeros(len(kick), np.int32)))
+        to_conclude = self._form((kick, progress, progress.t))
 
         def build():
             kernel_of(_follow, to_follow, shared=self.shared, side_by_side=self.side_by_side).of_lanes.on_cpu  # noqa: B018
@@ -65,14 +62,14 @@ class TrajectoryKernels:
 
         # What comes later is compiled meanwhile.
         self.pool.submit(build)
-        return flatten((columns, progress))
+        return flatten((kick, progress))
 
     def follow(self, group: Int[np.ndarray, " m"], trajectories: Flattened, steps: int) -> None:
         """Trajectories so many steps further, in place."""
-        columns, now = trajectories.tree
-        given = columns, now, np.full(len(group), steps, np.int32)
+        kick, now = trajectories.tree
+        given = kick, now, np.full(len(group), steps, np.int32)
         after = self._of_each(_follow, group, given, on_gpus=True, side_by_side=self.side_by_side)
-        trajectories.numbers[:, columns.shape[-1] :] = numbers_in_rows(after)
+        trajectories.numbers[:, kick.shape[-1] :] = numbers_in_rows(after)
 
     def conclude(
         self, group: Int[np.ndarray, " m"], trajectories: Flattened, rows: Int[np.ndarray, " r"], began
@@ -80,8 +77,8 @@ class TrajectoryKernels:
         """These trajectories with their verdicts, where they can be proved by now, in place. `began` is the time (s) at which
         the present round of steps began.
         """
-        columns, now = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], trajectories.tree)
-        found = self._of_each(_conclude, group[rows], (columns, now, began[rows]))
+        kick, now = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], trajectories.tree)
+        found = self._of_each(_conclude, group[rows], (kick, now, began[rows]))
         _, at = trajectories.starts
         for start, part in zip((at.t, at.skipped, at.y, at.verdict, at.bound), found, strict=True):
             part = part.reshape(len(rows), -1)

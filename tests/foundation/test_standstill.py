@@ -71,16 +71,16 @@ def test_a_batch_of_trajectories_has_no_lapack():
     scene, names = chain(12, 1), ("mu",)
     method = EventExact()
     own = np.full((2, 1), 0.3)
-    prepare = lambda rows: groups._prepare.__wrapped__(scene, names, rows)  # noqa: E731
-    of_preparing, (mechanics, linear, *rest) = of_program(prepare, own)
+    of_values, scenes = of_program(lambda rows: groups._scenes.__wrapped__(scene, names, rows), own)
+    of_preparing, (mechanics, linear, *rest) = of_program(groups._prepare.__wrapped__, scenes)
     assert "while" in of_preparing or "scan" in of_preparing, "elimination is a loop"
     for part in ("matrix", "frictionless"):
         getattr(linear, part)[:] = -np.eye(linear.matrix.shape[-1])
-    shared = flatten(groups.GroupConstants(own, mechanics, groups.sliding_modes(linear), *rest))
-    columns = flatten(np.zeros((2, 1)))
+    shared = flatten(groups.GroupConstants(scenes, mechanics, groups.sliding_modes(linear), *rest))
+    columns = flatten((np.zeros((2, 1)), np.zeros((2, 0))))
     rows = Flattened(columns.numbers[np.zeros((2, 4), int)], columns.form)
 
-    of_task = TaskConstants(scene, names, ("p",), (), method, False)
+    of_task = TaskConstants(("p",), method, False)
 
     def begin(shared, rows):
         return following._begin_block.__wrapped__(of_task, shared, rows)
@@ -90,7 +90,7 @@ def test_a_batch_of_trajectories_has_no_lapack():
 
     of_beginning, begun = of_program(begin, shared, rows)
     of_following, _ = of_program(follow, shared, begun)
-    assert not PRIMITIVES & (of_preparing | of_beginning | of_following)
+    assert not PRIMITIVES & (of_values | of_preparing | of_beginning | of_following)
 
 
 def test_a_step_of_many_contacts_has_no_lapack():

@@ -13,7 +13,8 @@ import pytest
 import xarray as xr
 
 import fivjax as fj
-from fivjax.maps import engine, plan
+from fivjax.kernels import kernel
+from fivjax.maps import engine, plan, trajectory_kernels
 from fivjax.maps.trajectory_kernels import TrajectoryKernels
 from tests.helpers import oracle, reference
 
@@ -127,6 +128,22 @@ def test_other_axes_by_name_and_three_of_them(paper_scene):
     alone = fj.bistability_map(paper_scene.replace(theta=0.02), belt_speed=[1.0], p=p, progress=False)
     np.testing.assert_array_equal(m["verdict"].sel(theta=0.02, belt_speed=[1.0]), alone["verdict"])
     np.testing.assert_allclose(m["decided_at"].sel(theta=0.02, belt_speed=[1.0]), alone["decided_at"], atol=1e-9)
+
+
+def test_maps_over_other_axes_need_no_other_kernels(paper_scene):
+    """Every group has its scene, every trajectory all parameters of its kick: whichever of them are axes."""
+
+    def kernels() -> list:
+        return [key for key in kernel._KERNELS if key[0] in (trajectory_kernels._begin, trajectory_kernels._follow)]
+
+    fj.bistability_map(paper_scene, mu=[0.15, 0.2], p=[1.3, 2.0], progress=False)
+    before, scene = kernels(), paper_scene.replace(mu=0.2, p=1.3)
+    found = [
+        fj.bistability_map(scene, belt_speed=[2.0, 3.0], duration=[0.1, 0.2], progress=False),
+        fj.bistability_map(scene, k1=[9e4, 1e5], m1=[0.5, 0.53], progress=False),
+    ]
+    assert before and kernels() == before
+    assert all(np.all(m["verdict"] >= 0) for m in found)
 
 
 def falling(decay, belt_speed) -> fj.Scene:
