@@ -68,6 +68,13 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     # A defective matrix has no modal coordinates. Infinite entries make every bound infinite, so nothing is proved.
     inverse = np.full(vectors.shape, np.inf, complex)
     condition = np.where(finite, np.linalg.cond(vectors), np.inf)
+    # States are computed from modal coordinates only where the condition number of the modes is below this.
+    well_conditioned = condition < 1e5
+    # Without damping, motions go on for ever unless modes have coalesced: real parts are rounding errors.
+    half = matrix.shape[-1] // 2
+    undamped = np.all(matrix[:, half:, half:] == 0, axis=(1, 2)) & well_conditioned
+    undamped &= np.all(np.abs(eigenvalues.real) <= 1e-10 * np.abs(eigenvalues), axis=-1)
+    eigenvalues.real[undamped] = 0.0
     regular = condition < 1e12
     inverse[regular] = np.linalg.inv(vectors[regular])
     # Sorted so that the upper half plane comes first; the conjugates are then cut off.
@@ -78,20 +85,19 @@ def sliding_modes(linear: LinearSliding) -> SlidingModes:
     vectors = np.take_along_axis(vectors, order[:, None, :], axis=2)[:, :, :kept]
     count = np.where(eigenvalues.imag > 0, 2.0, np.where(eigenvalues.imag == 0, 1.0, 0.0))
     from_modal = np.einsum("gk,gmk->gmk", count, vectors)
-    # States are computed from modal coordinates only where the condition number of the modes is below this.
-    well_conditioned = 1e5
+    decays = np.all(eigenvalues.real < 0, axis=-1)
     return SlidingModes(
         linear=linear,
         eigenvalues=eigenvalues,
         to_modal=inverse,
         from_modal=from_modal,
-        regular=condition < well_conditioned,
+        regular=well_conditioned,
         pressing=_of_modes(linear.pressing, from_modal),
         slip=_of_modes(linear.slip, from_modal),
         remainder=_in_modes(np.where(np.isfinite(inverse), inverse, 0), linear.remainder),
         envelope=envelope(eigenvalues, _clusters(eigenvalues)),
         slowest_period=_slowest_period(eigenvalues),
-        stable=regular & np.all(eigenvalues.real < 0, axis=-1),
+        stable=regular & (decays | undamped),
     )
 
 

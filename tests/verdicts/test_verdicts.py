@@ -114,6 +114,27 @@ def test_no_proof_above_the_stability_limit():
     assert not prover(scene)(q0 + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
 
 
+def test_without_damping_sliding_goes_on_below_coalescence_and_not_above():
+    """Modes' amplitudes stay as they are: until two modes have coalesced a motion within its margins never ends, and never fades."""
+    scene = fj.Scene(fj.belt_oscillator(c1=0.0, c2=0.0), fj.Coulomb(0.1), 2.0, fj.Pulse(100.0, 1.2))
+    m = fj.bistability_map(scene, p=[1.0, 1.05, 1.5], progress=False)
+    assert np.all(m["verdict"] == fj.Verdict.SLIDING) and np.all(m["contact_events"] == 0)
+    run = fj.simulate(scene.replace(p=1.5), 20.0, 1e-3)
+    assert set(run.status[200:]) == {Status.SLIDE}
+    share = np.abs(run.velocity[200:, 0]).max() / 2.0  # of the margin to sticking
+    assert 0.5 * float(m["bound"][2]) <= share <= float(m["bound"][2]) < 1
+    for mu, c in ((0.25, 0.0), (0.1, 1e-17)):
+        other = scene.replace(mu=mu, c1=c, c2=c)
+        assert not prover(other)(fj.sliding_equilibrium(other) + np.array([1e-9, 0.0, 0.0]), np.zeros(3))
+
+
+def test_growth_that_is_a_rounding_error_skips_no_time():
+    """With next to no damping: time would get so long that steps no longer add to it, which was taken for endless events."""
+    scene = fj.Scene(fj.belt_oscillator(c1=1e-17, c2=1e-17), fj.Coulomb(0.1), 2.0, fj.Pulse(100.0, 1.2))
+    m = fj.bistability_map(scene, p=[1.0, 1.5], progress=False)
+    assert np.all(m["verdict"] == fj.Verdict.UNDECIDED) and np.all(m["contact_events"] == 0)
+
+
 def one_kick(scene: fj.Scene, p: float, **options):
     """The map's row for this kick. Beside three others, over μ: other tests have compiled that."""
     mu, beside = [float(scene.parameters["mu"])], p * np.array([0.997, 0.998, 0.999, 1.0])
