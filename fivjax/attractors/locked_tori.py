@@ -33,7 +33,7 @@ def cycles_closed_in_on(
     """The cycles to which some of these tori are locked, with their rows: weakly, so that motions come to the torus long before
     they come to the cycle.
     """
-    rows = []
+    ends: States = {}
     for row, states in traced.items():
         back = np.linalg.norm(states[-1 - MOST_CROSSINGS : -1] - states[-1], axis=1)
         lag = MOST_CROSSINGS - int(np.argmin(back))
@@ -42,8 +42,13 @@ def cycles_closed_in_on(
         # On a torus that is not locked, mostly as far apart in the end as in the beginning; and hardly ever as close as this.
         closes_in = np.median(apart[-third:]) <= 0.9 * np.median(apart[:third])
         if closes_in and np.min(back) <= 1e-3 * extent(states):
-            rows.append(row)
-    return _cycles_at_the_end(maps, group, traced, rows, cycles, 4096)
+            ends[row] = states[-1:]
+        elif np.min(back) <= 1e-4 * extent(states):
+            # Next to the unstable cycle of a locked torus, motions nearly repeat that for long. Between its places are those of
+            # the stable one.
+            places = states[-lag:-1]
+            ends[row] = 0.5 * (states[-1:] + places[[np.argmin(np.linalg.norm(places - states[-1], axis=1))]])
+    return _cycles_at_the_end(maps, group, ends, list(ends), cycles, 4096)
 
 
 def _cycles_at_the_end(

@@ -184,7 +184,8 @@ def neighbourhoods(trials: list[CycleTrial], returned: ReturnMap) -> list[Neighb
         return rows[good], shell[good], ratios[good]
 
     # A few points of all shells are tried first, at once.
-    check(*np.nonzero(passed), 32)
+    rows, shell = np.nonzero(passed)
+    check(rows, shell, 32)
     while True:
         runs = np.all(np.lib.stride_tricks.sliding_window_view(passed, SHELLS, axis=1), axis=2)
         left = np.flatnonzero(np.any(runs, axis=1) & np.array([one is None for one in found]))

@@ -36,8 +36,10 @@ DERIVED_BLOCK = 16
 # Number of states on the section that XLA keeps of a motion, the last ones.
 KEPT = 16
 # Steps of central differences, relative to a state's size: about the cube root of the rounding unit; smaller ones where motions
-# have other events that far away. And the most crossings over which a difference is taken.
+# have other events that far away, or the map bends. And the most crossings over which a difference is taken.
 STEPS, DIFFERENCED = (5e-6, 3e-7, 2e-8), 16
+# Over one step a difference may change by this share of itself.
+BENT = 1e-3
 
 # Relative errors of trajectories' crossings, at most: kernels and `EventExact` compute them to rounding, others interpolate.
 ROUNDED, INTERPOLATED = 1e-6, 1e-2
@@ -291,9 +293,12 @@ class ReturnMaps:
             alike = np.all(alike.reshape(len(own), -1), axis=1)
             slope = (ahead.y - behind.y) / (2 * step * lengths[own, None])
             slopes[left] = np.where(alike[:, None], slope, np.nan)
-            # Next to the onset of an event a step may lead to motions that have it.
+            # Next to the onset of an event a step may lead to motions that have it, or to where the map bends strongly.
+            with np.errstate(invalid="ignore"):
+                bend = np.linalg.norm(self.weights * (ahead.y + behind.y - 2 * base.at.y[own]), axis=1)
+                bent = bend > BENT * np.linalg.norm(self.weights * (ahead.y - behind.y), axis=1)
             events = base.events[own]
-            left = left[(image.events[: len(own)] != events) | (image.events[len(own) :] != events)]
+            left = left[bent | (image.events[: len(own)] != events) | (image.events[len(own) :] != events)]
             if not len(left):
                 break
         derivatives = np.zeros((*at.y.shape, at.y.shape[1]))

@@ -561,9 +561,14 @@ class Locked:
         return np.ones(len(group))
 
 
-@pytest.mark.parametrize(("start", "found_by"), [(0.003, cycles_repeated), (0.05, cycles_closed_in_on)])
+@pytest.mark.parametrize(
+    ("start", "found_by"),
+    [(0.003, cycles_repeated), (0.05, cycles_closed_in_on), (np.pi / 13 + 1e-7, cycles_closed_in_on)],
+)
 def test_a_cycle_of_many_crossings_that_attracts_weakly_counts_for_a_motion_that_comes_to_it(start, found_by):
-    """The motion repeats it, or is still on its way. The cycle is where 13 times the angle is no longer turned back or on."""
+    """The motion repeats it, is still on its way, or still repeats the unstable one. The cycle is where 13 times the angle is no
+    longer turned back or on.
+    """
     maps, at = Locked(), Section(np.zeros((1, 6)), np.ones(1, np.int32), np.ones(1))
     at.y[0, :2] = 4 + 0.5 * np.cos(start), 0.5 * np.sin(start)
     _, states = maps.path(np.zeros(1, int), at, TRACED)
@@ -583,6 +588,37 @@ def test_a_torus_that_is_not_locked_closes_in_on_nothing():
     )
     for found_by in (cycles_repeated, cycles_closed_in_on):
         assert found_by(Locked(), np.zeros(1, int), {0: states}, [[]]) == []  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_next_to_the_unstable_cycle_of_a_locked_torus_the_stable_one_is_found():
+    """Kicks of both sizes come to the unstable cycle of 208 crossings first. Of the stable one, a grazing is so near that
+    differences have to be taken over less; its multiplier is that of another integrator.
+    """
+    structure = fj.Structure(
+        [
+            [0.7070662357877854, 0.0, -0.006746281265475348],
+            [0.0, 0.6419132833617491, 0.0],
+            [-0.006746281265475348, 0.0, 0.06529477014552923],
+        ],
+        [
+            [1.6821868568496174, -0.02449314629562967, 0.006813357983673492],
+            [-0.02449314629562967, 2.3304109220027978, -2.330282204192117],
+            [0.006813357983673492, -2.330282204192117, 2.330339308112618],
+        ],
+        [
+            [98327.94221429605, -1075.3619552536225, 41.9153404899364],
+            [-1075.3619552536225, 102315.7750083124, -102310.1237034576],
+            [41.9153404899364, -102310.1237034576, 102315.33444426191],
+        ],
+        [0.0, -1.0, 0.0],
+        contacts=[fj.ContactPoint(0, 2)],
+    )
+    scene = fj.Scene(structure, fj.Coulomb(0.2916127031220737), 3.488721450619412, fj.Pulse(100.0, 1.2))
+    m = fj.bistability_map(scene, p=[0.0, 3.0], progress=False)
+    assert m["attractor_kind"].values.tolist() == ["periodic"]
+    np.testing.assert_allclose(m["attractor_period"], 3.5634084078, rtol=1e-9)
+    np.testing.assert_allclose(m["attractor_multiplier"], 0.84176, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
