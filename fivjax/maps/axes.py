@@ -30,7 +30,8 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
         hint = " Give the scene a Pulse as its load." if unknown[0] in ("p", "duration", "start") else ""
         hint = hint or arguments.did_you_mean(unknown[0], scene.parameters)
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
-    checked = {name: arguments.axis(name, values) for name, values in axes.items()}
+    # Names may be NumPy's strings, such as those of a dataset's coordinates.
+    checked = {str(name): arguments.axis(name, values) for name, values in axes.items()}
     check_corners(scene, checked)
     return checked
 

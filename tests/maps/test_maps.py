@@ -140,7 +140,7 @@ def test_maps_over_other_axes_need_no_other_kernels(paper_scene):
     before, scene = kernels(), paper_scene.replace(mu=0.2, p=1.3)
     found = [
         fj.bistability_map(scene, belt_speed=[2.0, 3.0], duration=[0.1, 0.2], progress=False),
-        fj.bistability_map(scene, k1=[9e4, 1e5], m1=[0.5, 0.53], progress=False),
+        fj.bistability_map(scene, **{np.str_("k1"): [9e4, 1e5], "m1": [0.5, 0.53]}, progress=False),
     ]
     assert before and kernels() == before
     assert all(np.all(m["verdict"] >= 0) for m in found)
