@@ -88,12 +88,27 @@ class Catalogue(NamedTuple):
         for g, cycle in new:
             if self.of_group[g].with_cycle(self.maps, cycle) is cycle:
                 added.append((g, cycle))
-        if not self.from_afar or not added:
+        if self.from_afar:
+            self._add_approaches(added)
+
+    def add_approaches(self, groups: list[int]) -> None:
+        """Adds the approaches to those cycles of many crossings of these groups that have none."""
+        known = [(g, self.of_group[g]) for g in groups]
+        have = [one.cycle for _, of_group in known for one in of_group.approaches]
+        self._add_approaches(
+            [
+                (g, cycle)
+                for g, of_group in known
+                for cycle in of_group.cycles
+                if len(cycle.points) > CROSSINGS and not any(cycle is one for one in have)
+            ]
+        )
+
+    def _add_approaches(self, to: list[tuple[int, StableCycle]]) -> None:
+        if not to:
             return
-        groups = np.array([g for g, _ in added])
-        for g, one in zip(
-            groups.tolist(), approaches(self.maps, groups, [c for _, c in added], self.report), strict=True
-        ):
+        groups = np.array([g for g, _ in to])
+        for g, one in zip(groups.tolist(), approaches(self.maps, groups, [c for _, c in to], self.report), strict=True):
             if one is not None:
                 self.of_group[g].approaches.append(one)
         for g in np.unique(groups).tolist():

@@ -145,14 +145,16 @@ class Capture:
         if not proving:
             chaotic[asks] = long_divergence(self.maps, motions).chaotic
             return Late(chaotic, {}, none, now)
-        for g in np.unique(motions.group).tolist():
-            if g not in self.known_at_last:
-                self.known_at_last[g] = self.known[g].copy()
+        catalogue = self._catalogue(self.maps, self.known_at_last)
+        new = [g for g in np.unique(motions.group).tolist() if g not in self.known_at_last]
+        self.known_at_last.update((g, self.known[g].copy()) for g in new)
+        # On a locked torus some motions are next to its unstable cycle for very long.
+        catalogue.add_approaches(new)
 
         def slides(motions: Motions) -> Bool[np.ndarray, " r"]:
             return bounds(self.batch, *motions) < 1
 
-        found = fates(self._catalogue(self.maps, self.known_at_last), motions, slides)
+        found = fates(catalogue, motions, slides)
         chaotic[asks] = found.chaotic
         sliding = np.flatnonzero(found.without_events)
         if len(sliding):

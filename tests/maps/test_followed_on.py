@@ -241,3 +241,17 @@ def test_what_passes_by_where_a_cycle_was_slides_once_it_has_faded():
     with pytest.raises(fj.NoLimitCycle) as error:
         fj.limit_cycle(scene.replace(mu=0.16795))
     assert "stayed in motion" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_next_to_the_unstable_cycle_of_a_locked_torus_motions_are_captured_for_the_stable_one(paper_scene):
+    """A single kick comes so near to the unstable cycle that it is next to it for longer than it is followed."""
+    scene = paper_scene.replace(mu=0.20017391304347826, p=1.7826086956521738, belt_speed=3.0)
+    m = fj.bistability_map(scene, p=[1.7826086956521738], progress=False)
+    assert m["verdict"].values.tolist() == [fj.Verdict.LIMIT_CYCLE] and m["proof"].values.tolist() == [
+        fj.Proof.APPROACH
+    ]
+    cycle = fj.limit_cycle(scene)
+    np.testing.assert_allclose(
+        [m["attractor_period"][0], m["amplitude"][0]], [cycle.period, cycle.amplitude], rtol=1e-7
+    )
