@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from ..foundation.digits import apart
-from .file_matrix import FileMatrix, Label, from_entries, text_of
+from .file_matrix import FileMatrix, Label, from_entries, integer, real, text_of
 
 
 def matrices(path: Path) -> dict[str, FileMatrix]:
@@ -152,18 +152,8 @@ def _table(place: str, numbers: list[int], lines: list[str]) -> np.ndarray:
             raise ValueError(
                 f"{place}, line {number}: {len(rows[0])} entries expected, {len(entries)} found. Mend the line."
             )
-        rows.append([_number(f"{place}, line {number}", entry) for entry in entries])
+        rows.append([real(f"{place}, line {number}", entry) for entry in entries])
     return np.array(rows)
-
-
-def _number(place: str, entry: str) -> float:
-    try:
-        value = float(entry.replace("D", "E").replace("d", "e"))
-    except ValueError:
-        raise ValueError(f"{place}: {entry!r} is no number. Write the file again, or mend the line.") from None
-    if not np.isfinite(value):
-        raise ValueError(f"{place}: must be finite, but is {entry}. Write the file again.")
-    return value
 
 
 def _whole(place: str, numbers: np.ndarray, lines: list[str], labels: np.ndarray) -> None:
@@ -192,7 +182,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
             if words.upper().startswith("ELEMENT NODES"):
                 listing = True
             elif listing and words:
-                nodes += [_integer(here, entry) for entry in _entries(words)]
+                nodes += [integer(here, entry) for entry in _entries(words)]
             continue
         listing = False
         if stripped.startswith("*"):
@@ -200,7 +190,7 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
             if keyword == "USER ELEMENT":
                 if count:
                     raise ValueError(f"{here}: a second element begins. Give one substructure in a file.")
-                count = _integer(here, options.get("NODES", ""))
+                count = integer(here, options.get("NODES", ""))
                 symmetric, reading = "UNSYMM" not in options, "directions"
             elif keyword == "MATRIX":
                 reading = options.get("TYPE", "")
@@ -210,12 +200,12 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
             else:
                 reading = ""  # load vectors and recovery matrices are not needed
         elif reading == "directions":
-            entries = [_integer(here, entry) for entry in _entries(stripped)]
+            entries = [integer(here, entry) for entry in _entries(stripped)]
             # The first line is for the first node; each later one begins with the number of the first node that it is for.
             first = 1 if not directions else entries[0]
             directions[first] = entries if not directions else entries[1:]
         elif reading:
-            values[reading] += [_number(here, entry) for entry in _entries(stripped)]
+            values[reading] += [real(here, entry) for entry in _entries(stripped)]
     if len(nodes) != count:
         raise ValueError(
             f"{place} must list its {count} nodes under `** ELEMENT NODES`, but lists {len(nodes)}. Write it again."
@@ -241,13 +231,6 @@ def _substructure(path: Path, text: str) -> dict[str, FileMatrix]:
         )
         for name, numbers in values.items()
     }
-
-
-def _integer(place: str, entry: str) -> int:
-    try:
-        return int(entry)
-    except ValueError:
-        raise ValueError(f"{place}: {entry!r} is no whole number. Write the file again, or mend the line.") from None
 
 
 def _fill(place: str, values: list[float], size: int, symmetric: bool) -> sparse.csr_array:

@@ -1,5 +1,6 @@
 """A matrix as a file gives it, with the node and direction of its rows; and how it is made from single entries."""
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +52,30 @@ def text_of(path: Path) -> str:
     if b"\0" in content:
         raise ValueError(f"File `{path}` is not text: byte {content.index(0)} is zero. Write it as text, or again.")
     return content.decode("utf-8", errors="replace")
+
+
+def integer(place: str, field: str) -> int:
+    """The whole number in a field of a file, at this place."""
+    try:
+        return int(field)
+    except ValueError:
+        raise ValueError(f"{place}: {field!r} is no whole number. Write the file again, or mend the line.") from None
+
+
+def real(place: str, field: str) -> float:
+    """The finite number in a field of a file, at this place."""
+    try:
+        value = float(fortran_number(field))
+    except ValueError:
+        raise ValueError(f"{place}: {field!r} is no number. Write the file again, or mend the line.") from None
+    if not np.isfinite(value):
+        raise ValueError(f"{place}: must be finite, but is {field}. Write the file again.")
+    return value
+
+
+def fortran_number(field: str) -> str:
+    """A number as Fortran writes it, as others do: it may have a D for the E, or leave it out; 1.5+3 is 1500."""
+    return re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", field.upper().replace("D", "E"))
 
 
 def from_entries(

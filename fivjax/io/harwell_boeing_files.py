@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from .file_matrix import FileMatrix, text_of
+from .file_matrix import FileMatrix, fortran_number, text_of
 from .reading_limits import check_rows
 
 # How much of a file tells whether it is one; digits of the longest number in its header.
@@ -113,15 +113,14 @@ def _numbers(place: str, lines: list[str], fields: tuple[int, int], kind: type, 
     """The numbers of some lines at this place, in `fields`: so many of one width."""
     # No line has more fields than characters.
     count, width = min(fields[0], max(map(len, lines), default=0)), fields[1]
-    words = " ".join(lines).upper().replace("D", "E").split()
+    words = " ".join(lines).split()
     if len(words) != wanted:  # fields that touch each other
         fields_read = (line[k * width : (k + 1) * width] for line in lines for k in range(count))
-        words = [field.upper().replace("D", "E").strip() for field in fields_read if field.strip()]
+        words = [field.strip() for field in fields_read if field.strip()]
     if len(words) != wanted:
         raise ValueError(f"{place}: {wanted} numbers expected, {len(words)} found. Write it again.")
-    # Fortran leaves out the E before an exponent of three digits.
-    words = words if kind is int else [re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", word) for word in words]
     try:
-        return np.array([kind(word) for word in words], np.int64 if kind is int else np.float64)
+        numbers = list(map(int, words)) if kind is int else [float(fortran_number(word)) for word in words]
+        return np.array(numbers, np.int64 if kind is int else np.float64)
     except (ValueError, OverflowError) as error:
         raise ValueError(f"{place}: {error}. Write it again.") from None

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from . import sparse_parts
-from .file_matrix import FileMatrix, Label, from_entries, text_of
+from .file_matrix import FileMatrix, Label, from_entries, integer, real, text_of
 from .separate_reading import parts_of
 
 SQUARE, SYMMETRIC = 1, 6
@@ -63,7 +63,7 @@ def dmig(path: Path) -> dict[str, FileMatrix | str]:
 
 def _form(here: str, name: str, fields: list[str]) -> int | str:
     """The form of a matrix by its header, or why it is not read."""
-    form, kind = (_integer(here, field) for field in fields[2:4])
+    form, kind = (integer(here, field) for field in fields[2:4])
     if form not in (SQUARE, SYMMETRIC):
         return (
             f"{here}: matrix `{name}` has form {form} (rectangular), but mass, damping and stiffness are square (1) or "
@@ -88,7 +88,7 @@ def _column(here: str, line: int, fields: list[str]) -> list[tuple]:
         group = [*rest[start : start + 4], "", "", ""][:4]
         if not group[2]:
             raise ValueError(f"{here}: the entry of {column} ends before its value. Write the file again.")
-        entries.append((_label(here, group[0], group[1]), column, _real(here, group[2]), line))
+        entries.append((_label(here, group[0], group[1]), column, real(here, group[2]), line))
     if not entries:
         raise ValueError(f"{here}: the column of {column} has no entries. Write the file again.")
     return entries
@@ -129,26 +129,7 @@ def _fields(here: str, line: str) -> list[str]:
 
 
 def _label(here: str, node: str, direction: str) -> Label:
-    return Label(_integer(here, node), _integer(here, direction or "0"))
-
-
-def _integer(here: str, field: str) -> int:
-    try:
-        return int(field)
-    except ValueError:
-        raise ValueError(f"{here}: {field!r} is no whole number. Write the file again, or mend the line.") from None
-
-
-def _real(here: str, field: str) -> float:
-    # Nastran leaves out the E, and may write D for it: 1.5+3 is 1500.
-    text = re.sub(r"(?<=[\d.])([+-]\d+)$", r"E\1", field.upper().replace("D", "E"))
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"{here}: {field!r} is no number. Write the file again, or mend the line.") from None
-    if not np.isfinite(value):
-        raise ValueError(f"{here}: must be finite, but is {field}. Write the file again.")
-    return value
+    return Label(integer(here, node), integer(here, direction or "0"))
 
 
 def output4(path: Path) -> dict[str, FileMatrix]:
