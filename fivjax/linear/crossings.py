@@ -72,6 +72,8 @@ def first_limit(loop: Loop) -> Limit:
     # A mode without damping lies on the imaginary axis already at gain zero, which is no crossing.
     marginal = jnp.max(eigenvalues(state).real) > -1e-11
     usable = usable & ~(marginal & (codes == FLUTTER) & (inverse_gain * typical > 1e5))
+    # With damping, undamped modes that meet say nothing; but they may do so at the very gain of a crossing: where it is equal.
+    usable = usable & (marginal | (codes != COALESCENCE))
     gains = jnp.where(usable, 1 / jnp.where(usable, inverse_gain, 1.0), jnp.inf)
     gains, omega, codes = jax.lax.sort((gains, omega, codes), num_keys=1)
 
