@@ -13,7 +13,7 @@ from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
 from ..io.datasets import labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
-from ..maps.crossing import NO_KICK, FirstCrossing, first_crossings, with_ends
+from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..maps.datasets import time_limit
 from ..maps.engine import RunOptions, run_to_verdict
 from ..maps.executors import with_workers
@@ -234,8 +234,8 @@ def _to_narrow(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> t
 
 def _hidden(scan: np.ndarray, verdicts: np.ndarray, seen: FirstCrossing) -> np.ndarray:
     """Whether undecided kicks outside the bracket might hide another change."""
-    inside = (scan > seen.low[:, None]) & (scan < seen.high[:, None])
-    return np.any((verdicts < 0) & ~inside & (scan != NO_KICK), axis=1)
+    inside, no_kick = (scan > seen.low[:, None]) & (scan < seen.high[:, None]), scan == 1.0
+    return np.any((verdicts < 0) & ~inside & ~no_kick, axis=1)
 
 
 def _narrowed(

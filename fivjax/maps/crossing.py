@@ -6,9 +6,6 @@ import numpy as np
 
 from ..verdicts.verdict import Verdict
 
-# The value of p that is no kick.
-NO_KICK = 1.0
-
 
 class FirstCrossing(NamedTuple):
     """The first change from sliding to limit cycle in each row of verdicts; arrays over rows, NaN where there is none."""
@@ -32,9 +29,7 @@ def with_ends(inner: np.ndarray) -> np.ndarray:
 def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> FirstCrossing:
     """The first crossing of each row of `verdicts` (rows, kicks) at `kicks` (one row for all, or one for each).
 
-    If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle. The same holds if only an
-    undecided kick of `NO_KICK` comes before it: without a kick there is no motion, and an unstable equilibrium is not proved to
-    slide.
+    If already the first kick of a row ends on the limit cycle, that kick is `high` and the middle.
     """
     kicks = np.broadcast_to(kicks, verdicts.shape)
     low, high, middle = (np.full(len(verdicts), np.nan) for _ in range(3))
@@ -49,8 +44,7 @@ def first_crossings(kicks: np.ndarray, verdicts: np.ndarray) -> FirstCrossing:
         upward = flips[found[flips] == Verdict.SLIDING]
         if found[0] == Verdict.LIMIT_CYCLE:
             high[row] = p[decided[0]]
-            from_the_start = decided[0] == 0 or (decided[0] == 1 and p[0] == NO_KICK)
-            middle[row] = p[0] if from_the_start else np.nan
+            middle[row] = p[0] if decided[0] == 0 else np.nan
         elif len(upward):
             below, above = decided[upward[0]], decided[upward[0] + 1]
             low[row], high[row] = p[below], p[above]
