@@ -1,6 +1,7 @@
 """Where steady sliding loses its stability: critical friction and critical slope of the friction law."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -96,8 +97,17 @@ def _friction_limit(structure, direction):
     return first_limit(friction_loop(structure, direction)[0]).gain
 
 
+def _by_its_parameters(limit):
+    """The limit of a structure as it was given, so that its parameters' way into the matrices is differentiated with it."""
+    return lambda structure, direction: limit(matrices_only(in_contact_coordinates(structure)), direction)
+
+
+_LIMITS = _friction_limit, critical_friction_of_several
 _critical_friction = kept(with_own_gradient(_friction_limit, _is_a_limit))
 _critical_friction_of_several = compiled(with_own_gradient(critical_friction_of_several, _is_a_limit))
+_traced_limit, _traced_limit_of_several = (
+    compiled(with_own_gradient(_by_its_parameters(limit), _is_a_limit)) for limit in _LIMITS
+)
 
 
 @returning_numpy
@@ -127,9 +137,11 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
         0.2282253477
     """
     own = _checked(structure, direction)
-    if not one_contact(structure):
-        return _critical_friction_of_several(*_several(own, direction))
-    return _critical_friction(matrices_only(structure), jnp.asarray(float(direction)))
+    traced, along = not all(map(is_known, jax.tree.leaves(structure))), jnp.asarray(float(direction))
+    if one_contact(structure):
+        return _traced_limit(structure, along) if traced else _critical_friction(matrices_only(structure), along)
+    matrices, along = _several(own, direction)
+    return _traced_limit_of_several(structure, along) if traced else _critical_friction_of_several(matrices, along)
 
 
 @compiled

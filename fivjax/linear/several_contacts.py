@@ -84,7 +84,8 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     largest, count = 2.0, 400
     looks = jnp.linspace(0.0, largest, count + 1)
     unstable = jax.lax.map(lambda mu: _growth(structure, mu, direction) > 0, looks, batch_size=50)
-    place = jnp.argmax(unstable)
+    # Not by `argmax`, which has another type where a program in single precision compiles it.
+    place = jnp.min(jnp.where(unstable, np.arange(count + 1, dtype=np.int32), np.int32(count)))
     found, always = jnp.any(unstable), unstable[0] | unstable[1] & _nearly_at_zero(structure, direction)
 
     def bisect(_, ends):
@@ -99,7 +100,7 @@ def first_limit_of_several(structure: Structure, direction: Float[Array, " c"]):
     low, high = jax.lax.fori_loop(0, halvings, bisect, ends)
     mu = jnp.where(always, 0.0, jnp.where(found, 0.5 * (low + high), jnp.inf))
     values = eigenvalues(sliding_state_matrix(structure, direction * high, jnp.zeros_like(direction)))
-    omega = jnp.abs(values[jnp.argmax(values.real)].imag)
+    omega = jnp.max(jnp.where(values.real == jnp.max(values.real), jnp.abs(values.imag), 0.0))
     undamped = jnp.all(structure.damping == 0)
     flutter = jnp.where(undamped, COALESCENCE, FLUTTER)
     code = jnp.where(omega > 1e-6 * time_scale_of(structure, slice(None)), flutter, DIVERGENCE)

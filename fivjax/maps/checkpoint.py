@@ -24,7 +24,7 @@ from ..attractors.catalogue import Attractors
 from ..foundation.seals import Damaged, sealed, unsealed
 from ..io.files import check_writable, replace_whole
 from ..verdicts.verdict import Verdict
-from .job_files import attractors_from_bytes, attractors_to_bytes, file_of
+from .job_files import attractors_from_bytes, attractors_to_bytes, file_of, runs_of
 from .plan import Indices
 from .results import Verdicts, by_name, not_run
 
@@ -65,7 +65,11 @@ class Checkpoint:
         self._places, self._more = np.zeros(0, np.int64) if total is None else None, []
         self._new, self._done, self._took = False, [], 0.0
         kept = read_checkpoint(path, run)
-        if kept is not None:
+        if kept is None:
+            # Interrupted before its first job was done: nothing else is left of a run.
+            for theirs in runs_of(self._jobs):
+                refuse_other_run(f"What is kept in `{self._jobs}`", theirs, run)
+        else:
             if self._places is not None:
                 self._places = kept.results[PLACE]
                 self.verdicts = not_run(len(self._places), energy)

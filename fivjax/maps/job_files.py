@@ -185,6 +185,16 @@ def state_from_bytes(content: bytes, key: str) -> JobState | None:
 
 def file_of(folder: Path, run: dict, places: Indices) -> tuple[str, str]:
     """The path and the key of the file, in this folder, for the job of this run with these trajectories."""
-    key = hashlib.sha256(json.dumps(run).encode() + np.asarray(places, np.int64).tobytes()).hexdigest()
+    job = hashlib.sha256(np.asarray(places, np.int64).tobytes()).hexdigest()
     # Workers may have another working directory.
-    return str(folder.absolute() / f"{int(places[0])}.job"), key
+    return str(folder.absolute() / f"{int(places[0])}.job"), json.dumps({"run": run, "job": job})
+
+
+def runs_of(folder: Path) -> list[dict]:
+    """The runs that the files of jobs in a folder belong to; damaged ones say nothing."""
+    found = []
+    for path in sorted(folder.glob("*.job")):
+        with contextlib.suppress(OSError, Damaged, ValueError, KeyError):
+            file = np.load(io.BytesIO(unsealed(path.read_bytes())), allow_pickle=False)
+            found.append(json.loads(json.loads(file["head"].tobytes())["key"])["run"])
+    return found

@@ -703,3 +703,36 @@ def test_what_friction_moves_ever_further_has_no_limit_of_steady_sliding():
     for limit_of in (fj.cea.critical_friction, fj.cea.stability_limit):
         with pytest.raises(ValueError, match="friction moves a part of the structure that no spring holds"):
             limit_of(with_a_free_mass(tangential=2))
+
+
+@pytest.mark.parametrize("damping", [2.0, 20.0])
+def test_damping_in_proportion_to_mass_has_the_derivatives_of_flutter(damping):
+    """The modes of the undamped structure meet at the very frequency of flutter, which by rounding was taken for the limit."""
+
+    def limit(k, c1, c2):
+        stiffness = jnp.array([[k, -3e3, 0.0], [-3e3, 1e4, -2e3], [0.0, -2e3, 9e3]])
+        structure = fj.Structure(jnp.eye(3), jnp.diag(jnp.array([c1, c2, 0.0])), stiffness, [0.0, -1.0, 0.0])
+        return fj.cea.critical_friction(structure)
+
+    def by_hand(k, c):
+        # The product of the couplings, 3e3 and 2e3 μ - 3e3, is the square of half the distance of the modes, and of damping.
+        return ((((k - 1e4) / 2) ** 2 + c**2 * (k + 1e4) / 2) / 3e3 + 3e3) / 2e3
+
+    with jax.enable_x64(True):
+        mu, slopes = jax.value_and_grad(limit, (0, 1, 2))(12e3, damping, damping)
+    exact = by_hand(12e3, damping), (1000.0 + damping**2 / 2) / 6e6, 2 * damping * 11e3 / 6e6
+    assert float(mu) == pytest.approx(exact[0], rel=1e-10)
+    assert float(slopes[0]) == pytest.approx(exact[1], rel=1e-8)
+    assert float(slopes[1]) + float(slopes[2]) == pytest.approx(exact[2], rel=1e-8)
+
+
+def test_a_function_of_parameters_is_differentiated_in_a_program_in_single_precision():
+    def matrices(k, c):
+        stiffness = jnp.array([[k, -3e3, 0.0], [-3e3, 1e4, -2e3], [0.0, -2e3, 9e3]])
+        return jnp.eye(3), jnp.diag(jnp.array([c, c, c])), stiffness, jnp.array([0.0, -1.0, 0.0])
+
+    structure = fj.Structure.from_parameters(matrices, dict(k=12e3, c=2.0), tangential=0, normal=2)
+    with jax.enable_x64(False):
+        slope = jax.grad(lambda c: fj.cea.critical_friction(structure.replace(c=c)))(2.1)
+    ahead, behind = (float(fj.cea.critical_friction(structure.replace(c=2.1 + h))) for h in (1e-3, -1e-3))
+    assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=1e-5)

@@ -141,3 +141,19 @@ def test_up_to_the_reach_no_contact_of_several_lifts_off():
             normal = forces * (1 + 0.999999 * reach * np.array(loads))
             assert np.all(np.linalg.solve(np.eye(2) + handed_on * change, normal) > 0)
     assert bounded > 5
+
+
+def test_the_limit_of_several_contacts_is_compiled_within_a_program_in_single_precision():
+    one = fj.belt_oscillator()
+    mass, damping, stiffness = (np.kron(np.eye(2), np.asarray(part)) for part in (one.mass, one.damping, one.stiffness))
+    spring = np.zeros((6, 6))
+    spring[np.ix_((0, 3), (0, 3))] = [[1, -1], [-1, 1]]
+    contacts, load = [fj.ContactPoint(0, 2), fj.ContactPoint(3, 5)], np.tile(np.asarray(one.load_direction), 2)
+
+    def limit(k):
+        return fj.cea.critical_friction(fj.Structure(mass, damping, stiffness + k * spring, load, contacts=contacts))
+
+    with jax.enable_x64(False):
+        found = jax.jit(jax.value_and_grad(limit))(500.0)
+    assert float(found[0]) == pytest.approx(float(limit(500.0)), rel=1e-5)
+    assert float(found[1]) == pytest.approx(float(limit(501.0) - limit(499.0)) / 2, rel=1e-4)

@@ -100,6 +100,28 @@ def test_an_interrupted_job_goes_on_from_where_it_was(paper_scene, whole, tmp_pa
     assert {entry.name for entry in tmp_path.iterdir()} == {"map.part", "whole.part"}
 
 
+def test_what_is_left_of_another_maps_first_job_is_refused_and_stays(paper_scene, whole, tmp_path, monkeypatch):
+    """Interrupted before its first job was done, a map has no checkpoint yet: only the file of the job says whose it is."""
+    real, made = TrajectoryKernels.follow, []
+
+    def stopping(*args):
+        made.append(1)
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(TrajectoryKernels, "follow", stopping)
+    path = tmp_path / "map.part"
+    with pytest.warns(UserWarning, match="Interrupted"):
+        fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.part.jobs"]
+    kept = {file.name: file.read_bytes() for file in (tmp_path / "map.part.jobs").iterdir()}
+    with pytest.raises(ValueError, match=r"map.part.jobs` is of another run: its `mu` is"):
+        fj.bistability_map(paper_scene, progress=False, resume=path, **(AXES | {"mu": [0.1, 0.2]}))
+    assert kept == {file.name: file.read_bytes() for file in (tmp_path / "map.part.jobs").iterdir()}
+    assert same(fj.bistability_map(paper_scene, progress=False, resume=path, **AXES), whole)
+
+
 def test_the_state_of_a_job_comes_back_from_its_file_bit_for_bit(tmp_path):
     """And is not that of another job, nor of another run."""
     rng, folder = np.random.default_rng(0), tmp_path / "map.part.jobs"
