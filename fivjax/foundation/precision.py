@@ -15,7 +15,7 @@ Two consequences are dealt with here:
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.core
@@ -68,6 +68,36 @@ def known_to_numpy(leaf):
         # 0-d arrays become NumPy scalars, which print as numbers and do arithmetic in float64.
         return np.asarray(leaf)[()]
     return leaf
+
+
+class _Double(NamedTuple):
+    """A JAX array on its way through a pickle, which would bring it back in single precision."""
+
+    numbers: np.ndarray
+
+
+def state_for_pickle(self) -> dict:
+    """The fields of a module, as its `__getstate__`: in a pickle, and in a copy, its JAX arrays keep their precision."""
+
+    def kept(leaf):
+        known = isinstance(leaf, jax.Array) and is_known(leaf)
+        return _Double(np.asarray(leaf)) if known else leaf
+
+    return {name: jax.tree.map(kept, value) for name, value in vars(self).items()}
+
+
+def state_from_pickle(self, state: dict) -> None:
+    """The fields again, as its `__setstate__`."""
+
+    def is_double(leaf) -> bool:
+        return isinstance(leaf, _Double)
+
+    def restored(leaf):
+        return jnp.asarray(leaf.numbers) if is_double(leaf) else leaf
+
+    with own_settings():
+        for name, value in state.items():
+            object.__setattr__(self, name, jax.tree.map(restored, value, is_leaf=is_double))
 
 
 def is_known(value) -> bool:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
-from ..foundation.precision import in_double_precision, is_known, real
+from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from ..foundation.smoothness import is_smooth
 from ..foundation.taylor import composed, taylor_coefficients
 from .printing import as_call
@@ -48,6 +48,8 @@ class AbstractFriction(eqx.Module):
 
     `docs/extending.md` shows how to write a law of your own.
     """
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     # Constant friction makes the motion in every status linear; exact methods rest on that.
     constant: ClassVar[bool] = False

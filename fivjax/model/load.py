@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.digits import apart
-from ..foundation.precision import in_double_precision, is_known, real
+from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from .printing import as_call
 
 
@@ -34,6 +34,8 @@ class AbstractLoad(eqx.Module):
 
     `docs/extending.md` shows how to write a load of your own.
     """
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     # Before the first jump, in N: a run starts from sliding equilibrium under this load.
     force: eqx.AbstractVar[Float[Array, ""]]

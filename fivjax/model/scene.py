@@ -14,7 +14,15 @@ from ..foundation import arguments
 from ..foundation.digits import apart
 from ..foundation.linear_solve import solve
 from ..foundation.numpy_evaluation import by_numpy
-from ..foundation.precision import in_double_precision, is_known, real, real_if_real, returning_numpy
+from ..foundation.precision import (
+    in_double_precision,
+    is_known,
+    real,
+    real_if_real,
+    returning_numpy,
+    state_for_pickle,
+    state_from_pickle,
+)
 from . import description
 from .contact_coordinates import in_contact_coordinates, transformation
 from .delassus_matrix import delassus, has_one_solution
@@ -49,6 +57,8 @@ class Scene(eqx.Module):
         >>> float(scene.replace(mu=0.2, k1=98e3).parameters["mu"])
         0.2
     """
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     structure: Structure
     friction: AbstractFriction
@@ -94,17 +104,31 @@ class Scene(eqx.Module):
         self.load = own_load
         self.restitution = real(restitution)
         self.impact_law = impact_law
+        whose: dict[str, str] = {}
+        for part, parameters in self._parameters_of_parts().items():
+            for name in parameters:
+                if name in whose:
+                    raise ValueError(
+                        f"Parameter `{name}` of the {part} has the name of one of the {whose[name]}, so `replace` and the axes "
+                        f"of maps could not tell them apart. Give it another name."
+                    )
+                whose[name] = part
 
     @property
     def parameters(self) -> dict[str, Array]:
         """Every numeric parameter by the name that `replace` and the axes of a map know it by."""
-        found = {"belt_speed": self.belt_speed, "restitution": self.restitution}
+        return {name: value for own in self._parameters_of_parts().values() for name, value in own.items()}
+
+    def _parameters_of_parts(self) -> dict[str, dict[str, Array]]:
+        # Other fields of a user's own law, such as strings and switches, are no parameters.
+        friction, load = (
+            {name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)}
+            for part in (self.friction, self.load)
+        )
         if isinstance(self.friction, FrictionPerContact):
-            found.update(self.friction.parameters)
-        for part in (self.friction, self.load):
-            # Other fields of a user's own law, such as strings and switches, are no parameters.
-            found.update({name: value for name, value in vars(part).items() if eqx.is_inexact_array(value)})
-        return {**found, **self.structure.parameters}
+            friction = {**self.friction.parameters, **friction}
+        own = {"belt_speed": self.belt_speed, "restitution": self.restitution}
+        return {"scene": own, "friction law": friction, "load": load, "structure": self.structure.parameters}
 
     @in_double_precision
     def replace(self, **changes) -> "Scene":

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..foundation.linear_solve import product
+from ..foundation.precision import state_for_pickle, state_from_pickle
 
 
 class Springs(eqx.Module):
@@ -13,6 +14,8 @@ class Springs(eqx.Module):
     A structure may be free to move as a whole. In $Kq$ its stiff springs then cancel only to rounding; far from the origin this
     leaves a force that pulls it back. The stretches $Bq$ of a rigid motion are zero, and so are the forces computed from them.
     """
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     stretch: Float[Array, "n n"]  # B, how displacements stretch the springs
     rates: Float[Array, " n"]  # k, N/m; exactly zero where the structure is free

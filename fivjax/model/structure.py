@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..foundation import arguments
 from ..foundation.numpy_evaluation import by_numpy
-from ..foundation.precision import in_double_precision, is_known, real
+from ..foundation.precision import in_double_precision, is_known, real, state_for_pickle, state_from_pickle
 from .contact_point import ContactPoint, directions, resolve_contacts
 from .matrix_checks import check_matrix, check_names, check_shapes
 from .printing import as_call
@@ -36,6 +36,8 @@ class Matrices(NamedTuple):
 
 class FromParameters(eqx.Module):
     """Parameters by name, and the function from them to the matrices."""
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     values: dict[str, Float[Array, "..."]]
     names: tuple[str, ...] = eqx.field(static=True)  # in the order that they were given in, which JAX does not keep
@@ -125,6 +127,8 @@ class Structure(eqx.Module):
         >>> block.size
         2
     """
+
+    __getstate__, __setstate__ = state_for_pickle, state_from_pickle
 
     # The matrices, or the parameters that they follow from. Everything else is read from here.
     source: "Matrices | FromParameters"

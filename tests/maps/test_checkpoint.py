@@ -111,6 +111,7 @@ def test_what_is_left_of_another_maps_first_job_is_refused_and_stays(paper_scene
         return real(*args)
 
     monkeypatch.setattr(TrajectoryKernels, "follow", stopping)
+    monkeypatch.setattr(job_files, "KEEP_EVERY", 0.0)
     path = tmp_path / "map.part"
     with pytest.warns(UserWarning, match="Interrupted"):
         fj.bistability_map(paper_scene, progress=False, resume=path, **AXES)

@@ -1,6 +1,8 @@
 """Friction laws, loads, and scenes: Eqs. 1 and 14, the sliding equilibrium of Eq. 3, and what is refused."""
 
+import copy
 import math
+import pickle
 import re
 
 import jax
@@ -404,3 +406,28 @@ def test_painleve_friction_is_the_same_for_the_mirrored_belt():
 def test_painleve_friction_is_infinite_without_coupling():
     """Without inertial coupling of normal and tangential motion there is no Painlevé limit."""
     assert fj.painleve_friction(fj.belt_oscillator(theta=0.0)) == math.inf
+
+
+def test_a_name_that_two_parts_share_is_refused():
+    """`replace` and the axes of maps would have changed both."""
+
+    def matrices(mu, c):
+        return jnp.eye(2), c * jnp.eye(2), mu * jnp.eye(2), jnp.array([0.0, -1.0])
+
+    structure = fj.Structure.from_parameters(matrices, dict(mu=1e4, c=1.0), tangential=0, normal=1)
+    with pytest.raises(ValueError, match="Parameter `mu` of the structure has the name of one of the friction law"):
+        fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.Pulse(10.0, 1.2))
+
+
+@pytest.mark.parametrize("again", [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy])
+def test_a_scene_comes_back_from_a_pickle_to_the_last_bit(again):
+    """Also in a program in single precision, where JAX's arrays do not."""
+    laws = [fj.Coulomb(0.227, 0.3), fj.ExponentialDecay(0.2, 0.1, 0.5)]
+    scenes = [fj.Scene(fj.belt_oscillator(m1=0.1 + 0.2), law, 1 / 3, fj.Pulse(100.0, 1.3)) for law in laws]
+    with jax.enable_x64(False):
+        for scene in scenes:
+            found = again(scene)
+            for name, value in scene.parameters.items():
+                assert found.parameters[name].dtype == value.dtype and float(found.parameters[name]) == float(value)
+            np.testing.assert_array_equal(found.structure.stiffness, scene.structure.stiffness)
+            assert jax.tree.structure(found) == jax.tree.structure(scene)
