@@ -60,6 +60,8 @@ def whole_number(name: str, value, *, minimum: int) -> None:
 def numeric_array(name: str, value) -> np.ndarray:
     """`value` as a NumPy array of real numbers, or a sentence about what it is instead."""
     known(name, value)
+    if hasattr(value, "toarray"):
+        raise TypeError(f"Argument `{name}` must be an array, but is {describe(value)}: give it as `.toarray()`.")
     try:
         array = np.asarray(value)
     except (ValueError, TypeError):

@@ -67,7 +67,8 @@ def _checked(structure: Structure, direction) -> Structure:
     """
     from scipy import linalg
 
-    arguments.instance("structure", structure, Structure, "a Structure, such as belt_oscillator()")
+    what = "a Structure, such as belt_oscillator()"
+    arguments.instance("structure", structure, Structure, f"{what}, or `scene.structure`")
     check_direction(direction)
     own = in_contact_coordinates(structure)
     if all(map(is_known, own.matrices)):

@@ -139,9 +139,11 @@ class Scene(eqx.Module):
         """
         unknown = [name for name in changes if name not in self.parameters]
         if unknown:
+            hint = arguments.did_you_mean(unknown[0], self.parameters)
+            if unknown[0] in ("structure", "friction", "load", "impact_law"):
+                hint = f" For another `{unknown[0]}` make a new `fj.Scene` from the parts of this one."
             raise ValueError(
-                f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}."
-                f"{arguments.did_you_mean(unknown[0], self.parameters)}"
+                f"Scene has no parameter `{unknown[0]}`; it has: {', '.join(sorted(self.parameters))}.{hint}"
             )
 
         def rebuild(part):

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import sparse
 
 import fivjax as fj
 
@@ -273,7 +274,11 @@ def test_replace_rebuilds_the_matrices():
 @pytest.mark.parametrize("name", ["k3", "mu_static", "impact_law", "load"])
 def test_replace_refuses_unknown_names(name):
     """A name that the scene lacks is refused, with those that it has: ignored, it would change nothing unnoticed."""
-    with pytest.raises(ValueError, match=rf"no parameter `{name}`; it has: belt_speed, c1, .*theta\.$") as refusal:
+    part = rf"( For another `{name}` make a new `fj.Scene` from the parts of this one\.)"
+    match = (
+        rf"no parameter `{name}`; it has: belt_speed, c1, .*theta\.{part if name in ('impact_law', 'load') else ''}$"
+    )
+    with pytest.raises(ValueError, match=match) as refusal:
         paper_scene_with().replace(**{name: 0.3})
     assert sentence(str(refusal.value))
 
@@ -431,3 +436,13 @@ def test_a_scene_comes_back_from_a_pickle_to_the_last_bit(again):
                 assert found.parameters[name].dtype == value.dtype and float(found.parameters[name]) == float(value)
             np.testing.assert_array_equal(found.structure.stiffness, scene.structure.stiffness)
             assert jax.tree.structure(found) == jax.tree.structure(scene)
+
+
+def test_scenes_and_sparse_matrices_in_place_of_others_have_a_remedy():
+    scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2))
+    with pytest.raises(TypeError, match=r"such as belt_oscillator\(\), or `scene.structure`"):
+        fj.cea.critical_friction(scene)
+    with pytest.raises(
+        TypeError, match=r"Argument `mass` must be an array, but is of type .*: give it as `.toarray\(\)`"
+    ):
+        fj.Structure(sparse.eye_array(2), np.eye(2), np.eye(2), [0.0, -1.0], tangential=0, normal=1)
