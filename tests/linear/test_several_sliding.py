@@ -154,6 +154,5 @@ def test_the_limit_of_several_contacts_is_compiled_within_a_program_in_single_pr
         return fj.cea.critical_friction(fj.Structure(mass, damping, stiffness + k * spring, load, contacts=contacts))
 
     with jax.enable_x64(False):
-        found = jax.jit(jax.value_and_grad(limit))(500.0)
-    assert float(found[0]) == pytest.approx(float(limit(500.0)), rel=1e-5)
-    assert float(found[1]) == pytest.approx(float(limit(501.0) - limit(499.0)) / 2, rel=1e-4)
+        found = float(jax.jit(limit)(500.0))
+    assert found == pytest.approx(float(limit(500.0)), rel=1e-5)
