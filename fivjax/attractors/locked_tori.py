@@ -15,13 +15,13 @@ def cycles_repeated(
     maps: ReturnMaps, group: Int[np.ndarray, " m"], traced: States, cycles: list[list[StableCycle]]
 ) -> list[tuple[int, StableCycle]]:
     """The cycles of motions that have nearly come to one of many crossings by the end of what they trace, with their rows."""
-    rows = []
+    ends: States = {}
     for row, states in traced.items():
         back = np.linalg.norm(states[-1 - MOST_CROSSINGS : -1] - states[-1], axis=1)
         # Hardly any motion on a torus comes back as close as this.
         if np.min(back) <= 1e-4 * extent(states):
-            rows.append(row)
-    return _cycles_at_the_end(maps, group, traced, rows, cycles)
+            ends[row] = states[-1:]
+    return _cycles_near(maps, group, ends, cycles)
 
 
 def cycles_closed_in_on(
@@ -48,21 +48,21 @@ def cycles_closed_in_on(
             # the stable one.
             places = states[-lag:-1]
             ends[row] = 0.5 * (states[-1:] + places[[np.argmin(np.linalg.norm(places - states[-1], axis=1))]])
-    return _cycles_at_the_end(maps, group, ends, list(ends), cycles, 4096)
+    return _cycles_near(maps, group, ends, cycles, 4096)
 
 
-def _cycles_at_the_end(
+def _cycles_near(
     maps: ReturnMaps,
     group: Int[np.ndarray, " m"],
-    traced: States,
-    rows: list[int],
+    ends: States,
     cycles: list[list[StableCycle]],
     onward: int = 0,
 ) -> list[tuple[int, StableCycle]]:
-    """The cycles near the last states that these motions trace, or near where they are so many returns later, with rows."""
+    """The cycles near these states, one of each row, or near where they lead in so many returns, with rows."""
+    rows = list(ends)
     if not rows:
         return []
-    own, last = group[rows], np.array([traced[row][-1] for row in rows]) / maps.weights
+    own, last = group[rows], np.concatenate([ends[row] for row in rows]) / maps.weights
     at = section_at(last, maps.normal, maps.sliding[own])
     if onward:
         at = maps.returns(own, at, onward).at

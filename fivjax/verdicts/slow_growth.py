@@ -38,9 +38,9 @@ def slide_while_certain(
     # Times shorter than so many periods are left to the stepper.
     least_periods = 4.0
     worthwhile = time * frequency > least_periods * 2 * jnp.pi
-    # Without damping, growth is a rounding error: time would get so long that no step is added to it any more.
-    grows = growth > 1e-10 * jnp.max(complex_pairs.size(modes.eigenvalues))
-    taken = sliding & modes.regular & grows & worthwhile & jnp.isfinite(time)
+    # Beside a longer time than this a step is lost in rounding. Without damping growth is a rounding error, and time that long.
+    counts = time * jnp.max(complex_pairs.size(modes.eigenvalues)) < 1e15
+    taken = sliding & modes.regular & (growth > 0) & worthwhile & counts
     time = jnp.where(taken, time, 0.0)
     rates = Pair(modes.eigenvalues.real * time, modes.eigenvalues.imag * time)
     moved = complex_pairs.real_part(modes.from_modal, complex_pairs.times(complex_pairs.exponential(rates), modal))
