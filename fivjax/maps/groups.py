@@ -51,7 +51,7 @@ class Limits(NamedTuple):
 class Task(NamedTuple):
     """The data that all trajectories of a run have in common: whose they are, and how they are followed."""
 
-    scene: Scene  # on the way to a worker with NumPy arrays, because JAX arrays lose double precision when they are unpickled
+    scene: Scene
     method: AbstractStepper
     names: tuple[str, ...]  # parameters that differ between groups
     of_kick: tuple[str, ...]  # parameters of the kick

@@ -11,7 +11,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -67,8 +66,6 @@ def run_job(
         end_with_parent()
         with ThreadPoolExecutor(max_workers=1) as one:
             return run_job(job, one, report, interrupted)
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, job.task.scene)
-    job = job._replace(task=job.task._replace(scene=scene))
     done = Done(not_run(len(job.seeding), job.task.limits.energy), dict(job.known))
     file = JobFile(job.file, job.key)
     try:

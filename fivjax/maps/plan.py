@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -231,7 +230,7 @@ def plan_of(
     side_by_side = 16
     in_rows = np.sum(-(-counts // side_by_side)) * side_by_side
     task = Task(
-        scene=jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, scene),
+        scene=scene,
         method=method,
         names=tuple(name for name in trajectories.names if name not in OF_KICK and name not in states),
         of_kick=tuple(name for name in trajectories.names if name in OF_KICK),
