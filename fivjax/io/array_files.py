@@ -24,14 +24,14 @@ def matlab(path: Path) -> dict[str, FileMatrix]:
 
 def numpy_array(path: Path) -> dict[str, FileMatrix]:
     """The matrix of a `.npy` file, by the file's name."""
-    return {path.stem: _matrix(path, "", numpy_files.load_array(path))}
+    return {path.stem: matrix_of(f"File `{path}`", numpy_files.load_array(path))}
 
 
 def numpy_archive(path: Path) -> dict[str, FileMatrix]:
     """The matrices of a `.npz` file: several by name, or a sparse one as `scipy.sparse.save_npz` writes it."""
     found = numpy_files.load_archive(path)
     if {"format", "shape", "data"} <= set(found):
-        return {path.stem: _matrix(path, "", _sparse(path, found))}
+        return {path.stem: matrix_of(f"File `{path}`", _sparse(path, found))}
     return _matrices(path, found)
 
 
@@ -71,15 +71,18 @@ def _matrices(path: Path, found: dict) -> dict[str, FileMatrix]:
     if not square:
         held = ", ".join(f"`{name}`" for name in found) or "nothing"
         raise ValueError(f"File `{path}` holds no matrix, but {held}. Save the matrices under names of their own.")
-    return {name: _matrix(path, f", matrix `{name}`", value) for name, value in square.items()}
+    return {name: matrix_of(f"File `{path}`, matrix `{name}`", value) for name, value in square.items()}
 
 
-def _matrix(path: Path, name: str, value) -> FileMatrix:
+def matrix_of(place: str, value) -> FileMatrix:
+    """An array or a sparse matrix as one from a file at this place.
+
+    **Raises:** `ValueError` for what is no matrix of numbers.
+    """
     if not sparse.issparse(value):
         value = np.asarray(value)
         if value.dtype.kind not in "biufc" or value.ndim != 2:
             raise ValueError(
-                f"File `{path}`{name} must be a square matrix of numbers, but has shape {value.shape} and type "
-                f"{value.dtype}."
+                f"{place} must be a square matrix of numbers, but has shape {value.shape} and type {value.dtype}."
             )
-    return FileMatrix(sparse.csr_array(value), None, f"File `{path}`{name}")
+    return FileMatrix(sparse.csr_array(value), None, place)

@@ -60,7 +60,7 @@ def read_matrices(path: str | Path) -> FileMatrices:
         raise ValueError(f"File `{path}` does not exist.")
     if path.stat().st_size == 0:
         raise ValueError(f"File `{path}` is empty. Write it again.")
-    return _usable(path, _reader(path)(path))
+    return usable(f"File `{path}`", _reader(path)(path))
 
 
 def _reader(path: Path) -> Callable[[Path], Mapping[str, FileMatrix | str]]:
@@ -88,7 +88,7 @@ def _reader(path: Path) -> Callable[[Path], Mapping[str, FileMatrix | str]]:
     return readers[path.suffix.lower()]
 
 
-def _usable(path: Path, found: Mapping[str, FileMatrix | str]) -> FileMatrices:
+def usable(place: str, found: Mapping[str, FileMatrix | str]) -> FileMatrices:
     """The matrices that could be mass, damping or stiffness, and the reasons why the others are not.
 
     **Raises:** `ValueError` if none could.
@@ -101,7 +101,7 @@ def _usable(path: Path, found: Mapping[str, FileMatrix | str]) -> FileMatrices:
         elif isinstance(matrix, FileMatrix):
             matrices[name] = _check(matrix)
     if not matrices:
-        raise ValueError(next(iter(left_out.values()), f"File `{path}` holds no matrix. Write it again."))
+        raise ValueError(next(iter(left_out.values()), f"{place} holds no matrix. Write it again."))
     return FileMatrices(matrices, left_out)
 
 

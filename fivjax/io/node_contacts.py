@@ -136,7 +136,9 @@ def load_direction(load: Mapping, order: tuple[Label, ...] | None, size: int) ->
 def _along(node: int, direction, order, size: int) -> np.ndarray:
     """The unit displacement of a node in a direction, as a vector of all coordinates."""
     if order is None:
-        raise ValueError(f"Node {node} cannot be found: the files name no nodes. Say which row is which with `labels`.")
+        raise ValueError(
+            f"Node {node} cannot be found: the matrices name no nodes. Say which row is which with `labels`."
+        )
     places = {label.direction: place for place, label in enumerate(order) if label.node == node}
     if not places:
         first = next((label.node for label in order if label.node > 0), order[0].node)  # after the internal ones

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -10,8 +11,9 @@ from scipy import sparse
 from ..foundation import arguments
 from ..model.sparse_structure import SparseStructure
 from ..model.structure_checks import check_matrices
+from .array_files import matrix_of
 from .file_matrix import FileMatrix, Label
-from .matrix_files import FileMatrices, read_matrices
+from .matrix_files import FileMatrices, read_matrices, usable
 from .node_contacts import NodeContact, contact_directions, load_direction, read_contacts
 
 # Common names of the matrices in files that hold several, in capitals.
@@ -27,7 +29,7 @@ HELD = 1e35
 
 
 def read_structure(
-    path: str | Path,
+    path: str | Path | Mapping[str, Any],
     *,
     units: str | None = None,
     mass: str | Path | None = None,
@@ -38,7 +40,7 @@ def read_structure(
     load: Mapping[tuple[int, int | str], float] | None = None,
     rayleigh: tuple[float, float] = (0.0, 0.0),
 ) -> SparseStructure:
-    """A structure from the files of a finite-element code, in SI units, with checks.
+    """A structure from the files of a finite-element code, or from matrices, in SI units, with checks.
 
         big = fj.read_structure("brake_STIF1.mtx", units="mm-t-s", contacts=[fj.NodeContact(17, "x", "-z")])
         print(big.checks)
@@ -50,8 +52,9 @@ def read_structure(
 
     **Arguments:**
 
-    - `path`: the file with the stiffness matrix, and perhaps the others.
-    - `units`: of the files, such as "mm-t-s" (forces in N) or "SI"; files do not say. Translations (directions 1 to 3, and all
+    - `path`: the file with the stiffness matrix, and perhaps the others; or the matrices themselves, arrays or SciPy's sparse
+      ones: `{"stiffness": K, "mass": M, "damping": C}`.
+    - `units`: such as "mm-t-s" (forces in N) or "SI"; files do not say. Translations (directions 1 to 3, and all
       rows without labels) become metres; rotations are in rad already, modal coordinates keep their scale.
     - `mass`, `damping`: their files, where they are not in the first one. Without a damping matrix, damping is zero.
     - `names`: the names of the matrices in files that hold several: `{"stiffness": "KAA", "mass": "MAA"}`.
@@ -83,7 +86,10 @@ def read_structure(
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
-    parts, remarks = _parts(arguments.path("path", path), mass, damping, names)
+    if isinstance(path, Mapping):
+        parts, remarks = _given(path, {"mass": mass, "damping": damping, "names": names or None}), []
+    else:
+        parts, remarks = _parts(arguments.path("path", path), mass, damping, names)
     order, numbers, aligned = _align(parts, _labels(labels))
     held = np.abs(aligned["stiffness"].diagonal()) >= HELD
     if np.any(held):
@@ -114,6 +120,25 @@ def read_structure(
             remarks=remarks,
         ),
     )
+
+
+def _given(matrices: Mapping[str, Any], beside: dict[str, Any]) -> dict[str, FileMatrix]:
+    """Stiffness, mass and damping (if there is one) in place of files."""
+    if not {"stiffness", "mass"} <= set(matrices) <= set(NAMES):
+        raise ValueError(
+            f"Argument `path` must be a file, or hold the matrices 'stiffness' and 'mass', and perhaps 'damping', but holds "
+            f"{', '.join(map(repr, matrices)) or 'nothing'}."
+        )
+    for name, value in beside.items():
+        if value is not None:
+            raise ValueError(f"Argument `{name}` is about files. Leave it out: `path` holds the matrices themselves.")
+    found = {
+        role: matrix_of(f"Argument `path[{role!r}]`", matrix) for role, matrix in matrices.items() if matrix is not None
+    }
+    held = usable("Argument `path`", found)
+    for reason in held.left_out.values():
+        raise ValueError(reason)
+    return dict(held)
 
 
 def _parts(path: Path, mass, damping, names: Mapping[str, str]) -> tuple[dict[str, FileMatrix], list[str]]:

@@ -74,8 +74,8 @@ def craig_bampton(
 
     **Returns:** a `Reduction`.
 
-    **Raises:** `ValueError` for a structure that has no contacts, is not symmetric, or has a part that moves freely although
-    the contacts are held.
+    **Raises:** `ValueError` for a structure that has no contacts, is not symmetric, or is not stable or has a part that moves
+    freely although the contacts are held.
 
     **Example:**
 
@@ -117,6 +117,12 @@ def craig_bampton(
             factors = splu(held)
         except (RuntimeError, np.linalg.LinAlgError):
             factors = None
+        largest = np.max(np.abs(squares), initial=0.0)
+        if np.any(squares < -1e-9 * largest):
+            raise ValueError(
+                f"With its contacts held, the structure is not stable: its stiffness has a negative eigenvalue there "
+                f"(ω² = {squares.min():.3g} 1/s²). Look at the signs in the stiffness matrix; `print(structure.checks)` counts."
+            )
         if factors is None or np.any(squares < 1e-9 * np.max(squares, initial=0.0)):
             tied = ", or a Lagrange multiplier ties nothing but them" if structure.checks.multipliers else ""
             raise ValueError(

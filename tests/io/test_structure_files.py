@@ -547,5 +547,38 @@ def test_matrices_of_different_sizes_are_refused(folder):
     np.savez(folder / "only.npz", M=MASS)
     with pytest.raises(ValueError, match=r"must say which is the stiffness matrix; it has: M"):
         fj.read_structure(folder / "only.npz", units="SI")
-    with pytest.raises(ValueError, match=r"Node 4 cannot be found: the files name no nodes"):
+    with pytest.raises(ValueError, match=r"Node 4 cannot be found: the matrices name no nodes"):
         fj.read_structure(folder / "pad.npz", units="SI", contacts=[fj.NodeContact(4, "x", "y")])
+
+
+@pytest.mark.parametrize("kind", [np.array, sparse.csr_matrix, sparse.dia_array])
+def test_matrices_in_memory_are_read_like_their_files(kind):
+    """The structure that the files of the model give, to the last bit."""
+    asked = dict(units="mm-t-s", labels=LABELS, contacts=[fj.NodeContact(4, "x", "y")], rayleigh=(1.0, 1e-6))
+    given = fj.read_structure({"stiffness": kind(STIFFNESS), "mass": kind(MASS), "damping": None}, **asked)
+    scale = 1e3 * np.eye(4)
+    np.testing.assert_array_equal(given.stiffness.toarray(), 1e-3 * scale @ STIFFNESS @ scale)
+    np.testing.assert_array_equal(given.mass.toarray(), 1e-3 * scale @ MASS @ scale)
+    np.testing.assert_allclose(given.damping.toarray(), given.mass.toarray() + 1e-6 * given.stiffness.toarray())
+    np.testing.assert_array_equal(given.normal_directions[:, 0], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("matrices", "more", "sentence"),
+    [
+        (
+            {"stiffness": STIFFNESS},
+            {},
+            r"must be a file, or hold the matrices 'stiffness' and 'mass'.*but holds 'stiffness'",
+        ),
+        ({"stiffness": STIFFNESS, "mass": MASS}, {"names": {"mass": "M"}}, r"`names` is about files. Leave it out"),
+        ({"stiffness": STIFFNESS * 1j, "mass": MASS}, {}, r"`path\['stiffness'\]` is complex"),
+        ({"stiffness": STIFFNESS[:2], "mass": MASS}, {}, r"`path\['stiffness'\]` must be a square matrix"),
+        ({"stiffness": "K", "mass": MASS}, {}, r"`path\['stiffness'\]` must be a square matrix of numbers"),
+        ({"stiffness": STIFFNESS, "mass": MASS[:2, :2]}, {}, r"the mass matrix has 2 rows and the stiffness matrix 4"),
+        ({"stiffness": STIFFNESS, "mass": np.full((4, 4), np.nan)}, {}, r"`path\['mass'\]` must be finite"),
+    ],
+)
+def test_matrices_in_memory_that_cannot_be_used_are_refused(matrices, more, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        fj.read_structure(matrices, units="SI", **more)

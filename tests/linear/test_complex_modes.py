@@ -300,6 +300,15 @@ def test_a_loose_part_is_refused(tmp_path):
     assert fj.craig_bampton(loose, up_to=1.0, keep=[(2, 1)]).structure.size == 4
 
 
+def test_a_part_that_its_springs_push_away_is_refused():
+    """It does not move freely: it moves away."""
+    matrices = {"stiffness": np.diag([2.0, 2.0, -1.0]), "mass": np.eye(3)}
+    labels = [(1, 1), (1, 2), (2, 1)]
+    unstable = fj.read_structure(matrices, units="SI", labels=labels, contacts=[fj.NodeContact(1, 1, 2)])
+    with pytest.raises(ValueError, match=r"not stable: its stiffness has a negative eigenvalue there \(ω² = -1 1/s²\)"):
+        fj.craig_bampton(unstable, up_to=1.0)
+
+
 def test_near_finds_the_nearest():
     """Shift and invert by itself: the eigenvalues nearest to a shift off the axis."""
     pencil = random_pencil(60)
