@@ -57,6 +57,12 @@ class StructureChecks:
         """Whether no eigenvalue of the mass or stiffness matrix is negative, and every degree of freedom has mass."""
         return self.negative_masses == 0 and self.negative_springs == 0 and self.massless == 0
 
+    @property
+    def unexplained(self) -> dict[str, int]:
+        """How many eigenvalues of mass and stiffness are negative, by matrix, beside those that Lagrange multipliers make."""
+        springs = (self.negative_springs or 0) - len(self.multipliers)
+        return {"mass": self.negative_masses or 0, "stiffness": springs}
+
     def __repr__(self) -> str:
         return "\n".join(self.sentences)
 
@@ -68,11 +74,10 @@ class StructureChecks:
             if value > ROUNDING:
                 found.append(f"The {name} matrix is not symmetric: entries differ by {value:.2g} of the largest one.")
         found = found or ["The matrices are symmetric."]
-        for name, count in {"mass": self.negative_masses, "stiffness": self.negative_springs}.items():
-            unexplained = (count or 0) - (len(self.multipliers) if name == "stiffness" else 0)
-            if unexplained > 0:
-                beside = ", beside one for each Lagrange multiplier" if unexplained < (count or 0) else ""
-                found.append(f"The {name} matrix has {_of(unexplained, 'negative eigenvalue')}{beside}.")
+        for name, count in self.unexplained.items():
+            if count > 0:
+                beside = ", beside one for each Lagrange multiplier" if name == "stiffness" and self.multipliers else ""
+                found.append(f"The {name} matrix has {_of(count, 'negative eigenvalue')}{beside}.")
         if self.negative_masses == 0 and self.negative_springs == 0:
             found.append("Mass and stiffness have no negative eigenvalues.")
         found += self._about_rows

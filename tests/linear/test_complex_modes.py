@@ -305,7 +305,7 @@ def test_a_part_that_its_springs_push_away_is_refused():
     matrices = {"stiffness": np.diag([2.0, 2.0, -1.0]), "mass": np.eye(3)}
     labels = [(1, 1), (1, 2), (2, 1)]
     unstable = fj.read_structure(matrices, units="SI", labels=labels, contacts=[fj.NodeContact(1, 1, 2)])
-    with pytest.raises(ValueError, match=r"not stable: its stiffness has a negative eigenvalue there \(ω² = -1 1/s²\)"):
+    with pytest.raises(ValueError, match=r"The stiffness matrix has negative eigenvalues \(1\)"):
         fj.craig_bampton(unstable, up_to=1.0)
 
 
