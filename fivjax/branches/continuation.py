@@ -167,7 +167,7 @@ def cycle_at(branch: "xr.Dataset", i: int) -> LimitCycle:
         >>> fj.cycle_at(branch, 0).kind
         'periodic'
     """
-    if isinstance(i, bool) or not isinstance(i, int | np.integer):
+    if not arguments.is_whole(i):
         raise TypeError(f"Argument `i` must be the index of a point, a whole number, but is {arguments.describe(i)}.")
     try:
         name, row = branch.attrs["parameter"], branch.isel(point=i)

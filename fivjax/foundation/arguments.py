@@ -51,9 +51,14 @@ def real_number(
         raise ValueError(f"Argument `{name}` must be at most {bound}, but is {shown}.")
 
 
+def is_whole(value) -> bool:
+    """Whether it is one whole number, of Python's or NumPy's; spans of time are made of those."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+
+
 def whole_number(name: str, value, *, minimum: int) -> None:
     """Refuse anything but one whole number of at least `minimum`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+    if not is_whole(value) or value < minimum:
         raise ValueError(f"Argument `{name}` must be a whole number of at least {minimum}, but is {value!r}.")
 
 
@@ -66,8 +71,14 @@ def numeric_array(name: str, value) -> np.ndarray:
         array = np.asarray(value)
     except (ValueError, TypeError):
         raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}.") from None
+    if np.ma.is_masked(value):
+        raise ValueError(
+            f"Argument `{name}` must have all its values, but some are masked. Drop them with `.compressed()`, or fill them."
+        )
     if array.dtype.kind not in "iuf":
-        holds = f" that holds {describe(array.flat[0].item())}" if array.ndim and array.size else ""
+        # What makes an array one of objects is not always its first.
+        others = (one for one in array.ravel().tolist() if isinstance(one, bool) or not isinstance(one, int | float))
+        holds = f" that holds {describe(next(others, None))}" if array.ndim and array.size else ""
         raise TypeError(f"Argument `{name}` must be numeric, but is {describe(value)}{holds}.")
     return array
 
@@ -124,10 +135,13 @@ def instance(name: str, value, kinds: type | tuple[type, ...], example: str) -> 
 def one_of(name: str, value, choices: Iterable[str]) -> None:
     """Refuse a word that is not among the choices."""
     choices = list(choices)
-    if value not in choices:
+    # An array compares as one.
+    is_array = hasattr(value, "shape")
+    if is_array or value not in choices:
         listed = ", ".join(f'"{choice}"' for choice in choices)
+        said = describe(value) if is_array else repr(value)
         raise ValueError(
-            f"Argument `{name}` must be one of {listed}, but is {value!r}.{did_you_mean(str(value), choices)}"
+            f"Argument `{name}` must be one of {listed}, but is {said}.{did_you_mean(str(value), choices)}"
         )
 
 
@@ -135,7 +149,8 @@ def listed_names(name: str, value, example: str) -> tuple[str, ...]:
     """The names in a list; one name may stand for itself."""
     if isinstance(value, str):
         return (value,)
-    listed = isinstance(value, Iterable) and not isinstance(value, Mapping)
+    # An array without axes is iterable by its type alone.
+    listed = isinstance(value, Iterable) and not isinstance(value, Mapping) and getattr(value, "ndim", 1) > 0
     names = tuple(value) if listed else ()
     if not listed or not all(isinstance(one, str) for one in names):
         raise TypeError(f'Argument `{name}` must be a list of names, such as ["{example}"], but is {describe(value)}.')

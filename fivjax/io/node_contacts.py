@@ -40,8 +40,7 @@ class NodeContact:
 
     def __post_init__(self):
         for name, node in (("node", self.node), ("against", self.against)):
-            whole = isinstance(node, int | np.integer) and not isinstance(node, bool)
-            if not whole and not (name == "against" and node is None):
+            if not arguments.is_whole(node) and not (name == "against" and node is None):
                 raise TypeError(f"Argument `{name}` must be the number of a node, but is {arguments.describe(node)}.")
 
 
@@ -160,7 +159,7 @@ def _components(direction) -> dict[int, float]:
         name, sign = direction.strip().lstrip("+-").lower(), -1.0 if direction.strip().startswith("-") else 1.0
         if name in axes:
             return {axes[name]: sign}
-    elif isinstance(direction, int | np.integer) and not isinstance(direction, bool):
+    elif arguments.is_whole(direction):
         if 0 <= direction <= 6:
             return {int(direction): 1.0}
     elif np.shape(direction) == (3,) and np.linalg.norm(direction) > 0:

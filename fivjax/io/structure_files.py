@@ -86,7 +86,7 @@ def read_structure(
     if unknown:
         raise ValueError(f"Argument `names` must name {', '.join(NAMES)}, but has {unknown[0]!r}.")
     contacts = read_contacts(contacts) if isinstance(contacts, str | Path) else contacts
-    if isinstance(path, Mapping):
+    if isinstance(path, Mapping) and path:
         parts, remarks = _given(path, {"mass": mass, "damping": damping, "names": names or None}), []
     else:
         parts, remarks = _parts(arguments.path("path", path), mass, damping, names)
@@ -127,7 +127,7 @@ def _given(matrices: Mapping[str, Any], beside: dict[str, Any]) -> dict[str, Fil
     if not {"stiffness", "mass"} <= set(matrices) <= set(NAMES):
         raise ValueError(
             f"Argument `path` must be a file, or hold the matrices 'stiffness' and 'mass', and perhaps 'damping', but holds "
-            f"{', '.join(map(repr, matrices)) or 'nothing'}."
+            f"{', '.join(map(repr, matrices))}."
         )
     for name, value in beside.items():
         if value is not None:

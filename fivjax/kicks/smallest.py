@@ -138,6 +138,7 @@ def smallest_kick(
     """
     # Number of searches, from the starts with the smallest p_crit.
     descents = 4
+    arguments.real_number("p_step", p_step, above=0)
     arguments.instance("scene", scene, Scene, "a Scene")
     arguments.known("scene", scene)
     arguments.instance("scene.load", scene.load, Pulse, "a Pulse, whose p is sought")

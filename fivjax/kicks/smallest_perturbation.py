@@ -6,6 +6,7 @@ closest, in the norm. The search goes in this direction as long as the size fall
 sliding suggests.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,10 @@ class SmallestPerturbation(NamedTuple):
     proved_high: float  # and with this size to end on a limit cycle
     values: np.ndarray  # displacements (m) and velocities (m/s), the `y0` of `simulate`; or the factor p of each piece
     trajectories: int  # the number that the search took
+
+    def in_coordinates(self, turned: Callable[[np.ndarray], np.ndarray]) -> "SmallestPerturbation":
+        """The same with its state, if it is one, in other coordinates."""
+        return self._replace(values=turned(self.values)) if self.over == "state" else self
 
     @property
     def ratio(self) -> float:

@@ -101,6 +101,8 @@ def eigenvalues(system: Structure | Scene, mu=None, *, direction: int = 1) -> Co
 def _check_frictions(mu) -> None:
     if is_known(mu):
         values = arguments.numeric_array("mu", mu)
+        if not values.size:
+            raise ValueError("Argument `mu` must hold at least one value, but is empty.")
         bad = values[~(np.isfinite(values) & (values >= 0))]
         if bad.size:
             raise ValueError(f"Argument `mu` must be non-negative and finite, but holds {bad[0]:g}.")

@@ -39,7 +39,7 @@ class ContactPoint:
     def __post_init__(self):
         for name in ("tangential", "normal"):
             value = getattr(self, name)
-            if isinstance(value, str) or (isinstance(value, int | np.integer) and not isinstance(value, bool)):
+            if isinstance(value, str) or arguments.is_whole(value):
                 continue
             if not is_known(value):
                 raise TypeError(

@@ -8,6 +8,7 @@ import abc
 from itertools import pairwise
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -57,7 +58,8 @@ class AbstractLoad(eqx.Module):
     def check(self) -> None:
         """Refuse a load that breaks its contract, where its values are known."""
         name, jumps, force, final = type(self).__name__, self.jumps, self.force, self.final
-        if not all(map(is_known, (jumps, force, final))):
+        # A load of one's own may have numbers that these do not tell of.
+        if not all(map(is_known, (jumps, force, final, *jax.tree.leaves(self)))):
             return
         jumps = np.asarray(jumps)
         if jumps.ndim != 1 or not np.all(np.isfinite(jumps)) or np.any(np.diff(jumps) < 0):

@@ -71,7 +71,7 @@ def check_shapes(n: int, **matrices) -> None:
 
 
 def check_index(name: str, index, n: int) -> int:
-    if isinstance(index, bool) or not isinstance(index, int | np.integer):
+    if not arguments.is_whole(index):
         raise TypeError(f"Argument `{name}` must be the index of a coordinate, but is {arguments.describe(index)}.")
     if not 0 <= index < n:
         raise ValueError(

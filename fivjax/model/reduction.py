@@ -213,7 +213,7 @@ def _compare(full: SparseStructure, reduced: Structure, basis: np.ndarray, up_to
 
 
 def _index(structure: SparseStructure, place) -> int:
-    if isinstance(place, int | np.integer):
+    if arguments.is_whole(place):
         if not 0 <= place < structure.size:
             raise ValueError(f"Argument `keep` must hold indices below {structure.size}, but holds {place}.")
         return int(place)

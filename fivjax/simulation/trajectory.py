@@ -222,12 +222,14 @@ def simulate(
         return _in_contact_coordinates(
             scene, t1, dt_save, method, y0=y0, energy=energy, derivatives=derivatives, progress=progress
         )
-    rows = math.ceil(t1 / dt_save - 1e-9)
-    if rows > most_rows:
+    with np.errstate(over="ignore"):
+        asked = float(np.float64(t1) / np.float64(dt_save))
+    if asked > most_rows:
         raise ValueError(
-            f"Argument `dt_save` asks for {rows:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
+            f"Argument `dt_save` asks for {asked:.3g} rows up to t1 = {t1:g} s, which no memory holds; the most is "
             f"{most_rows:.0e}. Save less often, or stop earlier."
         )
+    rows = math.ceil(asked - 1e-9)
     start, given = ("sliding equilibrium", None) if y0 is None else ("given by y0", start_state(scene, y0))
     # Events shorten advances, so more may be needed than the interval divided by `dt`.
     steps = math.ceil(dt_save / method.dt - 1e-9)

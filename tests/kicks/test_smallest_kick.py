@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import expm
 
 import fivjax as fj
+from fivjax.kicks import smallest_perturbation
 from fivjax.kicks.perturbations import Histories, InitialStates
 from fivjax.kicks.smallest import certified_excess
 from fivjax.model.sliding import sliding_states
@@ -88,6 +89,31 @@ def test_certified_perturbations_just_reach_the_end_of_sliding(of):
     draw = np.random.default_rng(1)
     shape = draw.normal(size=certificate.shapes.shape[1])
     assert max(driven(kind, certificate.size * shape / kind.norm(shape[None])[0])) < 1.0
+
+
+def test_the_smallest_state_is_given_in_the_structure_s_own_coordinates(monkeypatch):
+    """Computed where the contact's directions are coordinates; `values` is the `y0` of the caller's scene."""
+    plain, turn = SCENE.structure, np.array([[1.0, 0.3, -0.2], [0.1, 1.2, 0.4], [-0.3, 0.2, 0.9]])
+    mass, damping, stiffness = (
+        turn.T @ np.asarray(part) @ turn for part in (plain.mass, plain.damping, plain.stiffness)
+    )
+    load = turn.T @ np.asarray(plain.load_direction)
+    turned = fj.Structure(mass, damping, stiffness, load, tangential=turn[0], normal=turn[2])
+    inside = []
+
+    def found(scene):
+        n = scene.structure.size
+        q, v = np.asarray(fj.sliding_equilibrium(scene)), np.zeros(n)
+        v[0] = 0.1
+        inside.append(scene)
+        return smallest_perturbation.SmallestPerturbation("state", 1.0, 0.5, 1.0, 1.0, np.concatenate([q, v]), 0)
+
+    monkeypatch.setattr("fivjax.kicks.smallest.smallest_state", found)
+    scene = fj.Scene(turned, SCENE.friction, SCENE.belt_speed, SCENE.load)
+    y = fj.smallest_kick(scene, over="state").values
+    assert inside[0].structure.contacts_at_coordinates
+    np.testing.assert_allclose(y[:3], fj.sliding_equilibrium(scene), rtol=1e-9)
+    assert turn[0] @ y[3:] == pytest.approx(0.1) and turn[2] @ y[3:] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_states_and_histories_are_refused_what_they_do_not_have():

@@ -649,6 +649,7 @@ FALLING = fj.Scene(fj.belt_oscillator(), fj.ExponentialDecay(0.5, 0.05, 0.5))
     [
         (lambda: cea.eigenvalues(belt(), -0.1), "`mu` must be non-negative, but is -0.1"),
         (lambda: cea.eigenvalues(belt(), [0.1, -0.2]), "`mu` must be non-negative and finite, but holds -0.2"),
+        (lambda: cea.eigenvalues(belt(), []), "`mu` must hold at least one value"),
         (lambda: cea.eigenvalues(belt()), "`mu` must be given with a structure"),
         (lambda: cea.eigenvalues(SCENE, 0.2), "must not be given with a scene"),
         (lambda: cea.eigenvalues(belt(), 0.2, direction=0), "`direction` must be 1 or -1"),

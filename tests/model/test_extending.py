@@ -245,6 +245,36 @@ def test_a_law_with_unknown_numbers_passes():
         assert float(jax.jit(static)(-0.1)) == pytest.approx(0.3 - 0.1 * (1 - np.exp(-1)), rel=1e-14)
 
 
+class Half(fj.AbstractLoad):
+    """A load with a value that nothing else tells of."""
+
+    force: float
+    mid: float
+
+    @property
+    def jumps(self):
+        return np.array([0.0, 0.01])
+
+    @property
+    def final(self):
+        return self.force
+
+    def __call__(self, t):
+        return jnp.where((t >= 0) & (t < 0.01), self.mid, self.force)
+
+
+def test_a_load_with_unknown_numbers_passes():
+    """Its check cannot look either; differences of two runs are the reference."""
+
+    def displacement(mid):
+        scene = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.2), belt_speed=0.8, load=Half(100.0, mid))
+        return fj.simulate(scene, 0.02, 0.01).displacement[-1, 0]
+
+    with jax.enable_x64(True):
+        slope = float(jax.grad(displacement)(150.0))
+    assert slope == pytest.approx(float(displacement(151.0) - displacement(149.0)) / 2, rel=1e-6)
+
+
 class Load(fj.AbstractLoad):
     """What it says of itself, and what it does, apart."""
 

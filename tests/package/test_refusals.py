@@ -70,6 +70,9 @@ AXES = [
     ([False, True], TypeError, ["numeric"]),
     (None, TypeError, ["numeric", "None"]),
     ({0.1, 0.2}, TypeError, ["numeric", "set"]),
+    ([0.1, None], TypeError, ["numeric", "holds None"]),
+    (np.array([0.1, "b"], object), TypeError, ["numeric", "holds 'b'"]),
+    (np.ma.array([0.1, 0.15, 0.2], mask=[0, 1, 0]), ValueError, ["masked"]),
 ]
 BOTH = [fj.bistability_map, fj.critical_perturbation]
 
@@ -713,3 +716,30 @@ def test_as_many_digits_as_it_takes():
     assert digits.apart(100.0, 100.0, 3.5) == ("100", "100", "3.5")
     assert digits.apart(math.nan, math.inf, 1e-30) == ("nan", "inf", "1e-30")
     assert digits.apart(1 / 3, 1 / 3 + 1e-8, digits=9) == ("0.333333333", "0.333333343")
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "fragments"),
+    [
+        (lambda scene: fj.Coulomb(np.ma.masked), ValueError, ["`mu`", "masked"]),
+        (lambda scene: scene.replace(belt_speed=None), TypeError, ["`belt_speed`", "None"]),
+        (lambda scene: fj.simulate(scene, 1.0, 5e-324), ValueError, ["`dt_save`", "rows"]),
+        (lambda scene: fj.smallest_kick(scene, p_step=math.nan), ValueError, ["`p_step`", "finite"]),
+        (lambda scene: fj.smallest_kick(scene, over=np.array(0.2)), TypeError, ["`over`", "list of names"]),
+        (
+            lambda scene: fj.smallest_kick(scene, "history", pieces=np.timedelta64(1, "s")),
+            ValueError,
+            ["`pieces`", "whole"],
+        ),
+        (
+            lambda scene: fj.continue_cycle(scene, np.array(["mu", "k1"]), (0.1, 0.2)),
+            ValueError,
+            ["`parameter`", "array"],
+        ),
+        (lambda scene: fj.ContactPoint(np.timedelta64(1, "s"), 2), TypeError, ["`tangential`"]),
+    ],
+)
+def test_what_numpy_takes_for_something_else(paper_scene, call, error, fragments):
+    """Numbers without a value, spans of time for whole numbers, arrays for words."""
+    with refused(error, *fragments):
+        call(paper_scene)
