@@ -22,8 +22,10 @@ COMPILED_FOR_TESTS = "--xla_backend_optimization_level=0 --xla_backend_extra_opt
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     COMPILED_FOR_TESTS += " --xla_cpu_use_fusion_emitters=false"
 
-# The same holds for kernels: a third of the time without the later optimisations, and a twelfth with none (`tests/simulation`).
-KERNELS_COMPILED_FOR_TESTS = "-O1 -fno-slp-vectorize"
+# The same holds for kernels: two thirds of the time without the later optimisations, and a quarter with none, which run five times
+# as long. That repays in all rooms but those where trajectories are followed in bulk.
+KERNELS_COMPILED_FOR_TESTS, KERNELS_OF_MANY_STEPS = "-O0", "-O1 -fno-slp-vectorize"
+OF_MANY_STEPS = {"attractors", "kicks", "maps", "steppers", "verdicts"}
 
 # Files that take longest. They come first: one of them begun last would leave the other workers idle. Those that use what `test_maps`
 # compiles come a while after it, or two workers would compile that at the same time.
@@ -52,6 +54,18 @@ def pytest_configure(config: pytest.Config) -> None:
     if CACHE not in os.environ:
         os.environ[CACHE] = config.stash[_FOLDER] = tempfile.mkdtemp(prefix="fivjax-compiled-")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _kernels_of_a_room(request):
+    """Kernels that run long are compiled with more care, unless told how."""
+    told = os.environ.get(KERNEL_FLAGS)
+    if told == KERNELS_COMPILED_FOR_TESTS and request.path.parent.name in OF_MANY_STEPS:
+        os.environ[KERNEL_FLAGS] = KERNELS_OF_MANY_STEPS
+        yield
+        os.environ[KERNEL_FLAGS] = told
+    else:
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

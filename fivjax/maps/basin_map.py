@@ -22,7 +22,7 @@ from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import map_dataset, wilson
 from .engine import RunOptions, run_to_verdict
 from .executors import with_workers
-from .groups import Limits
+from .groups import Limits, kick_of
 from .plan import Grid, TrajectoryList
 from .resuming import keeper_at
 
@@ -104,7 +104,7 @@ def basins(
     check_size(axes)
     parameters = checked_axes(scene, {name: values for name, values in axes.items() if name not in states})
     axes = {name: parameters[name] if name in parameters else arguments.axis(name, axes[name]) for name in axes}
-    grid = Grid(axes, states)
+    grid = Grid(axes, states, kick_of(scene))
     _check_gap(scene, axes)
     keeper = keeper_at(resume, scene, method, grid, {"t_max": t_max, "kick": bool(kick)})
     with contextlib.nullcontext() if keeper is None else contextlib.closing(keeper):

@@ -18,7 +18,7 @@ from .axes import check_run, check_size, checked_axes, linear_limit
 from .datasets import audit_note, map_dataset
 from .engine import RunOptions, interrupted, run_to_verdict
 from .executors import with_workers
-from .groups import Limits
+from .groups import Limits, kick_of
 from .plan import Grid
 from .refinement import finer_axis, refine_grid
 from .results import Verdicts, not_run
@@ -125,7 +125,7 @@ def bistability_map(
         )
     check_size(axes, refine, bool(energy), bool(sparse))
     axes = {name: finer_axis(values, refine) for name, values in checked_axes(scene, axes).items()}
-    grid = Grid(axes)
+    grid = Grid(axes, of_kick=kick_of(scene))
     limits = Limits(t_max, int(max_steps), bool(energy))
     refinement = {"refine": int(refine), "audit": float(audit)} if refine else {}
     refinement |= {"sparse": True} if sparse else {}

@@ -129,7 +129,8 @@ class _Run(NamedTuple):
     def job(self, number: int) -> Job:
         own, task = self.plan.jobs[number], self.plan.task
         values, seeding = self.plan.trajectories.columns(own), self.plan.trajectories.seeding(own)
-        groups = groups_of(values, tuple(task.states))[0] if self.attractors else np.zeros((0, seeding.shape[1]))
+        within = (*task.of_kick, *task.states)
+        groups = groups_of(values, within)[0] if self.attractors else np.zeros((0, seeding.shape[1]))
         keys = {row.tobytes() for row in (*groups, *np.unique(seeding, axis=0))}
         known = {key: self.attractors[key] for key in keys & self.attractors.keys()}
         file = (None, "") if self.options.keeper is None else self.options.keeper.job_file(own)

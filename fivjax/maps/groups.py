@@ -5,13 +5,15 @@ proofs and the same attractors.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection
 from importlib import metadata
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import partial_eval
 from jaxtyping import Array, Float
 
 from ..contact import Mechanics
@@ -25,7 +27,7 @@ from ..steppers.kernel_scope import has_kernel
 from ..verdicts.sliding_proof import SlidingModes, sliding_modes
 from ..verdicts.sticking_proof import StickingDrift, sticking_drift
 
-# Parameters in which trajectories of one group may differ: those of the kick, which do not change the mechanics.
+# Parameters of a `Pulse` in which trajectories of one group may differ: those of the kick.
 OF_KICK = ("p", "duration", "start")
 
 
@@ -87,9 +89,11 @@ def bytes_per_trajectory(scene: Scene, sharing: float) -> int:
     return int(own + 3 * (modes + attractor) / sharing)
 
 
-def groups_of(values: dict[str, np.ndarray], states: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows of parameters that are neither of the kick nor initial `states`; and the row of each trajectory."""
-    own = [column for name, column in values.items() if name not in OF_KICK and name not in states]
+def groups_of(values: dict[str, np.ndarray], within: Collection[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of parameters other than those in which trajectories differ `within` a group: those of the kick, and
+    initial states; and the row of each trajectory.
+    """
+    own = [column for name, column in values.items() if name not in within]
     if not own:
         count = len(next(iter(values.values())))
         return np.zeros((1, 0)), np.zeros(count, int)
@@ -145,8 +149,15 @@ def _prepare(scenes):
 
 
 def kick_of(scene: Scene) -> dict[str, float]:
-    """The parameters of a scene's kick, with its values."""
-    return {name: float(scene.parameters[name]) for name in OF_KICK if name in scene.parameters}
+    """The parameters of a scene's kick, with its values: those of its load on which the final load does not depend. They do not
+    change the mechanics.
+    """
+    load = scene.load
+    numbers = {name: value for name, value in vars(load).items() if eqx.is_inexact_array(value) and value.ndim == 0}
+    with_numbers = functools.partial(eqx.tree_at, lambda load: [getattr(load, name) for name in numbers], load)
+    traced = jax.make_jaxpr(lambda values: jnp.asarray(with_numbers(values).final))(list(numbers.values()))
+    _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
+    return {name: float(value) for (name, value), of_final in zip(numbers.items(), used, strict=True) if not of_final}
 
 
 def with_values(scene: Scene, names: tuple[str, ...], row) -> Scene:

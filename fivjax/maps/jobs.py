@@ -85,7 +85,7 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
     have ended. The file keeps the state between rounds, and has the one from which an interrupted run goes on.
     """
     task, (verdicts, known) = job.task, results
-    of_groups, group = groups_of(job.values, tuple(task.states))
+    of_groups, group = groups_of(job.values, (*task.of_kick, *task.states))
     of_groups, seeds = with_seeding(of_groups, job.seeding[np.unique(group, return_index=True)[1]])
     batch = Batch(task, of_groups, pool)
     own = [job.values[name] for name in (*task.of_kick, *task.states)]
@@ -122,6 +122,8 @@ def follow_all(job: Job, pool: Executor, results: Done, file: JobFile, report: C
         verdict = np.array(now.verdict)
         if task.limits.t_max is None:
             in_time = now.t - now.skipped - now.last_jump < np.maximum(limit, capture.settled_by)[group[pending]]
+            # On a slow belt events are rare, and their steps are few: first the attractors are computed.
+            in_time |= done <= known_from
         else:
             in_time = now.t < limit[group[pending]]
         entered: dict[int, CapturingSet] = {}

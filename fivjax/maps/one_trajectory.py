@@ -151,7 +151,7 @@ def next_step_end(load: AbstractLoad, t: Float[Array, ""], dt: Float[Array, ""])
 def with_step(setting: Setting, now: Progress) -> Progress:
     """The trajectory after one more step, which ends at the next event at the latest."""
     scene, method = setting.scene, setting.method
-    # At rest an exact stepper would take an infinite step, over which work cannot be integrated.
+    # At rest an exact stepper would take a step that is too long to integrate work over it.
     longest = method.dt if now.energy is None else min(method.dt, 1.0)
     t = next_step_end(scene.load, now.t, longest)
     load = scene.load(0.5 * (now.t + t)) - scene.load.final

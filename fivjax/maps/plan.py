@@ -5,7 +5,7 @@ Trajectories of a group (`groups`) share data, above all their attractors, so a 
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -28,15 +28,21 @@ class Grid:
     """One trajectory for each combination of values on axes, in the order of a grid.
 
     `states` are names of axes that are initial displacements or velocities instead of parameters, with their indices in the
-    state; all other coordinates begin at the sliding equilibrium.
+    state; all other coordinates begin at the sliding equilibrium. `of_kick` are names of the kick's parameters.
     """
 
-    def __init__(self, axes: dict[str, np.ndarray], states: Mapping[str, int] | None = None):
+    def __init__(
+        self,
+        axes: dict[str, np.ndarray],
+        states: Mapping[str, int] | None = None,
+        of_kick: Collection[str] = OF_KICK,
+    ):
         self.axes, self.names, self.states = axes, tuple(axes), dict(states or {})
+        self.of_kick = tuple(name for name in axes if name in of_kick and name not in self.states)
         self.shape = tuple(len(values) for values in axes.values())
         self.total = math.prod(self.shape)
         # Axes along which groups change.
-        self.across = [k for k, name in enumerate(axes) if name not in OF_KICK and name not in self.states]
+        self.across = [k for k, name in enumerate(axes) if name not in self.of_kick and name not in self.states]
         self.group_count = math.prod(self.shape[k] for k in self.across)
 
     def columns(self, places: Indices | None = None) -> dict[str, np.ndarray]:
@@ -87,8 +93,9 @@ class TrajectoryList:
 
     def __init__(self, values: Mapping[str, np.ndarray], states: Mapping[str, int] | None = None):
         self.values, self.names, self.states = dict(values), tuple(values), dict(states or {})
+        self.of_kick = tuple(name for name in OF_KICK if name in values)
         self.total = len(next(iter(values.values())))
-        self._distinct, self._group = groups_of(self.values, self.states)
+        self._distinct, self._group = groups_of(self.values, (*self.of_kick, *self.states))
         self.group_count = len(self._distinct)
 
     def columns(self, places: Indices | None = None) -> dict[str, np.ndarray]:
@@ -232,8 +239,8 @@ def plan_of(
     task = Task(
         scene=scene,
         method=method,
-        names=tuple(name for name in trajectories.names if name not in OF_KICK and name not in states),
-        of_kick=tuple(name for name in trajectories.names if name in OF_KICK),
+        names=tuple(name for name in trajectories.names if name not in trajectories.of_kick and name not in states),
+        of_kick=trajectories.of_kick,
         states=states,
         limits=limits,
         # The same in all jobs, because matrix products of other shapes round differently. A trajectory in a row of its own

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from ..contact import Mechanics
 
-# The longest advance, in units of time. A block that is carried by the belt moves in a straight line, whose series ends at
-# once; powers of a longer time would overflow.
+# The longest advance, in units of time. A block that is carried by the belt moves in a straight line, and one at rest not at
+# all, so that their series end at once; powers of a longer time would overflow.
 LONGEST_STEP = 1e6
 
 
@@ -64,5 +64,4 @@ def trusted(states: Float[Array, "k state"], tolerance: float) -> Float[Array, "
         return jnp.minimum(*(functools.reduce(jnp.maximum, reach(last, first)) for last in (order, order - 1)))
 
     reached = jax.lax.cond(moves, lambda: nearest(0, 1), lambda: nearest(2))
-    longest = jnp.minimum(jnp.exp(reached), LONGEST_STEP)
-    return jnp.where(moves | starts, longest, jnp.inf)
+    return jnp.where(moves | starts, jnp.minimum(jnp.exp(reached), LONGEST_STEP), LONGEST_STEP)

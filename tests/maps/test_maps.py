@@ -8,6 +8,7 @@ import json
 import warnings
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -15,6 +16,7 @@ import xarray as xr
 import fivjax as fj
 from fivjax.kernels import kernel
 from fivjax.maps import engine, plan, trajectory_kernels
+from fivjax.maps.groups import kick_of
 from fivjax.maps.trajectory_kernels import TrajectoryKernels
 from tests.helpers import oracle, reference
 
@@ -342,3 +344,74 @@ def test_a_gap_that_opens_further_and_closes_within_a_step_is_seen_to_close():
         run = fj.simulate(scene.replace(p=p), 600.0, 0.02)
         assert amplitude == pytest.approx(np.abs(np.asarray(run.velocity)[-2500:, 0]).max(), rel=1e-4)
     assert abs(np.diff(found.amplitude)) > 1e-3
+
+
+class Steps(fj.AbstractLoad):
+    """A load that takes a value of its own for a while."""
+
+    force: float
+    meanwhile: float
+    afterwards: float
+
+    @property
+    def jumps(self):
+        return jnp.array([0.0, 0.1])
+
+    @property
+    def final(self):
+        return self.afterwards
+
+    def __call__(self, t):
+        return jnp.where(t < 0, self.force, jnp.where(t < 0.1, self.meanwhile, self.afterwards))
+
+
+def test_trajectories_that_a_load_of_ones_own_leaves_alike_share_their_attractors():
+    """What its final value does not depend on is of the kick; and the verdicts are those of the paper's kick."""
+    own = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.22), 3.0, Steps(100.0, 120.0, 100.0))
+    assert kick_of(own) == {"force": 100.0, "meanwhile": 120.0}
+    p = np.array([1.0, 1.1, 1.2, 1.5])
+    m = fj.bistability_map(own, meanwhile=100 * p, progress=False)
+    assert m.sizes["attractors"] == 1
+    paper = fj.Scene(own.structure, own.friction, 3.0, fj.Pulse(force=100.0, p=1.2))
+    expected = fj.bistability_map(paper, p=p, progress=False)
+    np.testing.assert_array_equal(m["verdict"], expected["verdict"])
+    np.testing.assert_allclose(m["amplitude"], expected["amplitude"], rtol=1e-12)
+
+
+def test_a_parameter_of_a_structure_may_have_a_name_of_the_kicks():
+    """Taken for one of the kick, it would not change the structure."""
+
+    def build(start):
+        damping, stiffness = start * jnp.eye(2), jnp.array([[1e4, 900.0], [900.0, 9.8e3]])
+        return jnp.eye(2), damping, stiffness, jnp.array([0.0, -1.0])
+
+    structure = fj.Structure.from_parameters(build, {"start": 5.0}, tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.3), 1.0, fj.ConstantLoad(50.0))
+    together = fj.bistability_map(scene, start=[1.0, 5.0, 40.0], progress=False)
+    for k, value in enumerate([1.0, 5.0, 40.0]):
+        alone = fj.bistability_map(scene.replace(start=value), belt_speed=[1.0], progress=False)
+        np.testing.assert_array_equal(together["verdict"][k], alone["verdict"][0])
+        np.testing.assert_array_equal(together["decided_at"][k], alone["decided_at"][0])
+
+
+def test_a_motion_that_is_exactly_nothing_slides():
+    """Without friction and with a load that only presses nothing moves at all: no rounding begins a motion."""
+    structure = fj.Structure(np.eye(2), np.eye(2), np.diag([1e4, 2e4]), [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.0), belt_speed=1.0, load=fj.Pulse(force=1.0, p=2.0))
+    assert np.all(fj.bistability_map(scene, p=[1.0, 1.5, 2.0], progress=False)["verdict"] == fj.Verdict.SLIDING)
+    assert np.all(fj.basins(scene, dq0=[0.0, 1e-300], kick=False, progress=False)["verdict"] == fj.Verdict.SLIDING)
+
+
+def test_on_a_slow_belt_a_cycle_is_looked_for_though_its_events_are_rare():
+    """In two thousand periods of the structure there are twenty-six of stick and slip; `limit_cycle` is the reference."""
+    stiffness = np.array([[1e4, 924.19], [924.19, 9784.5]])
+    damping = np.array([[5.6, 0.24], [0.24, 4.5]])
+    structure = fj.Structure(np.diag([1.0, 0.66]), damping, stiffness, [0.0, -1.0], tangential=0, normal=1)
+    scene = fj.Scene(
+        structure, fj.Coulomb(0.25, 0.325), belt_speed=1e-4, load=fj.Pulse(force=38.0, p=3.0, duration=0.03)
+    )
+    m = fj.bistability_map(scene, p=[1.05, 20.0], progress=False)
+    cycle = fj.limit_cycle(scene)
+    np.testing.assert_array_equal(m["verdict"], fj.Verdict.LIMIT_CYCLE)
+    np.testing.assert_allclose(m["amplitude"], cycle.amplitude, rtol=1e-9)
+    np.testing.assert_allclose(m["attractor_period"], cycle.period, rtol=1e-9)
