@@ -92,10 +92,9 @@ class Curve:
                 return None
             try:
                 if normal is None:
-                    step = -np.linalg.lstsq(rows, residuals, rcond=None)[0]
+                    step = -_least_solution(rows, residuals)
                 else:
-                    system = np.vstack([rows, normal])
-                    step = -np.linalg.solve(system, np.append(residuals, normal @ (u - target)))
+                    step = -_solution(np.vstack([rows, normal]), np.append(residuals, normal @ (u - target)))
             except np.linalg.LinAlgError:
                 return None
             size = float(np.max(np.abs(step)))
@@ -108,8 +107,7 @@ class Curve:
 
     def tangent(self, cycle: ComputedCycle, like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
         """The unit tangent of the curve, on the side of `like`."""
-        _, _, axes = np.linalg.svd(cycle.jacobian)
-        found = axes[-1]
+        found = _null_vector(cycle.jacobian, like)
         return found if like is None or found @ like >= 0 else -found
 
     def along(self, cycle: ComputedCycle, tangent: Float[np.ndarray, " m"], by: float) -> ComputedCycle | None:
@@ -121,6 +119,48 @@ class Curve:
         u, normal = guess.copy(), np.zeros_like(guess)
         u[-1], normal[-1] = parameter / self.scales[-1], 1.0
         return self.corrected(u, normal)
+
+
+# A system of so many equations or more, of a cycle of twenty phases, is taken for sparse: each phase has to do with itself, the
+# next one and the parameter alone.
+SPARSE = 120
+
+
+def _solution(matrix: Float[np.ndarray, "m m"], right: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """**Raises:** `LinAlgError` for a singular matrix."""
+    if len(matrix) < SPARSE:
+        return np.linalg.solve(matrix, right)
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    try:
+        return splu(csc_array(matrix)).solve(right)
+    except RuntimeError as error:
+        raise np.linalg.LinAlgError(str(error)) from None
+
+
+def _null_vector(rows: Float[np.ndarray, "m-1 m"], like: Float[np.ndarray, " m"] | None) -> Float[np.ndarray, " m"]:
+    """The unit vector, of either sign, that one equation less than unknowns leave; `like` another one near by, if known."""
+    if len(rows) >= SPARSE:
+        # Bordered by another vector, the equations have one solution; by any at first, then by what that gave.
+        found = np.random.default_rng(0).standard_normal(rows.shape[1]) if like is None else like
+        last = np.eye(1, rows.shape[1], rows.shape[1] - 1)[0]
+        try:
+            for _ in range(2):
+                found = _solution(np.vstack([rows, found]), last)
+                found = found / np.linalg.norm(found)
+        except np.linalg.LinAlgError:
+            found = np.full(rows.shape[1], np.nan)
+        if np.all(np.isfinite(found)):
+            return found
+    return np.linalg.svd(rows)[2][-1]
+
+
+def _least_solution(rows: Float[np.ndarray, "m-1 m"], right: Float[np.ndarray, " m-1"]) -> Float[np.ndarray, " m"]:
+    """The shortest solution of one equation less than unknowns: that at right angles to what they leave."""
+    if len(rows) < SPARSE:
+        return np.linalg.lstsq(rows, right, rcond=None)[0]
+    return _solution(np.vstack([rows, _null_vector(rows, None)]), np.append(right, 0.0))
 
 
 def roots_at_start(modes: tuple[Mode, ...], k: int) -> int:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.branches import pseudo_arclength
 from fivjax.branches.special_points import pairing
 from tests.helpers import oracle, reference
 from tests.helpers.catalogue import full_matrices
@@ -436,3 +437,26 @@ def test_the_derivatives_of_a_neimark_sacker_point_beside_a_fold_are_differences
         ahead, behind = (where(**{name: value * (1 + by)}) for by in (1e-5, -1e-5))
         slope = (ahead - behind) / (2e-5 * value)
         assert float(branch.d_special.sel(of=name)[at]) == pytest.approx(slope, rel=1e-7)
+
+
+def test_long_cycles_have_the_tangents_and_corrections_of_short_ones():
+    """Equations of so many phases are solved as sparse ones; singular values and least squares of all are the reference."""
+    draw = np.random.default_rng(4)
+    size = pseudo_arclength.SPARSE + 30
+    rows = np.zeros((size, size + 1))
+    for k in range(0, size, 6):
+        rows[k : k + 6, k : k + 6] = draw.normal(size=(6, 6))
+        rows[k : k + 6, (k + 6) % size : (k + 6) % size + 6] = -np.eye(6)
+    rows[:, -1] = draw.normal(size=size)
+    expected = np.linalg.svd(rows)[2][-1]
+    for like in (None, expected + 0.3 * draw.normal(size=size + 1) / np.sqrt(size), -expected):
+        found = pseudo_arclength._null_vector(rows, like)
+        np.testing.assert_allclose(found * np.sign(found @ expected), expected, rtol=0, atol=1e-11)
+    right = draw.normal(size=size)
+    least = np.linalg.lstsq(rows, right, rcond=None)[0]
+    np.testing.assert_allclose(
+        pseudo_arclength._least_solution(rows, right), least, rtol=0, atol=1e-9 * np.abs(least).max()
+    )
+    # Where another solution is left, there still is a vector that the equations leave.
+    rows[0] = rows[1]
+    np.testing.assert_allclose(rows @ pseudo_arclength._null_vector(rows, None), 0, atol=1e-10)
