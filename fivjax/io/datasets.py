@@ -17,8 +17,8 @@ from ..foundation.quantities import QUANTITIES as QUANTITIES
 from ..model.description import describe as describe
 from ..model.scene import Scene
 from . import accessor
+from .files import check_there, replace_whole
 from .files import check_writable as check_writable
-from .files import replace_whole
 from .files import save_figure as save_figure
 from .files import save_text as save_text
 from .reading_limits import unreadable
@@ -87,7 +87,8 @@ def save(result, path: str | Path) -> Path:
     if path.suffix.lower() in OTHERS:
         raise ValueError(
             f"Argument `path` must name a NetCDF file, such as `{path.with_suffix('.nc').name}`, but is `{path}`. Other "
-            f"formats are written by xarray: `fj.open(…).to_zarr(…)`, `.to_dataframe().to_csv(…)`."
+            f"formats are written by xarray: `fj.open(…).to_zarr(…)`, or for some variables "
+            f"`fj.open(…)[['verdict', 'amplitude']].to_dataframe().to_csv(…)`."
         )
     # Made in memory first: on a full disk HDF5 crashes the whole process.
     content = BytesIO()
@@ -120,9 +121,11 @@ def open(path: str | Path) -> "xr.Dataset":
     from .hdf5_files import read_netcdf
 
     path = arguments.path("path", path)
-    if not path.is_file():
-        folder = "is a folder; give the name of a file, or open a map's folder.zarr by `xarray.open_zarr`"
-        raise ValueError(f"File `{path}` {folder if path.is_dir() else 'does not exist'}.")
+    if path.is_dir():
+        raise ValueError(
+            f"File `{path}` is a folder; give the name of a file, or open a map's folder.zarr by `xarray.open_zarr`."
+        )
+    check_there(path)
     accessor.register()
     attributes, variables = read_netcdf(path)
     # Of damaged or hostile names, sizes and attributes, xarray makes errors of many kinds.

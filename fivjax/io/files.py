@@ -8,6 +8,18 @@ from pathlib import Path
 from ..foundation.whole_files import try_to_write, write_whole
 
 
+class MissingFile(FileNotFoundError, ValueError):
+    """A file that is to be read and is not there."""
+
+
+def check_there(path: Path) -> None:
+    """Refuse the path of a file that is not there."""
+    if not path.is_file():
+        raise MissingFile(
+            f"File `{path}` {'is a folder; give the name of a file in it' if path.is_dir() else 'does not exist'}."
+        )
+
+
 def check_writable(path: str | Path) -> Path:
     """Refuse a path that could not be written, before any work is done.
 

@@ -14,6 +14,7 @@ from scipy import sparse
 from ..foundation import arguments
 from . import abaqus_files, array_files, harwell_boeing_files, nastran_files
 from .file_matrix import FileMatrix
+from .files import check_there
 
 
 class FileMatrices(dict[str, FileMatrix]):
@@ -56,8 +57,7 @@ def read_matrices(path: str | Path) -> FileMatrices:
         ['K', 'M']
     """
     path = arguments.path("path", path)
-    if not path.is_file():
-        raise ValueError(f"File `{path}` does not exist.")
+    check_there(path)
     if path.stat().st_size == 0:
         raise ValueError(f"File `{path}` is empty. Write it again.")
     return usable(f"File `{path}`", _reader(path)(path))

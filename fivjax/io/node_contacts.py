@@ -9,6 +9,7 @@ import numpy as np
 
 from ..foundation import arguments
 from .file_matrix import Label, text_of
+from .files import check_there
 
 # Columns of a file of contacts; the last one may be missing.
 COLUMNS = ("node", "along", "away", "against")
@@ -52,8 +53,7 @@ def read_contacts(path: str | Path) -> list[NodeContact]:
 
     **Raises:** `ValueError` with the line that cannot be used.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"File `{path}` of contacts does not exist.")
+    check_there(Path(path))
     lines = [
         (number, line)
         for number, line in enumerate(text_of(Path(path)).lstrip("\ufeff").splitlines(), 1)

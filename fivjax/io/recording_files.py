@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..foundation import arguments
+from .files import check_there
 from .matlab_files import read_matlab
 from .numpy_files import load_archive, load_array
 from .reading_limits import check_length, unreadable
@@ -75,8 +76,7 @@ def read_recording(
         raise ValueError(
             f"File `{path}` must be one of {', '.join(readers)}, but ends in {path.suffix or 'nothing'!r}."
         )
-    if not path.is_file():
-        raise ValueError(f"File `{path}` does not exist.")
+    check_there(path)
     arguments.real_number("full_scale", full_scale, above=0)
     if rate is not None:
         arguments.real_number("rate", rate, above=0)

@@ -13,6 +13,7 @@ from ..model.sparse_structure import SparseStructure
 from ..model.structure_checks import check_matrices
 from .array_files import matrix_of
 from .file_matrix import FileMatrix, Label
+from .files import check_there
 from .matrix_files import FileMatrices, read_matrices, usable
 from .node_contacts import NodeContact, contact_directions, load_direction, read_contacts
 
@@ -209,8 +210,7 @@ def _labels(labels) -> tuple[Label, ...] | None:
     if labels is None:
         return None
     if isinstance(labels, str | Path):
-        if not Path(labels).is_file():
-            raise ValueError(f"File `{labels}` does not exist.")
+        check_there(Path(labels))
         try:
             labels = np.loadtxt(labels, dtype=np.int64, delimiter="," if "," in Path(labels).read_text() else None)
         except ValueError as error:

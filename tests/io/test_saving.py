@@ -129,6 +129,9 @@ def test_what_cannot_be_saved_or_opened_is_refused(tmp_path):
         fj.open(tmp_path / "text.nc")
     with refused(ValueError, "none.nc", "does not exist"):
         fj.open(tmp_path / "none.nc")
+    for read in (fj.open, fj.read_matrices, lambda path: fj.read_recording(path.with_suffix(".csv"))):
+        with pytest.raises(FileNotFoundError, match="does not exist"):
+            read(tmp_path / "none.nc")
     with refused(TypeError, "`result`", "3 (int)"):
         fj.save(3, tmp_path / "three.nc")
     with refused(ValueError, "`dataset`", "scene"):
