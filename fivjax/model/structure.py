@@ -85,7 +85,13 @@ class FromParameters(eqx.Module):
 @functools.partial(by_numpy, always=True)
 def _matrices(matrices_of: Callable[..., tuple], parameters: dict[str, Float[Array, "..."]]) -> Matrices:
     def matrices(parameters):
-        return Matrices(*map(jnp.asarray, matrices_of(**parameters)))
+        found = matrices_of(**parameters)
+        if not isinstance(found, tuple | list) or len(found) != len(Matrices._fields):
+            raise TypeError(
+                f"Argument `matrices_of` must return (mass, damping, stiffness, load direction), but returns "
+                f"{arguments.describe(found)}."
+            )
+        return Matrices(*map(jnp.asarray, found))
 
     # Parameters that come out of `vmap` have leading axes; so have the matrices made from them.
     names, values = list(parameters), jnp.broadcast_arrays(*parameters.values())
@@ -201,7 +207,8 @@ class Structure(eqx.Module):
           The energy ledger then has a line for each.
         - `builder`: the function of the parameters by name that calls this one. `replace` calls it again, with its own checks.
 
-        **Raises:** what `Structure` raises for the matrices at these values.
+        **Raises:** `TypeError` for a function that needs its parameters' numbers, and what `Structure` raises for the matrices
+        at these values.
         """
         if not callable(matrices_of):
             raise TypeError(
@@ -220,7 +227,14 @@ class Structure(eqx.Module):
                 f"Argument `dampers` must name parameters, but has {unknown[0]!r}.{arguments.did_you_mean(unknown[0], numbers)}"
             )
         source = FromParameters(numbers, tuple(numbers), matrices_of, dampers, builder)
-        checked = cls(*source.matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
+        try:
+            matrices = source.matrices
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+            raise TypeError(
+                "Argument `matrices_of` must work out by `jax.numpy` what depends on its parameters, as maps and derivatives over "
+                "them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."
+            ) from error
+        checked = cls(*matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
 
     @property

@@ -743,3 +743,25 @@ def test_what_numpy_takes_for_something_else(paper_scene, call, error, fragments
     """Numbers without a value, spans of time for whole numbers, arrays for words."""
     with refused(error, *fragments):
         call(paper_scene)
+
+
+@pytest.mark.parametrize(
+    ("build", "fragments"),
+    [
+        (
+            lambda k: (np.eye(2), np.eye(2), np.array([[k, 0.0], [0.0, k]]), np.array([0.0, -1.0])),
+            ["`matrices_of`", "`jnp.array`"],
+        ),
+        (
+            lambda k: (np.eye(2), math.sqrt(k) * np.eye(2), np.eye(2), np.array([0.0, -1.0])),
+            ["`matrices_of`", "`jnp.sqrt`"],
+        ),
+        (lambda k: (np.eye(2) if k > 1 else 2 * np.eye(2),) * 4, ["`matrices_of`", "`jnp.where`"]),
+        (lambda k: (np.eye(2),) * 3, ["`matrices_of`", "mass, damping, stiffness, load direction"]),
+        (lambda k: None, ["`matrices_of`", "None"]),
+    ],
+)
+def test_what_makes_no_matrices_of_parameters(build, fragments):
+    """What needs the numbers of the parameters could not be followed by maps and derivatives."""
+    with refused(TypeError, *fragments):
+        fj.Structure.from_parameters(build, {"k": 1e4}, tangential=0, normal=1)
