@@ -231,8 +231,8 @@ class Structure(eqx.Module):
             matrices = source.matrices
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
             raise TypeError(
-                "Argument `matrices_of` must work out by `jax.numpy` what depends on its parameters, as maps and derivatives over "
-                "them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."
+                "Argument `matrices_of` must work out by `jax.numpy` what depends on its parameters, as maps and derivatives "
+                "over them demand. NumPy, `math` and `if` need the numbers; `jnp.array`, `jnp.sqrt` and `jnp.where` do not."
             ) from error
         checked = cls(*matrices, tangential, normal, contacts=contacts, coordinates=coordinates)
         return eqx.tree_at(lambda s: s.source, checked, source)
