@@ -12,7 +12,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.precision import is_known, returning_numpy
 from ..model.contact_coordinates import in_contact_coordinates
 from ..model.friction import slope_of
-from ..model.scene import Scene, steady_sliding
+from ..model.scene import Scene, refuse_several_contacts, steady_sliding
 from ..model.sliding import contact_coordinates, free_in_sliding
 from ..model.structure import Structure
 from .crossings import first_limit
@@ -200,7 +200,7 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
     **Returns:** `-inf` where no slope makes sliding unstable, and 0 where it is unstable even without a slope (by mode
     coupling).
 
-    **Raises:** `ValueError` for a belt at rest.
+    **Raises:** `ValueError` for a belt at rest, and for several contacts.
 
     **Example:**
 
@@ -208,12 +208,13 @@ def critical_slope(scene: Scene) -> Float[Array, ""]:
         >>> slope = fj.cea.critical_slope(falling)
     """
     scene = as_scene(_a_scene(scene), None, 1)
+    refuse_several_contacts(scene.structure, "`critical_slope`", "`growth_rate` takes several.")
     return _critical_slope(scene)
 
 
 @returning_numpy
 def friction_slope(scene: Scene) -> Float[Array, ""]:
-    """The slope dμ/dv of the scene's friction law at its belt speed, in s/m.
+    """The slope dμ/dv of the scene's friction law at its belt speed, in s/m; of several contacts, that of each.
 
     **Example:**
 
@@ -222,7 +223,8 @@ def friction_slope(scene: Scene) -> Float[Array, ""]:
         -0.0389
     """
     scene = as_scene(_a_scene(scene), None, 1)
-    return slope_of(scene.friction, jnp.abs(scene.belt_speed))
+    contacts, speed = len(scene.structure.contacts), jnp.abs(scene.belt_speed)
+    return slope_of(scene.friction, speed if contacts == 1 else jnp.broadcast_to(speed, (contacts,)))
 
 
 def _a_scene(scene):

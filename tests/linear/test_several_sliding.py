@@ -156,3 +156,11 @@ def test_the_limit_of_several_contacts_is_compiled_within_a_program_in_single_pr
     with jax.enable_x64(False):
         found = float(jax.jit(limit)(500.0))
     assert found == pytest.approx(float(limit(500.0)), rel=1e-5)
+
+
+def test_each_contact_has_the_slope_of_its_own_law_at_its_own_speed():
+    laws = [fj.ExponentialDecay(0.3, 0.1, 0.5), fj.Coulomb(0.2)]
+    scene = fj.Scene(coupled(), laws, [0.8, 0.3], fj.ConstantLoad(100.0))
+    np.testing.assert_allclose(fj.cea.friction_slope(scene), [-0.2 * 0.5 * np.exp(-0.5 * 0.8), 0.0], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"`critical_slope` takes structures with one contact, but this one has 2"):
+        fj.cea.critical_slope(scene)
