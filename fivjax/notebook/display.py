@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from .. import plot
 from ..calibration.result import Calibration
+from ..cycles.cycle import LimitCycle
 from ..foundation import arguments
 from ..linear.cea import Sensitivity
 from ..plot import energy as plot_energy
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 def show(result, **options) -> Figure:
     """The picture of a result.
 
-    **Arguments:** `result`, a `Trajectory`, a map, a critical perturbation, modes, a stability chart, energies per cycle,
-    sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of `fj.plot` that draws it.
+    **Arguments:** `result`, a `Trajectory`, a `LimitCycle` (one period), a map, a critical perturbation, modes, a stability
+    chart, energies per cycle, sensitivities, a `tradeoff` or a `Calibration`; `options` are those of the function of `fj.plot`
+    that draws it.
 
     **Returns:** a matplotlib figure.
 
@@ -39,6 +41,8 @@ def show(result, **options) -> Figure:
 
     if isinstance(result, Trajectory):
         return _of_trajectory(result, **options)
+    if isinstance(result, LimitCycle):
+        return _of_trajectory(result.trajectory(), of_phase_plane=1.0, **options)
     if isinstance(result, Sensitivity):
         return plot_linear.sensitivity(result.dataset, **options)
     if isinstance(result, Calibration):
@@ -80,14 +84,15 @@ def _refuse_more_axes(dataset: "xr.Dataset") -> None:
             )
 
 
-def _of_trajectory(run: Trajectory, **options) -> Figure:
+def _of_trajectory(run: Trajectory, of_phase_plane: float = 0.25, **options) -> Figure:
+    """Its response, and the last share of it in the phase plane."""
     if len(run.scene.structure.contacts) > 1:
         return plot.response(run, **options)
     figure = Figure(figsize=(10.0, 3.4), layout="constrained")
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(5, 3)), object)
     # A subfigure has all methods that these functions need.
     plot.response(run, **options, figure=left)  # pyright: ignore[reportArgumentType]
-    plot.phase_plane(run, last=0.25 * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
+    plot.phase_plane(run, last=of_phase_plane * float(run.t[-1]), figure=right)  # pyright: ignore[reportArgumentType]
     return figure
 
 

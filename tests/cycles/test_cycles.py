@@ -98,6 +98,14 @@ def test_one_period_by_simulation_ends_where_it_began(cycle):
     np.testing.assert_allclose(np.abs(cycle.harmonics[:3, 0]), np.abs(lines), rtol=1e-3)
 
 
+def test_a_cycle_is_shown_as_one_closed_period(cycle):
+    response, phase_plane = fj.show(cycle).axes
+    assert response.get_xlim()[1] == pytest.approx(cycle.period)
+    x, v = phase_plane.lines[0].get_data()
+    assert np.hypot((x[-1] - x[0]) / np.ptp(x), (v[-1] - v[0]) / np.ptp(v)) < 1e-9
+    assert np.ptp(v) > cycle.amplitude
+
+
 def test_energy_per_period_balances(cycle):
     """Over a period nothing is stored: what the contact puts in, dampers and impacts take."""
     energy = cycle.energy
