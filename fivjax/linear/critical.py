@@ -139,8 +139,8 @@ def critical_friction(structure: Structure, *, direction: int = 1) -> Float[Arra
     """
     own = _checked(structure, direction)
     traced, along = not all(map(is_known, jax.tree.leaves(structure))), jnp.asarray(float(direction))
-    if one_contact(structure):
-        return _traced_limit(structure, along) if traced else _critical_friction(matrices_only(structure), along)
+    if one_contact(own):
+        return _traced_limit(structure, along) if traced else _critical_friction(matrices_only(own), along)
     matrices, along = _several(own, direction)
     return _traced_limit_of_several(structure, along) if traced else _critical_friction_of_several(matrices, along)
 
@@ -174,9 +174,9 @@ def stability_limit(structure: Structure, *, direction: int = 1) -> StabilityLim
         (67.92, 'flutter')
     """
     own = _checked(structure, direction)
-    if not one_contact(structure):
+    if not one_contact(own):
         return _stability_limit_of_several(*_several(own, direction))
-    return _stability_limit(matrices_only(structure), jnp.asarray(float(direction)))
+    return _stability_limit(matrices_only(own), jnp.asarray(float(direction)))
 
 
 def _slope_limit(scene):

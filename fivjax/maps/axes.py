@@ -24,6 +24,10 @@ def linear_limit(scene: Scene, axes: Mapping[str, np.ndarray]) -> dict[str, floa
     return {"mu_crit": limit} if np.isfinite(limit) else {}
 
 
+# Names of maps' results beside those of each trajectory.
+OF_RESULTS = ("attractors", "attractor", "proof", "chaotic", "contact_events", "computed", "p_crit")
+
+
 def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     unknown = [name for name in axes if name not in scene.parameters]
     if unknown:
@@ -32,6 +36,12 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
         raise ValueError(f"Unknown axis `{unknown[0]}`; this scene has: {', '.join(sorted(scene.parameters))}.{hint}")
     # Names may be NumPy's strings, such as those of a dataset's coordinates.
     checked = {str(name): arguments.axis(name, values) for name, values in axes.items()}
+    taken = {*by_name(not_run(1, True)), *OF_RESULTS}
+    for name in checked:
+        if name in taken:
+            raise ValueError(
+                f"Axis `{name}` has the name of a result of maps. Call that parameter of the scene otherwise."
+            )
     check_corners(scene, checked)
     return checked
 

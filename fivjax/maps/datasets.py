@@ -82,7 +82,7 @@ def map_dataset(
     shape = (-1,) if sparse else grid.shape
     dataset = xr.Dataset({name: (dims, values.reshape(shape)) for name, values in results.items()}, coords)
     dataset = dataset.assign({name: ("attractors", column) for name, column in table.items()})
-    if not sparse:
+    if not sparse and "p" in grid.of_kick:
         dataset = with_critical_kicks(dataset)
     labelled(dataset, scene, method=describe_method(method), **time_limit(t_max))
     dataset.attrs.update(kernels_by(method, scene))

@@ -35,6 +35,8 @@ def describe(scene) -> dict:
         "load": type(scene.load).__name__,
         "impact_law": scene.impact_law,
         "parameters": {name: np.asarray(value).tolist() for name, value in scene.parameters.items()},
+        "of_friction": list(scene.parameters_of("friction law")),
+        "of_load": list(scene.parameters_of("load")),
         **{name: np.asarray(getattr(structure, name)).tolist() for name in MATRICES},
         **_places(structure),
         "coordinates": list(structure.coordinates),
@@ -118,11 +120,16 @@ def arguments_of_scene(description: Mapping) -> dict:
     numbers that were saved; errors of other kinds for a damaged description.
     """
     parameters = description["parameters"]
+
+    def of(part: str) -> dict:
+        # Parts may have optional numbers by names that others have, too.
+        return {name: parameters[name] for name in description.get(part, parameters)}
+
     return {
         "structure": _structure(description),
-        "friction": _friction(description["friction"], parameters),
+        "friction": _friction(description["friction"], of("of_friction")),
         "belt_speed": parameters["belt_speed"],
-        "load": _part(AbstractLoad, "load", description["load"], parameters),
+        "load": _part(AbstractLoad, "load", description["load"], of("of_load")),
         "restitution": parameters["restitution"],
         "impact_law": description["impact_law"],
     }
@@ -133,11 +140,24 @@ def _structure(description: Mapping) -> Structure:
     if builder is not None:
         names = builder().parameters
         if set(names) <= set(description["parameters"]):
-            return builder(**{name: description["parameters"][name] for name in names})
+            built = builder(**{name: description["parameters"][name] for name in names})
+            if _is_described(built, description):
+                return built
     places = {name: description[name] for name in ("tangential", "normal", "coordinates") if name in description}
     if "contacts" in description:
         places["contacts"] = [ContactPoint(pair["tangential"], pair["normal"]) for pair in description["contacts"]]
     return Structure(**{name: np.asarray(description[name]) for name in MATRICES}, **places)
+
+
+def _is_described(structure: Structure, description: Mapping) -> bool:
+    """Whether it has the matrices and coordinates of a description: a user's own function may have the name of another."""
+    if list(structure.coordinates) != description["coordinates"]:
+        return False
+    for name in MATRICES:
+        own, other = np.asarray(getattr(structure, name)), np.asarray(description[name])
+        if own.shape != other.shape or np.any(np.abs(own - other) > 1e-9 * np.max(np.abs(other))):
+            return False
+    return True
 
 
 def _friction(name: str | list[str], parameters: Mapping):

@@ -119,6 +119,10 @@ class Scene(eqx.Module):
         """Every numeric parameter by the name that `replace` and the axes of a map know it by."""
         return {name: value for own in self._parameters_of_parts().values() for name, value in own.items()}
 
+    def parameters_of(self, part: str) -> dict[str, Array]:
+        """Those of a part: "scene", "friction law", "load" or "structure"."""
+        return self._parameters_of_parts()[part]
+
     def _parameters_of_parts(self) -> dict[str, dict[str, Array]]:
         # Other fields of a user's own law, such as strings and switches, are no parameters.
         friction, load = (

@@ -62,9 +62,9 @@ def show(result, **options) -> Figure:
 
 # The function that draws a dataset, by the variables that it has.
 _PICTURES = (
+    (lambda d: "manifold" in d and "path" in d, plot.boundary_section),
     (lambda d: "verdict" in d, plot.bistability),
     (lambda d: "special" in d and "word" in d, plot.branch),
-    (lambda d: "manifold" in d and "path" in d, plot.boundary_section),
     (lambda d: "crossings" in d and d["p_crit"].ndim == 1 and d["p_crit"].size > 1, plot.critical),
     (lambda d: "damping_ratio" in d and d["frequency"].shape[0] > 1, plot_linear.eigenvalues),
     (lambda d: "growth_rate" in d and "mode" not in d.dims and d["growth_rate"].ndim == 2, plot_linear.chart),

@@ -45,18 +45,12 @@ def response(
     check_run(run)
     structure = run.scene.structure
     several = len(structure.contacts) > 1
-    if several and coordinate is None:
-        places = [tangential for tangential, _ in structure.places]
-    else:
-        places = [structure.tangential if coordinate is None else coordinate]
+    places = [tangential for tangential, _ in structure.places] if coordinate is None else [coordinate]
     figure = new_figure(figure, 8.0, 3.6 if len(places) == 1 else 1.2 + 1.6 * len(places))
     panels = figure.subplots(len(places), 1, sharex=True, squeeze=False)[:, 0]
     found = {}
     for contact, (axes, place) in enumerate(zip(panels, places, strict=True)):
-        if isinstance(place, tuple):
-            values, what = _of(run, quantity) @ np.array(place), "along the belt"
-        else:
-            values, what = _of(run, quantity)[:, place], coordinate_label(structure, place)
+        values, what = _along(run, quantity, place)
         axes.plot(run.t, values, color=BLACK, lw=0.8)
         handles = [] if several and coordinate is not None else shade_status(axes, run, contact)
         found.update({handle.get_label(): handle for handle in [*handles, *mark_kick(axes, run)]})
@@ -66,6 +60,19 @@ def response(
     if found:
         legend_above(panels[0], list(found.values()))
     return figure
+
+
+def _along(run: Trajectory, quantity: str, place: int | tuple[float, ...]) -> tuple[np.ndarray, str]:
+    """A quantity at a coordinate, or along a direction of a contact given by vectors; and what that is called."""
+    if isinstance(place, tuple):
+        return _of(run, quantity) @ np.array(place), "along the belt"
+    return _of(run, quantity)[:, place], coordinate_label(run.scene.structure, place)
+
+
+def _tangential(run: Trajectory) -> int | tuple[float, ...]:
+    """Where the only contact's tangential direction is. Several are refused."""
+    structure = run.scene.structure
+    return structure.tangential if len(structure.contacts) > 1 else structure.places[0][0]
 
 
 def phase_plane(
@@ -128,17 +135,17 @@ def perturbation(run: Trajectory, *, zoom: float | None = None, figure: Figure |
     windows = (
         [whole] if zoom is None else [(max(whole[0], begin - 0.2 * zoom), min(whole[1], begin + 0.8 * zoom)), whole]
     )
-    tangential = run.scene.structure.tangential
+    acceleration, what = _along(run, "acceleration", _tangential(run))
     for (upper, lower), window in zip(panels.T, windows, strict=True):
         upper.step(run.t, run.load, where="post", color=VERMILION, lw=1.6)
-        lower.plot(run.t, np.asarray(run.acceleration)[:, tangential], color=BLUE, lw=0.7)
+        lower.plot(run.t, acceleration, color=BLUE, lw=0.7)
         mark_kick(lower, run)
         lower.set(xlabel="time (s)", xlim=window)
     # The axis covers the range of the load, not zero, so that a kick of a tenth is visible.
     low, high = float(np.min(run.load)), float(np.max(run.load))
     room = 0.2 * (high - low) or 0.1 * high
     panels[0, 0].set(ylabel="load (N)", ylim=(low - room, high + room))
-    panels[1, 0].set_ylabel(with_unit(f"{coordinate_label(run.scene.structure, tangential)},\nacceleration", "m/s2"))
+    panels[1, 0].set_ylabel(with_unit(f"{what},\nacceleration", "m/s2"))
     if zoom is not None:
         for upper, name in zip(panels[0], ("around the kick", "whole run"), strict=True):
             upper.set_title(name, loc="right", fontsize="medium")
@@ -159,12 +166,11 @@ def comparison(
     figure = new_figure(figure, 8.0, 1.2 + 1.9 * len(runs))
     rows = list(figure.subplots(len(runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0])
     for axes, (name, run), colour in zip(rows, runs.items(), [BLUE, ORANGE, GREEN, PURPLE] * len(runs), strict=False):
-        tangential = run.scene.structure.tangential
-        axes.plot(run.t, _of(run, quantity)[:, tangential], color=colour, lw=0.7)
+        values, what = _along(run, quantity, _tangential(run))
+        axes.plot(run.t, values, color=colour, lw=0.7)
         handles = [Line2D([], [], color=colour, label=name), *shade_status(axes, run), *mark_kick(axes, run)]
         legend_above(axes, handles, columns=4)
-        label = f"{coordinate_label(run.scene.structure, tangential)},\n{quantity}"
-        axes.set_ylabel(with_unit(label, QUANTITIES[quantity][1]))
+        axes.set_ylabel(with_unit(f"{what},\n{quantity}", QUANTITIES[quantity][1]))
         axes.set_xlim(run.t[0], run.t[-1])
     rows[-1].set_xlabel("time (s)")
     return figure

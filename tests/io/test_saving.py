@@ -227,3 +227,31 @@ def test_a_scene_prints_its_values(run):
     # What is printed is the call that makes the scene.
     rebuilt = eval(text.replace("Scene(", "fj.Scene(", 1), {"fj": fj, **{name: getattr(fj, name) for name in dir(fj)}})
     assert same(rebuilt, run.scene)
+
+
+def test_a_parameter_of_a_structure_is_none_of_a_law_that_does_without(tmp_path):
+    """`Coulomb` has an optional `mu_static`: a scene that comes back must not find it in the structure."""
+
+    def matrices(mu_static):
+        return jnp.eye(2), 0.1 * jnp.eye(2), jnp.diag(jnp.stack([mu_static, jnp.asarray(4.0)])), jnp.array([0.0, -1.0])
+
+    structure = fj.Structure.from_parameters(matrices, {"mu_static": 1.0}, tangential=0, normal=1)
+    scene = fj.Scene(structure, fj.Coulomb(0.2), 0.3, fj.ConstantLoad(1.0))
+    again = fj.Scene.from_dataset(fj.simulate(scene, 0.1, 0.05).to_dataset())
+    assert str(again.friction) == str(scene.friction)
+
+
+def test_a_structure_comes_back_as_what_it_was_whatever_made_it():
+    def matrices(k1, **others):
+        mass, damping, stiffness, load = fj.belt_oscillator(k1=k1, **others).matrices
+        return mass, damping, 2 * stiffness, load
+
+    def build(**parameters):
+        return fj.Structure.from_parameters(matrices, parameters, tangential=0, normal=2, builder=build)
+
+    build.__name__ = "belt_oscillator"
+    own = {name: float(value) for name, value in fj.belt_oscillator().parameters.items()}
+    scene = fj.Scene(build(**own), fj.Coulomb(0.2), 1.0, fj.ConstantLoad(100.0))
+    again = fj.Scene.from_dataset(fj.simulate(scene, 0.01, 1e-3).to_dataset())
+    np.testing.assert_array_equal(again.structure.stiffness, scene.structure.stiffness)
+    assert again.structure.coordinates == scene.structure.coordinates

@@ -164,3 +164,38 @@ def test_each_contact_has_the_slope_of_its_own_law_at_its_own_speed():
     np.testing.assert_allclose(fj.cea.friction_slope(scene), [-0.2 * 0.5 * np.exp(-0.5 * 0.8), 0.0], rtol=1e-12)
     with pytest.raises(ValueError, match=r"`critical_slope` takes structures with one contact, but this one has 2"):
         fj.cea.critical_slope(scene)
+
+
+def turned(structure: fj.Structure) -> fj.Structure:
+    """The same structure in other coordinates, in which its contact is given by vectors."""
+    turn = np.array([[0.8, -0.5, 0.3], [0.4, 0.9, -0.2], [-0.3, 0.25, 1.1]])
+    matrices = (turn.T @ np.asarray(matrix) @ turn for matrix in structure.matrices[:3])
+    load, contact = turn.T @ np.asarray(structure.load_direction), fj.ContactPoint(turn[0], turn[2])
+    return fj.Structure(*(0.5 * (one + one.T) for one in matrices), load, contacts=[contact])
+
+
+@pytest.mark.parametrize("changed", [{"k2": 130e3, "theta": 0.003}, {"theta": -0.01}, {}])
+def test_one_contact_given_by_vectors_has_the_limit_of_one_at_coordinates(changed):
+    """Also above 2, up to which limits of several contacts are sought."""
+    plain = fj.belt_oscillator(**changed)
+    expected, found = fj.cea.stability_limit(plain), fj.cea.stability_limit(turned(plain))
+    assert found.mechanism is expected.mechanism
+    assert found.mu == pytest.approx(expected.mu, rel=1e-8)
+    assert float(fj.cea.critical_friction(turned(plain))) == pytest.approx(expected.mu, rel=1e-8)
+
+
+def test_without_damping_a_contact_given_by_vectors_has_sensitivities():
+    """Limits of several contacts have none then. Differences are the reference."""
+    structure = turned(fj.belt_oscillator(c1=0.0, c2=0.0))
+    found = fj.cea.sensitivity(structure)["stiffness[0,0]"]
+
+    def limit(step):
+        stiffness = np.array(structure.stiffness)
+        stiffness[0, 0] += step
+        matrices = np.asarray(structure.mass), np.asarray(structure.damping), stiffness
+        return float(
+            fj.cea.critical_friction(fj.Structure(*matrices, structure.load_direction, contacts=structure.contacts))
+        )
+
+    # To one side, because nothing holds the structure in one direction but the belt.
+    assert found == pytest.approx((4 * limit(1.0) - limit(2.0) - 3 * limit(0.0)) / 2, rel=1e-5)

@@ -97,3 +97,9 @@ def test_results_show_in_a_running_ipython(scene, run, a_map, monkeypatch):
     assert shell.display_formatter.format(figure)[0]["image/png"]
     figure.canvas.manager = object()
     assert "image/png" not in shell.display_formatter.format(figure)[0]
+
+
+def test_a_boundary_has_a_picture_of_its_own_although_it_has_verdicts():
+    boundary = xr.Dataset({name: ("a", np.zeros(2)) for name in ("verdict", "manifold", "path")})
+    drawing = next(draw for is_one, draw in display._PICTURES if is_one(boundary))
+    assert drawing is fj.plot.boundary_section

@@ -765,3 +765,15 @@ def test_what_makes_no_matrices_of_parameters(build, fragments):
     """What needs the numbers of the parameters could not be followed by maps and derivatives."""
     with refused(TypeError, *fragments):
         fj.Structure.from_parameters(build, {"k": 1e4}, tangential=0, normal=1)
+
+
+@pytest.mark.parametrize("name", ["verdict", "attractors", "amplitude", "p_crit"])
+def test_axes_with_names_of_results(name):
+    """Refused before anything is computed."""
+
+    def matrices(**parameters):
+        return 3 * (jax.numpy.diag(jax.numpy.array([1.0, parameters[name]])),) + (jax.numpy.array([0.0, -1.0]),)
+
+    structure = fj.Structure.from_parameters(matrices, {name: 1.0}, tangential=0, normal=1)
+    with refused(ValueError, f"`{name}`", "a result of maps"):
+        fj.bistability_map(fj.Scene(structure, fj.Coulomb(0.2), 0.3, fj.ConstantLoad(1.0)), **{name: [0.9, 1.1]})

@@ -316,3 +316,16 @@ def test_pictures_leave_pyplot_alone():
     """Importing fivjax must not import pyplot, whose state is global."""
     code = "import sys, fivjax, fivjax.plot; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def test_runs_of_a_contact_given_by_vectors_are_drawn_along_its_belt():
+    turn = np.array([[0.8, -0.5, 0.3], [0.4, 0.9, -0.2], [-0.3, 0.25, 1.1]])
+    plain = fj.belt_oscillator()
+    matrices = (turn.T @ np.asarray(matrix) @ turn for matrix in plain.matrices[:3])
+    load, contact = turn.T @ np.asarray(plain.load_direction), fj.ContactPoint(turn[0], turn[2])
+    structure = fj.Structure(*(0.5 * (one + one.T) for one in matrices), load, contacts=[contact])
+    run = fj.simulate(fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2)), 0.02, 1e-3)
+    expected = run.acceleration @ turn[0]
+    for figure in (fj.show(run), fj.plot.response(run), fj.plot.comparison({"a": run})):
+        np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), expected)
+    np.testing.assert_allclose(fj.plot.perturbation(run).axes[1].lines[0].get_ydata(), expected)
