@@ -12,11 +12,11 @@ class MissingFile(FileNotFoundError, ValueError):
     """A file that is to be read and is not there."""
 
 
-def check_there(path: Path) -> None:
-    """Refuse the path of a file that is not there."""
+def check_there(path: Path, of: str = "") -> None:
+    """Refuse the path of a file that is not there; `of` what it is."""
     if not path.is_file():
         raise MissingFile(
-            f"File `{path}` {'is a folder; give the name of a file in it' if path.is_dir() else 'does not exist'}."
+            f"File `{path}`{of} {'is a folder; give the name of a file in it' if path.is_dir() else 'does not exist'}."
         )
 
 

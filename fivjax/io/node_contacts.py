@@ -53,7 +53,7 @@ def read_contacts(path: str | Path) -> list[NodeContact]:
 
     **Raises:** `ValueError` with the line that cannot be used.
     """
-    check_there(Path(path))
+    check_there(Path(path), " of contacts")
     lines = [
         (number, line)
         for number, line in enumerate(text_of(Path(path)).lstrip("\ufeff").splitlines(), 1)
