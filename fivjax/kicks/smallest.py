@@ -22,6 +22,7 @@ from ..foundation.digits import apart
 from ..foundation.kept_programs import kept
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported
+from ..maps.groups import OF_KICK
 from ..model.load import Pulse
 from ..model.scene import Scene, refuse_several_contacts
 from ..verdicts.sliding_proof import envelope_peak
@@ -34,8 +35,6 @@ from .stable_manifold import Saddle, critical_kick, saddle_of
 GRID, STARTS = 4096, 24
 # Steps of a search; and the derivative of p_crit that counts as zero, relative to p - 1 per duration.
 MOST_STEPS, LEVEL = 24, 1e-9
-# What of a kick may be free.
-OF_KICK = ("p", "duration", "start")
 
 
 class SmallestKick(NamedTuple):

@@ -152,9 +152,8 @@ def kick_of(scene: Scene) -> dict[str, float]:
     """The parameters of a scene's kick, with its values: those of its load on which the final load does not depend. They do not
     change the mechanics.
     """
-    load = scene.load
-    numbers = {name: value for name, value in vars(load).items() if eqx.is_inexact_array(value) and value.ndim == 0}
-    with_numbers = functools.partial(eqx.tree_at, lambda load: [getattr(load, name) for name in numbers], load)
+    numbers = {name: value for name, value in scene.parameters_of("load").items() if value.ndim == 0}
+    with_numbers = functools.partial(eqx.tree_at, lambda load: [getattr(load, name) for name in numbers], scene.load)
     traced = jax.make_jaxpr(lambda values: jnp.asarray(with_numbers(values).final))(list(numbers.values()))
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return {name: float(value) for (name, value), of_final in zip(numbers.items(), used, strict=True) if not of_final}

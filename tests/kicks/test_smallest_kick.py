@@ -11,6 +11,7 @@ from fivjax.kicks.perturbations import Histories, InitialStates
 from fivjax.kicks.smallest import certified_excess
 from fivjax.model.sliding import sliding_states
 from tests.helpers import reference
+from tests.helpers.general_coordinates import TURN, in_general_coordinates
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 
@@ -93,12 +94,7 @@ def test_certified_perturbations_just_reach_the_end_of_sliding(of):
 
 def test_the_smallest_state_is_given_in_the_structure_s_own_coordinates(monkeypatch):
     """Computed where the contact's directions are coordinates; `values` is the `y0` of the caller's scene."""
-    plain, turn = SCENE.structure, np.array([[1.0, 0.3, -0.2], [0.1, 1.2, 0.4], [-0.3, 0.2, 0.9]])
-    mass, damping, stiffness = (
-        turn.T @ np.asarray(part) @ turn for part in (plain.mass, plain.damping, plain.stiffness)
-    )
-    load = turn.T @ np.asarray(plain.load_direction)
-    turned = fj.Structure(mass, damping, stiffness, load, tangential=turn[0], normal=turn[2])
+    turned = in_general_coordinates(SCENE.structure)
     inside = []
 
     def found(scene):
@@ -113,7 +109,7 @@ def test_the_smallest_state_is_given_in_the_structure_s_own_coordinates(monkeypa
     y = fj.smallest_kick(scene, over="state").values
     assert inside[0].structure.contacts_at_coordinates
     np.testing.assert_allclose(y[:3], fj.sliding_equilibrium(scene), rtol=1e-9)
-    assert turn[0] @ y[3:] == pytest.approx(0.1) and turn[2] @ y[3:] == pytest.approx(0.0, abs=1e-12)
+    assert TURN[0] @ y[3:] == pytest.approx(0.1) and TURN[2] @ y[3:] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_states_and_histories_are_refused_what_they_do_not_have():

@@ -10,6 +10,7 @@ from scipy import linalg
 import fivjax as fj
 from fivjax.linear.linearisation import LOWEST_SLIP, linear_sliding
 from fivjax.verdicts.sliding_proof import why_withheld
+from tests.helpers.general_coordinates import in_general_coordinates
 
 
 def coupled(coupling: float = 0.0, stretch: float = 1.0) -> fj.Structure:
@@ -166,27 +167,19 @@ def test_each_contact_has_the_slope_of_its_own_law_at_its_own_speed():
         fj.cea.critical_slope(scene)
 
 
-def turned(structure: fj.Structure) -> fj.Structure:
-    """The same structure in other coordinates, in which its contact is given by vectors."""
-    turn = np.array([[0.8, -0.5, 0.3], [0.4, 0.9, -0.2], [-0.3, 0.25, 1.1]])
-    matrices = (turn.T @ np.asarray(matrix) @ turn for matrix in structure.matrices[:3])
-    load, contact = turn.T @ np.asarray(structure.load_direction), fj.ContactPoint(turn[0], turn[2])
-    return fj.Structure(*(0.5 * (one + one.T) for one in matrices), load, contacts=[contact])
-
-
 @pytest.mark.parametrize("changed", [{"k2": 130e3, "theta": 0.003}, {"theta": -0.01}, {}])
 def test_one_contact_given_by_vectors_has_the_limit_of_one_at_coordinates(changed):
     """Also above 2, up to which limits of several contacts are sought."""
     plain = fj.belt_oscillator(**changed)
-    expected, found = fj.cea.stability_limit(plain), fj.cea.stability_limit(turned(plain))
+    expected, found = fj.cea.stability_limit(plain), fj.cea.stability_limit(in_general_coordinates(plain))
     assert found.mechanism is expected.mechanism
     assert found.mu == pytest.approx(expected.mu, rel=1e-8)
-    assert float(fj.cea.critical_friction(turned(plain))) == pytest.approx(expected.mu, rel=1e-8)
+    assert float(fj.cea.critical_friction(in_general_coordinates(plain))) == pytest.approx(expected.mu, rel=1e-8)
 
 
 def test_without_damping_a_contact_given_by_vectors_has_sensitivities():
     """Limits of several contacts have none then. Differences are the reference."""
-    structure = turned(fj.belt_oscillator(c1=0.0, c2=0.0))
+    structure = in_general_coordinates(fj.belt_oscillator(c1=0.0, c2=0.0))
     found = fj.cea.sensitivity(structure)["stiffness[0,0]"]
 
     def limit(step):

@@ -14,6 +14,7 @@ from fivjax import plot
 from fivjax.maps.axes import linear_limit
 from fivjax.plot.contact_status import KICK_HEIGHT
 from fivjax.plot.style import coordinate_label
+from tests.helpers.general_coordinates import TURN, in_general_coordinates
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), 1.0, fj.Pulse(100.0, 1.3, start=0.02))
 
@@ -319,13 +320,9 @@ def test_pictures_leave_pyplot_alone():
 
 
 def test_runs_of_a_contact_given_by_vectors_are_drawn_along_its_belt():
-    turn = np.array([[0.8, -0.5, 0.3], [0.4, 0.9, -0.2], [-0.3, 0.25, 1.1]])
-    plain = fj.belt_oscillator()
-    matrices = (turn.T @ np.asarray(matrix) @ turn for matrix in plain.matrices[:3])
-    load, contact = turn.T @ np.asarray(plain.load_direction), fj.ContactPoint(turn[0], turn[2])
-    structure = fj.Structure(*(0.5 * (one + one.T) for one in matrices), load, contacts=[contact])
+    structure = in_general_coordinates(fj.belt_oscillator())
     run = fj.simulate(fj.Scene(structure, fj.Coulomb(0.2), 1.0, fj.Pulse(100.0, 1.2)), 0.02, 1e-3)
-    expected = run.acceleration @ turn[0]
+    expected = run.acceleration @ TURN[0]
     for figure in (fj.show(run), fj.plot.response(run), fj.plot.comparison({"a": run})):
         np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), expected)
     np.testing.assert_allclose(fj.plot.perturbation(run).axes[1].lines[0].get_ydata(), expected)
