@@ -4,6 +4,7 @@ xarray is imported where a dataset is made or opened, never before: `import fivj
 """
 
 import json
+from collections.abc import Collection, Iterable
 from datetime import UTC, datetime
 from importlib import metadata
 from io import BytesIO
@@ -57,6 +58,15 @@ def labelled(dataset: "xr.Dataset", scene: Scene, **settings) -> "xr.Dataset":
         "scene": json.dumps(describe(scene)),
     }
     return dataset
+
+
+def check_axis_names(axes: Iterable[str], results: Collection[str], of: str) -> None:
+    """Refuse axes that are called like a result, beside which they would stand in the dataset; `of` says of what."""
+    for name in axes:
+        if name in results:
+            raise ValueError(
+                f"Axis `{name}` has the name of a result of {of}. Call that parameter of the scene otherwise."
+            )
 
 
 # Suffixes of what `save` does not write.

@@ -11,7 +11,7 @@ from ..cycles.own_coordinates import in_own_coordinates
 from ..foundation import arguments
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import reported, stage
-from ..io.datasets import labelled
+from ..io.datasets import check_axis_names, labelled
 from ..maps.axes import check_run, check_size, checked_axes, linear_limit
 from ..maps.crossing import FirstCrossing, first_crossings, with_ends
 from ..maps.datasets import time_limit
@@ -27,6 +27,12 @@ from ..steppers.event_exact import EventExact
 from ..steppers.where_switched import WhereSwitched
 from ..verdicts.verdict import Verdict
 from .critical_derivatives import differentiable, with_derivatives
+
+# Names in the dataset of critical kicks, beside those of maps.
+OF_RESULTS = (
+    *("p_crit_low", "p_crit_high", "p_crit_error", "crossings", "only_crossing", "critical_energy", "kick_work"),
+    *("d_p_crit", "parameter", "kind", "why_none", "newton_trajectories"),
+)
 
 
 @reported("critical kicks")
@@ -127,6 +133,7 @@ def critical_perturbation(
     scanned = round(min((high - low) / p_step, 1e15)) + 1
     check_size({**axis, "p": range(scanned)}, energy=bool(energy))
     axes = checked_axes(scene, axis)
+    check_axis_names(axes, OF_RESULTS, "critical kicks")
     shape = tuple(len(values) for values in axes.values())
     columns = {
         name: values.ravel() for name, values in zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True)

@@ -10,7 +10,7 @@ from ..foundation.kept_programs import kept
 from ..foundation.linear_solve import solve
 from ..foundation.matrix_routines import eigenvalues
 from ..foundation.precision import in_double_precision, real
-from ..io.datasets import labelled
+from ..io.datasets import check_axis_names, labelled
 from ..model.scene import Scene
 from ..model.sliding import sliding_coordinates, sliding_matrices, sliding_rows
 from ..model.structure import Structure
@@ -54,6 +54,7 @@ def chart(system: Structure | Scene, *, direction: int = 1, **parameters) -> "xr
     import xarray as xr
 
     scene, axes = with_axes(system, direction, parameters, count=2)
+    check_axis_names(axes, ("growth_rate", "frequency", "margin", "normal_force"), "stability charts")
     grid = np.meshgrid(*axes.values(), indexing="ij")
     shape = grid[0].shape
     columns = [values.ravel() for values in grid]

@@ -16,7 +16,7 @@ from ..foundation import arguments
 from ..foundation.compiling import compiled
 from ..foundation.digits import apart
 from ..foundation.precision import in_double_precision, real
-from ..io.datasets import labelled
+from ..io.datasets import check_axis_names, labelled
 from ..model.structure import Structure
 from .critical import critical_friction
 from .gradient_search import BracketedNewton as BracketedNewton
@@ -174,6 +174,7 @@ def _design(structure: Structure, bounds, tied, goal: _Goal, steps: int, rate: f
 
     name, quantity, target, larger_is_better = goal
     bounds, low, width = _check_bounds(structure, bounds, tied)
+    check_axis_names({*bounds, *tied}, ("step", name.replace(" ", "_")), "designs")
     names = list(bounds)
     start = np.array([(float(structure.parameters[key]) - low[i]) / width[i] for i, key in enumerate(names)])
 

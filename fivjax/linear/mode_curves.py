@@ -6,7 +6,7 @@ import numpy as np
 
 from ..foundation.precision import in_double_precision
 from ..foundation.progress import following, stage, tick
-from ..io.datasets import labelled
+from ..io.datasets import check_axis_names, labelled
 from ..model.scene import Scene
 from ..model.structure import Structure
 from .critical import stability_limit
@@ -17,6 +17,13 @@ from .system import with_axes
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+# Names in the dataset of modes.
+OF_RESULTS = (
+    *("mode", "coordinate", "frequency", "growth_rate", "damping_ratio", "eigenvalue", "partner", "shape"),
+    *("mu_crit", "frequency_crit", "mu_coalescence"),
+)
 
 
 @in_double_precision
@@ -46,6 +53,7 @@ def modes(system: Structure | Scene, *, direction: int = 1, progress: bool | Non
         >>> modes = fj.cea.modes(structure, mu=np.linspace(0.0, 0.5, 101))
     """
     scene, axes = with_axes(system, direction, parameters, count=1)
+    check_axis_names(axes, OF_RESULTS, "modes")
     ((name, values),) = axes.items()
     with following("modes", shown=progress, total=len(values), unit=" values"):
         stage("compiling")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..foundation import arguments
+from ..io.datasets import check_axis_names
 from ..linear.critical import critical_friction
 from ..model.scene import Scene, check_corners
 from ..steppers.base import AbstractStepper
@@ -37,11 +38,7 @@ def checked_axes(scene: Scene, axes: dict) -> dict[str, np.ndarray]:
     # Names may be NumPy's strings, such as those of a dataset's coordinates.
     checked = {str(name): arguments.axis(name, values) for name, values in axes.items()}
     taken = {*by_name(not_run(1, True)), *OF_RESULTS}
-    for name in checked:
-        if name in taken:
-            raise ValueError(
-                f"Axis `{name}` has the name of a result of maps. Call that parameter of the scene otherwise."
-            )
+    check_axis_names(checked, taken, "maps")
     check_corners(scene, checked)
     return checked
 

@@ -128,6 +128,12 @@ def _states_among(scene: Scene, axes: dict) -> dict[str, int]:
             f"Unknown axis `{unknown[0]}`; the states are {', '.join(known)}, and the scene has "
             f"{', '.join(sorted(scene.parameters))}.{arguments.did_you_mean(unknown[0], [*known, *scene.parameters])}"
         )
+    both = next((name for name in axes if name in known and name in scene.parameters), None)
+    if both is not None:
+        raise ValueError(
+            f"Axis `{both}` is a part of the state and a parameter of the scene. Call one of them otherwise: `coordinates` of "
+            f"the structure are names of your choice."
+        )
     return {name: known[name] for name in axes if name in known}
 
 

@@ -114,6 +114,9 @@ def test_windows_have_bounds_and_as_many_points_as_are_asked_for(scene, tmp_path
         assert part[name].equals(inside[name]), name
     # In whatever order somebody has put the points.
     assert fj.window(sparse.sortby("p")).equals(whole) and fj.window(sparse.sortby("amplitude")).equals(whole)
+    # A number of the structure may be called `p`: then it is no kick.
+    said = json.loads(sparse.attrs["scene"]) | {"of_load": []}
+    assert "p_crit" in whole and "p_crit" not in fj.window(sparse.assign_attrs(scene=json.dumps(said)))
     few = fj.window(sparse, most=5)
     assert dict(few["verdict"].sizes) == {"mu": 4, "p": 5}
     assert few["verdict"].equals(whole["verdict"][::4, ::4])

@@ -18,6 +18,7 @@ import fivjax as fj
 from fivjax import cli
 from fivjax.foundation import arguments, digits
 from fivjax.io import files
+from fivjax.linear.design import lower_growth_rate
 from tests.helpers.refusing import EngineReached, refused, refused_on_the_command_line, untouched, without_engines
 
 
@@ -767,13 +768,41 @@ def test_what_makes_no_matrices_of_parameters(build, fragments):
         fj.Structure.from_parameters(build, {"k": 1e4}, tangential=0, normal=1)
 
 
-@pytest.mark.parametrize("name", ["verdict", "attractors", "amplitude", "p_crit"])
-def test_axes_with_names_of_results(name):
-    """Refused before anything is computed."""
-
+def _with_a_parameter(name: str, **settings) -> fj.Structure:
     def matrices(**parameters):
         return 3 * (jax.numpy.diag(jax.numpy.array([1.0, parameters[name]])),) + (jax.numpy.array([0.0, -1.0]),)
 
-    structure = fj.Structure.from_parameters(matrices, {name: 1.0}, tangential=0, normal=1)
-    with refused(ValueError, f"`{name}`", "a result of maps"):
-        fj.bistability_map(fj.Scene(structure, fj.Coulomb(0.2), 0.3, fj.ConstantLoad(1.0)), **{name: [0.9, 1.1]})
+    return fj.Structure.from_parameters(matrices, {name: 1.0}, tangential=0, normal=1, **settings)
+
+
+@pytest.mark.parametrize(
+    ("result", "of", "call"),
+    [
+        *(
+            (name, "maps", lambda scene, **axis: fj.bistability_map(scene, **axis))
+            for name in ("verdict", "attractors", "amplitude", "p_crit")
+        ),
+        ("parameter", "critical kicks", lambda scene, **axis: fj.critical_perturbation(scene, **axis)),
+        ("mode", "modes", lambda scene, **axis: fj.cea.modes(scene, **axis)),
+        ("frequency", "modes", lambda scene, **axis: fj.cea.modes(scene, **axis)),
+        ("margin", "stability charts", lambda scene, **axis: fj.cea.chart(scene, mu=[0.1, 0.2], **axis)),
+        (
+            "worst_growth_rate",
+            "designs",
+            lambda scene, **axis: lower_growth_rate(scene.structure, dict.fromkeys(axis, (0.9, 1.1)), mu=[0.1]),
+        ),
+    ],
+)
+def test_axes_with_names_of_results(result, of, call):
+    """Refused before anything is computed."""
+    scene = fj.Scene(_with_a_parameter(result), fj.Coulomb(0.2), 0.3, fj.Pulse(1.0))
+    with refused(ValueError, f"`{result}`", f"a result of {of}"):
+        call(scene, **{result: [0.9, 1.1]})
+
+
+def test_names_of_two_parts_of_a_state():
+    with refused(ValueError, "`dx`", "the velocity of `x`"):
+        _with_a_parameter("k", coordinates=["x", "dx"])
+    scene = fj.Scene(_with_a_parameter("x", coordinates=["x", "y"]), fj.Coulomb(0.2), 0.3, fj.ConstantLoad(1.0))
+    with refused(ValueError, "Axis `x`", "a parameter of the scene"):
+        fj.basins(scene, x=[0.9, 1.1], dx=[0.0, 1.0])
