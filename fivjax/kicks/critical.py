@@ -20,7 +20,7 @@ from ..maps.executors import with_workers
 from ..maps.groups import Limits
 from ..maps.plan import TrajectoryList
 from ..model.load import Pulse
-from ..model.scene import Scene, refuse_several_contacts
+from ..model.scene import Scene
 from ..steppers.base import AbstractStepper
 from ..steppers.description import describe_method
 from ..steppers.event_exact import EventExact
@@ -107,10 +107,6 @@ def critical_perturbation(
     check_run(scene, method, t_max, memory)
     arguments.truth("energy", energy)
     arguments.truth("derivatives", derivatives)
-    if derivatives:
-        refuse_several_contacts(
-            scene.structure, "`critical_perturbation` with derivatives", "Without derivatives it takes several."
-        )
     if derivatives and not isinstance(method, EventExact):
         raise ValueError(
             "Argument `derivatives` needs the method EventExact(), whose trajectories are exact through events."

@@ -28,15 +28,16 @@ class Crossings(NamedTuple):
 
     y: Float[np.ndarray, "k state"]  # deviations from sliding
     y_parameter: Float[np.ndarray, "d k state"]  # their derivatives along directions of the parameters
-    status: Int[np.ndarray, " k"]
-    direction: Float[np.ndarray, " k"]
+    status: Int[np.ndarray, "k *contacts"]
+    direction: Float[np.ndarray, "k *contacts"]
     events: Int[np.ndarray, " k"]  # contact events up to the crossing
     count: int
 
 
 def kicked(scene: Scene, stepper: EventExact, directions: Scene, crossings: int) -> Crossings:
     """Crossings after the kick of the scene's load, from steady sliding; as many as asked for, if there are so many."""
-    contact = Contact(np.int32(Status.SLIDE), np.sign(float(scene.belt_speed)))
+    direction = np.sign(np.asarray(scene.belt_speed, float))
+    contact = Contact(np.full(direction.shape, Status.SLIDE, np.int32), direction)
     return _followed(scene, stepper, directions, Point(np.zeros(2 * scene.structure.size), contact), None, crossings)
 
 

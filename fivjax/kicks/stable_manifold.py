@@ -108,7 +108,8 @@ def manifold_distances(path: Crossings, saddle: Saddle, weights: Float[np.ndarra
     target = weights * np.asarray(saddle.closed.point.y)
     away = weights * path.y[: path.count] - target
     distance = np.linalg.norm(away, axis=-1) / np.linalg.norm(target)
-    status = path.status[: path.count] == int(saddle.closed.point.contact.status)
+    same = path.status[: path.count] == np.asarray(saddle.closed.point.contact.status)
+    status = np.all(same.reshape(path.count, -1), axis=1)
     # Up to the closest crossing: later the trajectory leaves, and may return on another way.
     closest = int(np.argmin(np.where(status, distance, np.inf)))
     place = np.flatnonzero((distance < near) & status & (np.arange(path.count) <= closest))

@@ -50,8 +50,8 @@ class GrazingKick(NamedTuple):
 
 class _Events(NamedTuple):
     time: Float[Array, " k"]  # s after the kick began
-    status: Int[Array, " k"]  # before the event
-    guard: Int[Array, " k"]  # that ran out
+    status: Int[Array, " k"]  # of its contact before the event
+    guard: Int[Array, " k"]  # that ran out, of those of all contacts in a row
     count: Int[Array, ""]
 
 
@@ -152,11 +152,11 @@ def _find_events(args, _):
         def observe(found: _Events, segment: Segment):
             ended = segment.after.ended.reshape(-1)
             happened = jnp.any(ended)
-            place = jnp.where(happened, found.count, MOST_EVENTS)
+            place, first = jnp.where(happened, found.count, MOST_EVENTS), jnp.argmax(ended).astype(jnp.int32)
             return _Events(
                 found.time.at[place].set(begin + segment.t + segment.after.h, mode="drop"),
-                found.status.at[place].set(segment.contact.status, mode="drop"),
-                found.guard.at[place].set(jnp.argmax(ended).astype(jnp.int32), mode="drop"),
+                found.status.at[place].set(segment.contact.status.reshape(-1)[first // 2], mode="drop"),
+                found.guard.at[place].set(first, mode="drop"),
                 found.count + happened,
             )
 

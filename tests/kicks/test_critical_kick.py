@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import fivjax as fj
+from fivjax.kicks.stable_manifold import critical_kick
 from tests.helpers import reference
+from tests.helpers.several_contacts import copies, scene_of
 
 SCENE = fj.Scene(fj.belt_oscillator(), fj.Coulomb(0.227), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2))
 
@@ -76,3 +78,37 @@ def test_a_derivative_is_the_difference_of_an_independent_solver_s_kicks(critica
 def test_derivatives_are_refused_with_steps_that_are_not_exact():
     with pytest.raises(ValueError, match="needs the method EventExact"):
         fj.critical_perturbation(SCENE, derivatives=True, method=fj.WhereSwitched(dt=1e-5))
+
+
+@pytest.mark.slow
+def test_derivatives_of_several_contacts_are_differences_of_kicks():
+    """Two oscillators that a spring couples, under different loads: forces and belt speeds scale, and kicks of other scenes."""
+    structure = copies(2, shares=[1.0, 1.1])
+    mass, damping, stiffness, load = map(np.array, structure.matrices)
+    stiffness[np.ix_([0, 3], [0, 3])] += 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    damping[np.ix_([0, 3], [0, 3])] += 200.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    structure = fj.Structure(mass, damping, stiffness, load, contacts=structure.contacts)
+    scene = scene_of(structure, belt=1.0, p=1.3)
+    found = fj.critical_perturbation(
+        scene, force=[100.0], p_range=(1.42, 1.45), p_step=0.01, derivatives=True, progress=False
+    ).isel(force=0)
+    p_crit, bracket = float(found.p_crit), (float(found.p_crit) - 1e-4, float(found.p_crit) + 1e-4)
+    assert str(found.kind.values) == "manifold" and not str(found.why_none.values)
+    assert float(found.p_crit_high - found.p_crit_low) == pytest.approx(2e-9 * p_crit, rel=1e-6)
+
+    def kick(**changes) -> float:
+        there = critical_kick(scene.replace(**changes), bracket, ())
+        assert there is not None
+        return there.p
+
+    for names, value, by in (
+        (("force",), 100.0, 1e-3),
+        (("mu_0", "mu_static_0"), 0.2, 1e-6),
+        (("duration",), 0.1, 2e-8),
+    ):
+        slope = sum(float(found.d_p_crit.sel(parameter=name)) for name in names)
+        difference = (kick(**dict.fromkeys(names, value + by)) - kick(**dict.fromkeys(names, value - by))) / (2 * by)
+        assert slope == pytest.approx(difference, rel=1e-6)
+    # Displacements are forces over stiffness: with the belt's speeds, all scales.
+    faster = (kick(belt_speed=np.full(2, 1 + 1e-6)) - kick(belt_speed=np.full(2, 1 - 1e-6))) / 2e-6
+    assert 100.0 * float(found.d_p_crit.sel(parameter="force")) == pytest.approx(-faster, rel=1e-6)

@@ -9,6 +9,7 @@ import fivjax as fj
 from fivjax.kicks.critical_derivatives import differentiable
 from fivjax.kicks.touching import grazing_kick
 from tests.helpers import reference
+from tests.helpers.several_contacts import copies, scene_of
 
 SCENE = fj.Scene(
     fj.belt_oscillator(), fj.Coulomb(0.227, mu_static=0.5), belt_speed=1.0, load=fj.Pulse(force=100.0, p=1.2)
@@ -96,3 +97,16 @@ def test_a_touch_after_lift_offs_is_where_the_independent_solver_begins_to_stick
         kicks = [boundary(**{name: (1 + by) * value}) for by in (-1e-6, 1e-6)]
         slope = float(found.d_p_crit.sel(parameter=name)[0])
         assert slope == pytest.approx((kicks[1] - kicks[0]) / (2e-6 * value), rel=1e-4)
+
+
+@pytest.mark.slow
+def test_of_several_contacts_the_one_that_touches_is_found():
+    """Two oscillators without coupling, of which the second is loaded more: it touches first, as if it were alone."""
+    names = ("duration", "mu_1", "mu_0")
+    scene = scene_of(copies(2, shares=[0.9, 1.0]), mu=0.227, mu_static=0.5, belt=1.0, p=1.2)
+    alone = grazing_kick(SCENE, (P_CRIT - 2e-6, P_CRIT + 3e-6), ("duration", "mu"))
+    found = grazing_kick(scene, (P_CRIT - 2e-6, P_CRIT + 3e-6), names)
+    assert alone is not None and found is not None
+    assert found.p == pytest.approx(touching(), abs=1e-11)
+    assert found.d_p["duration"] == pytest.approx(alone.d_p["duration"], rel=1e-8)
+    assert found.d_p["mu_1"] == pytest.approx(alone.d_p["mu"], rel=1e-8) and abs(found.d_p["mu_0"]) < 1e-8
